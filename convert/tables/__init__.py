@@ -1,0 +1,1 @@
+"""One name table per network, as data: foreign name, our path, transform."""

@@ -1,0 +1,1 @@
+"""An egocentric world simulator in JAX."""

@@ -1,0 +1,168 @@
+"""`egosim data`: pack clips into shards, verify them, describe them."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from egosim_jax.cli.progress import track
+from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.types import InputError, VideoSpec
+
+if TYPE_CHECKING:
+    from egosim_jax.data.metadata import ClipFiles
+    from egosim_jax.data.shards import Record, ShardReader
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pack:
+    """Pack the clips of a metadata file into shards.
+
+    Stores each clip's own files, unchanged, or decoded frames if a size is given. A clip that
+    fails the strict checks is reported and left out (exit code 3). Prints the folder.
+    """
+
+    metadata: Path
+    """CSV or JSONL in EgoSim's columns: video, ego_prior_video, hand_keypoint_video, first_frame,
+    prompt, video_id."""
+    out: Path
+    """Folder of the shards."""
+    where: str | None = None
+    """Take rows whose column has this value, for instance split=test."""
+    limit: int | None = None
+    """Take at most so many clips."""
+    size: tuple[int, int] | None = None
+    """Height and width: store decoded frames of this size, for small models, whose training step
+    is shorter than decoding would be."""
+    num_frames: int = 61
+    """With a size: frames to store of each clip, from its first on."""
+    shard_megabytes: int = 256
+    """Largest size of a shard file."""
+    overwrite: bool = False
+    """Replace the shards that the folder holds."""
+
+    def run(self) -> int:
+        """Check and pack clip after clip."""
+        from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.data.shards import ShardWriter, sha256
+
+        if self.shard_megabytes < 1:
+            raise InputError(f"--shard-megabytes must be at least 1, not {self.shard_megabytes}.")
+        items = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
+        spec = self._spec()
+        failed = 0
+        with ShardWriter(
+            self.out,
+            kind="frames" if spec else "videos",
+            spec=spec,
+            provenance={"metadata": self.metadata.name, "sha256": sha256(self.metadata)},
+            shard_bytes=self.shard_megabytes * 2**20,
+            overwrite=self.overwrite,
+        ) as writer:
+            for files in track(items, "packing", total=len(items)):
+                try:
+                    record = self._record(files, spec)
+                    writer.add(record.arrays, record.metadata)
+                except InputError as error:
+                    failed += 1
+                    print(f"left out: {error}", file=sys.stderr)
+            if failed == len(items):
+                raise InputError(f"None of the {failed} clips could be packed.")
+        print(self.out)
+        return PARTIAL if failed else DONE
+
+    def _spec(self) -> VideoSpec | None:
+        if self.size is None:
+            return None
+        return VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1])
+
+    def _record(self, files: ClipFiles, spec: VideoSpec | None) -> Record:
+        from egosim_jax.data.pack import decoded_record, encoded_record
+
+        return decoded_record(files, spec) if spec else encoded_record(files)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Verify shards: hashes, counts, shapes, every video.
+
+    Prints one line a problem; exit code 3 if there is any.
+    """
+
+    shards: Path
+    """Folder of the shards."""
+
+    def run(self) -> int:
+        """Check shard after shard."""
+        from egosim_jax.data.check import check
+        from egosim_jax.data.shards import read_manifest
+
+        manifest = read_manifest(self.shards)
+        found = 0
+        for _, problems in track(check(self.shards), "checking", total=len(manifest.shards)):
+            for problem in problems:
+                print(problem)
+            found += len(problems)
+        summary = f"{manifest.records} records in {len(manifest.shards)} shards"
+        print(f"{summary}: {found or 'no'} problems", file=sys.stderr)
+        return PARTIAL if found else DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stats:
+    """Describe shards: kind, arrays, sizes, frames, prompts and splits."""
+
+    shards: Path
+    """Folder of the shards."""
+
+    def run(self) -> int:
+        """Read every record and print two tables."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from egosim_jax.data.shards import ShardReader
+
+        reader = ShardReader(self.shards)
+        manifest = reader.manifest
+        megabytes = sum(shard.size for shard in manifest.shards) / 2**20
+        spec = manifest.spec
+        table = Table(title=str(self.shards), show_header=False)
+        table.add_row("kind", manifest.kind)
+        table.add_row("records", f"{manifest.records} in {len(manifest.shards)} shards")
+        table.add_row("size", f"{megabytes:.1f} MB")
+        if spec is not None:
+            table.add_row("video", f"{spec.frames} frames of {spec.width}x{spec.height}")
+        for name, info in manifest.arrays.items():
+            shape = " ".join("*" if axis is None else str(axis) for axis in info.shape)
+            table.add_row(name, f"{info.dtype} [{shape}]")
+        for name, value in manifest.provenance.items():
+            table.add_row(name, str(value))
+        console = Console()
+        console.print(table)
+        console.print(self._clips(reader))
+        return DONE
+
+    def _clips(self, reader: ShardReader) -> object:
+        """A row for each split: records, their lengths, words of the prompts."""
+        from rich.table import Table
+
+        from egosim_jax.data.transforms import record_length
+
+        records: Counter[str] = Counter()
+        lengths: dict[str, Counter[int]] = {}
+        words: Counter[str] = Counter()
+        for record in track(reader, "reading", total=len(reader)):
+            split = str(record.metadata.get("extra", {}).get("split", "all"))
+            records[split] += 1
+            lengths.setdefault(split, Counter())[record_length(record.arrays)] += 1
+            words[split] += len(str(record.metadata.get("prompt", "")).split())
+        table = Table("split", "records", "frames", "words a prompt")
+        for split, count in sorted(records.items()):
+            frames = ", ".join(
+                f"{length} ({number})" for length, number in sorted(lengths[split].items())
+            )
+            table.add_row(split, str(count), frames, f"{words[split] / count:.1f}")
+        return table

@@ -1,0 +1,286 @@
+"""`egosim generate`: clips from a metadata file of conditions."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from egosim_jax.command import DONE, PARTIAL, USAGE
+from egosim_jax.types import Clip, InputError, Triplet
+
+if TYPE_CHECKING:
+    from egosim_jax.data.metadata import ClipFiles
+    from egosim_jax.generator import Generator, ModelConfig
+
+RESULTS = "results.jsonl"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generate:
+    """Generate a clip for each row of a metadata file.
+
+    Writes {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | truth), results.jsonl, config.json
+    and environment.json. Prints the path of each clip.
+    """
+
+    config: str
+    """Name of the model."""
+    metadata: Path
+    """CSV or JSONL in EgoSim's columns: ego_prior_video, hand_keypoint_video, first_frame, prompt,
+    video_id, and video if the truth is known."""
+    out: Path
+    """Folder to write to."""
+    weights: Path | None = None
+    """Folder of weights; only `debug` runs without, on random ones."""
+    video_id: tuple[str, ...] = ()
+    """Take these clips alone."""
+    where: str | None = None
+    """Take rows whose column has this value, for instance split=test."""
+    limit: int | None = None
+    """Take at most so many clips."""
+    start: Annotated[tuple[int, ...], tyro.conf.arg(metavar="FRAME [FRAME ...]")] = (0,)
+    """First frame of the window that is generated; several make several clips, {id}_{frame}."""
+    steps: int | None = None
+    """Denoising steps, if not the model's own."""
+    seed: int = 0
+    """Each clip's noise comes from this seed and its id."""
+    batch_size: int = 1
+    """Clips generated together."""
+    lenient: bool = False
+    """Repair input as the official loader does: repeat or cut frames, stretch sizes, take a
+    missing mask for all observed."""
+    skip_existing: bool = False
+    """Leave clips alone whose video is already there."""
+    reconstruct: bool = False
+    """Also write {id}_vae.mp4, the truth through the autoencoder: the ceiling of any denoiser."""
+
+    def run(self) -> int:
+        """Check everything, compile, generate."""
+        items = self._items()
+        config = self._config()
+        self._open(config)
+        todo = [item for item in items if not (self.skip_existing and self._video(item).exists())]
+        if len(todo) < len(items):
+            print(f"{len(items) - len(todo)} clips are already there", file=sys.stderr)
+        sound, bad = self._check(todo, config)
+        for item, problem in bad:
+            self._report(item, status="failed", error=problem)
+        if bad and not sound:
+            return USAGE
+        if sound:
+            bad += self._generate(sound, config)
+        print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self.out}", file=sys.stderr)
+        return PARTIAL if bad else DONE
+
+    def _items(self) -> list[_Item]:
+        from egosim_jax.data.metadata import read_metadata, select
+
+        for name, value in (("steps", self.steps), ("batch-size", self.batch_size)):
+            if value is not None and value < 1:
+                raise InputError(f"--{name} must be at least 1, not {value}.")
+        chosen = select(
+            read_metadata(self.metadata),
+            where=self.where,
+            video_ids=self.video_id,
+            limit=self.limit,
+        )
+        several = len(self.start) > 1
+        return [
+            _Item(files, start, f"{files.video_id}_{start}" if several else files.video_id)
+            for files, start in itertools.product(chosen, self.start)
+        ]
+
+    def _config(self) -> ModelConfig:
+        import dataclasses
+
+        from egosim_jax import configs
+
+        config = configs.get(self.config)
+        if self.weights is None and config.name != "debug":
+            raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
+        return config if self.steps is None else dataclasses.replace(config, steps=self.steps)
+
+    def _open(self, config: ModelConfig) -> None:
+        from egosim_jax.io.run import open_folder
+
+        run = {
+            "model": config,
+            "weights": None if self.weights is None else _hashes(self.weights),
+            "seed": self.seed,
+            "policy": self._policy,
+        }
+        open_folder(self.out, run)
+
+    def _check(
+        self, items: Sequence[_Item], config: ModelConfig
+    ) -> tuple[list[_Item], list[tuple[_Item, str]]]:
+        """The items that can be read, and the others with what is wrong; nothing is compiled."""
+        from egosim_jax.data.clips import check_clip
+
+        sound, bad = [], []
+        for item in items:
+            problems = check_clip(
+                item.files, config.video, start=item.start, policy=self._policy
+            )
+            if problems:
+                bad.append((item, "\n".join(problems)))
+            else:
+                sound.append(item)
+        return sound, bad
+
+    def _generate(
+        self, items: Sequence[_Item], config: ModelConfig
+    ) -> list[tuple[_Item, str]]:
+        """Generate batch after batch; the items that failed."""
+        generator = self._generator(config)
+        then = time.monotonic()
+        generator.compile(min(self.batch_size, len(items)))
+        print(f"compiled in {time.monotonic() - then:.1f} s", file=sys.stderr)
+
+        bad: list[tuple[_Item, str]] = []
+        began, size = time.monotonic(), min(self.batch_size, len(items))
+        done = 0
+        for batch in _batches(items, size):
+            then = time.monotonic()
+            loaded, problems = self._load(batch, config)
+            bad += problems
+            if loaded:
+                bad += self._batch(generator, loaded, size)
+            done += len(batch)
+            left = (time.monotonic() - began) / done * (len(items) - done)
+            print(
+                f"{done}/{len(items)} clips, {time.monotonic() - then:.1f} s, {left:.0f} s left",
+                file=sys.stderr,
+            )
+        return bad
+
+    def _generator(self, config: ModelConfig) -> Generator:
+        from egosim_jax.generator import Generator, Networks
+
+        if self.weights is None:
+            print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
+            return Generator(config, Networks.random(config, seed=self.seed))
+        for name, digest in _hashes(self.weights).items():
+            print(f"{config.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
+        return Generator(config, Networks.load(config, self.weights))
+
+    def _load(
+        self, batch: Sequence[_Item], config: ModelConfig
+    ) -> tuple[list[tuple[_Item, Triplet]], list[tuple[_Item, str]]]:
+        from egosim_jax.data.clips import load_triplet
+
+        loaded, bad = [], []
+        for item in batch:
+            try:
+                triplet = load_triplet(
+                    item.files, config.video, start=item.start, policy=self._policy
+                )
+                loaded.append((item, triplet))
+            except InputError as error:
+                bad.append((item, str(error)))
+                self._report(item, status="failed", error=str(error))
+        return loaded, bad
+
+    def _batch(
+        self, generator: Generator, loaded: Sequence[tuple[_Item, Triplet]], size: int
+    ) -> list[tuple[_Item, str]]:
+        """Generate and write one batch, filled up to `size` so that nothing compiles again."""
+        items, triplets = zip(*loaded, strict=True)
+        fill = size - len(items)
+        triplets = [*triplets, *[triplets[-1]] * fill]
+        seeds = [_seed(self.seed, item.output_id) for item in (*items, *[items[-1]] * fill)]
+        then = time.monotonic()
+        try:
+            clips = generator.generate(triplets, seeds)
+        except FloatingPointError as error:
+            for item in items:
+                self._report(item, status="failed", error=str(error))
+            return [(item, str(error)) for item in items]
+        seconds = (time.monotonic() - then) / len(items)
+        ceilings = generator.reconstruct(triplets) if self.reconstruct else [None] * size
+        for item, triplet, clip, ceiling, seed in zip(
+            items, triplets, clips, ceilings, seeds, strict=False
+        ):
+            self._write(item, triplet, clip, ceiling)
+            self._report(item, status="done", seed=seed, seconds=round(seconds, 3))
+            print(self._video(item))
+        return []
+
+    def _write(self, item: _Item, triplet: Triplet, clip: Clip, ceiling: Clip | None) -> None:
+        import numpy as np
+
+        from egosim_jax.io.video import write_video
+
+        shown = [triplet.prior, triplet.hands, clip.frames]
+        if triplet.truth is not None:
+            shown.append(triplet.truth)
+        comparison = np.concatenate(shown, axis=2)
+        write_video(self.out / f"{item.output_id}_cmp.mp4", comparison, clip.fps)
+        if ceiling is not None:
+            write_video(self.out / f"{item.output_id}_vae.mp4", ceiling.frames, clip.fps)
+        write_video(self._video(item), clip.frames, clip.fps)
+
+    def _report(self, item: _Item, *, status: str, **values: Any) -> None:
+        """Append a line to results.jsonl; an id's last line counts."""
+        if status == "failed":
+            print(f"failed: {item.output_id}: {values['error']}", file=sys.stderr)
+        line = {
+            "video_id": item.output_id,
+            "source_id": item.files.video_id,
+            "start": item.start,
+            "status": status,
+            "output": self._video(item).name,
+            **values,
+            "prompt": item.files.prompt,
+            **item.files.extra,
+        }
+        with (self.out / RESULTS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def _video(self, item: _Item) -> Path:
+        return self.out / f"{item.output_id}.mp4"
+
+    @property
+    def _policy(self) -> Any:
+        return "lenient" if self.lenient else "strict"
+
+
+@dataclass(frozen=True)
+class _Item:
+    """A window of a clip."""
+
+    files: ClipFiles
+    start: int
+    output_id: str
+
+
+def _batches(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
+    for first in range(0, len(items), size):
+        yield items[first : first + size]
+
+
+def _seed(seed: int, name: str) -> int:
+    """A seed of its own for each clip, so that its noise depends on neither order nor batch."""
+    return int.from_bytes(hashlib.sha256(f"{seed} {name}".encode()).digest()[:4], "big")
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of each weights file."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder of weights. (--weights)")
+    files = sorted(folder.glob("*.safetensors"))
+    return {file.stem: _digest(file) for file in files}
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

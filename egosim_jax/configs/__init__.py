@@ -1,0 +1,28 @@
+"""The released models by name, one file each."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pkgutil
+from typing import TYPE_CHECKING
+
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.generator import ModelConfig
+
+
+def names() -> list[str]:
+    """Every name that `get` knows."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+
+
+def get(name: str) -> ModelConfig:
+    """The config of that name; an unknown one raises `InputError` with the nearest."""
+    if name not in names():
+        near = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)
+        raise InputError(
+            f"There is no config {name!r}. Nearest: {near[0]}. All: {', '.join(names())}. (--config)"
+        )
+    return importlib.import_module(f"{__name__}.{name}").CONFIG

@@ -1,0 +1,18 @@
+"""The smallest model that has every part, with random weights: to see that everything runs."""
+
+import dataclasses
+
+from egosim_jax.configs.real_tiny import CONFIG as REAL_TINY
+from egosim_jax.models.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.types import VideoSpec
+
+CONFIG = dataclasses.replace(
+    REAL_TINY,
+    name="debug",
+    video=VideoSpec(frames=9, height=64, width=96, fps=16),
+    dit=WanDiTConfig(dim=48, ffn_dim=96, heads=2, layers=2, text_dim=64, image_dim=32),
+    vae=dataclasses.replace(REAL_TINY.vae, dim=8),
+    image=CLIPVisionConfig(image_size=28, dim=32, layers=2, heads=2, ffn_dim=64),
+    steps=4,
+)

@@ -1,0 +1,116 @@
+"""Verifying shards: every hash, count, shape and video, and every problem by its file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from array_record.python.array_record_module import ArrayRecordReader
+
+from egosim_jax.data.metadata import SAFE_ID
+from egosim_jax.data.shards import (
+    ArrayInfo,
+    Manifest,
+    Record,
+    RecordError,
+    ShardInfo,
+    file_problems,
+    from_bytes,
+    read_manifest,
+    sha256,
+)
+from egosim_jax.io.video import decode_image, decode_video
+from egosim_jax.types import InputError, check_frame_count
+
+
+def check(folder: Path) -> Iterator[tuple[ShardInfo, list[str]]]:
+    """Each shard of a folder with what is wrong with it; every problem names the file.
+
+    Compares size and SHA-256 with the manifest, reads every record, holds its arrays against the
+    manifest, decodes videos and images in full and looks for numbers that are not finite. Raises
+    `InputError` if there is no manifest, or one that cannot be trusted.
+    """
+    manifest = read_manifest(folder)
+    for shard in manifest.shards:
+        yield shard, _shard_problems(folder, shard, manifest)
+
+
+def _shard_problems(folder: Path, shard: ShardInfo, manifest: Manifest) -> list[str]:
+    path = folder / shard.file
+    problems = file_problems(folder, shard)
+    if problems:
+        return problems
+    if sha256(path) != shard.sha256:
+        problems.append(f"{path}: its SHA-256 is not the manifest's")
+    try:
+        reader = ArrayRecordReader(str(path))
+    except RuntimeError as error:
+        return [*problems, f"{path}: not an ArrayRecord file: {error}"]
+    count = reader.num_records()
+    if count != shard.records:
+        problems.append(f"{path}: {count} records, the manifest says {shard.records}")
+    for index in range(count):
+        name = f"{path}, record {index}"
+        try:
+            record = from_bytes(reader.read([index])[0], name=name)
+        except RecordError as error:
+            problems.append(str(error))
+        except RuntimeError as error:
+            problems.append(f"{name} cannot be read: {error}")
+        else:
+            problems += [f"{name}: {problem}" for problem in _record_problems(record, manifest)]
+    reader.close()
+    return problems
+
+
+def _record_problems(record: Record, manifest: Manifest) -> list[str]:
+    video_id = record.metadata.get("video_id")
+    problems = []
+    if not isinstance(video_id, str) or not SAFE_ID.fullmatch(video_id):
+        problems.append(f"video_id {video_id!r} cannot name a file")
+    problems += _shape_problems(record.arrays, manifest.arrays)
+    if manifest.kind == "videos":
+        problems += _video_problems(record.arrays)
+    else:
+        problems += [
+            f"{name} holds numbers that are not finite"
+            for name, array in record.arrays.items()
+            if not np.isfinite(array.astype(np.float32)).all()
+        ]
+    return problems
+
+
+def _shape_problems(arrays: Mapping[str, np.ndarray], wanted: Mapping[str, ArrayInfo]) -> list[str]:
+    problems = []
+    for name in sorted(arrays.keys() | wanted.keys()):
+        if name not in arrays or name not in wanted:
+            where = "the manifest" if name in arrays else "the record"
+            problems.append(f"{name} is not in {where}")
+            continue
+        array, info = arrays[name], wanted[name]
+        fits = len(array.shape) == len(info.shape) and all(
+            want in (None, have) for have, want in zip(array.shape, info.shape, strict=True)
+        )
+        if not fits or array.dtype.name != info.dtype:
+            problems.append(
+                f"{name} is {array.dtype.name} {array.shape}, the manifest says {info.dtype} "
+                f"{info.shape}"
+            )
+    return problems
+
+
+def _video_problems(arrays: Mapping[str, np.ndarray]) -> list[str]:
+    problems, counts = [], {}
+    for name, array in arrays.items():
+        try:
+            if name == "first_frame":
+                decode_image(array.tobytes(), name=name)
+            else:
+                counts[name] = len(decode_video(array.tobytes(), name=name).frames)
+                check_frame_count(counts[name], what=name, fix="pack the clip again")
+        except InputError as error:
+            problems.append(str(error))
+    if len(set(counts.values())) > 1:
+        problems.append(f"the frame counts disagree: {counts}")
+    return problems

@@ -1,0 +1,140 @@
+"""One clip's files, checked and read at a model's length and size.
+
+Strict, the default, refuses what would otherwise be repaired in silence: a missing mask, videos
+whose frame counts disagree or are not 4k+1, sizes that disagree or are not multiples of 16, clips
+shorter than the model's. Lenient does what the EgoSim release does: the last frame is repeated or
+the video cut, every size is stretched, and without a mask everything counts as observed. In both,
+a clip longer than the model's gives the window that begins at `start`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.transforms import fit_length, resize_image, resize_mask, resize_video
+from egosim_jax.io.video import VideoInfo, probe_video, read_image, read_video
+from egosim_jax.types import InputError, Triplet, VideoSpec, check_frame_count
+
+Policy = Literal["strict", "lenient"]
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+
+
+def check_clip(
+    files: ClipFiles, spec: VideoSpec | None, *, start: int = 0, policy: Policy = "strict"
+) -> list[str]:
+    """Everything that would keep `load_triplet` from reading a clip, without decoding its videos.
+
+    Each problem names the metadata row and the file. Without a `spec` any length is long enough.
+    """
+    problems = []
+    probed: dict[str, VideoInfo] = {}
+    sizes: dict[str, tuple[int, int]] = {}
+    for name, path in _videos(files, policy).items():
+        try:
+            probed[name] = probe_video(path)
+            sizes[name] = (probed[name].height, probed[name].width)
+        except InputError as error:
+            problems.append(str(error))
+    try:
+        sizes["first_frame"] = _read_first_frame(files.first_frame).shape[:2]
+    except InputError as error:
+        problems.append(str(error))
+    if policy == "strict":
+        problems += _length_problems(probed, start + (spec.frames if spec else 1))
+        problems += _size_problems(sizes)
+    return [f"{files.row} ({files.video_id}): {problem}" for problem in problems]
+
+
+def load_triplet(
+    files: ClipFiles, spec: VideoSpec, *, start: int = 0, policy: Policy = "strict"
+) -> Triplet:
+    """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
+
+    The image for CLIP is the clip's own, wherever the window begins. Raises `InputError` listing
+    what `check_clip` finds.
+    """
+    problems = check_clip(files, spec, start=start, policy=policy)
+    if problems:
+        raise InputError("\n".join(problems))
+    videos = {
+        name: _read_window(path, spec, start) for name, path in _videos(files, policy).items()
+    }
+    colours = {
+        name: resize_video(frames, spec.height, spec.width)
+        for name, frames in videos.items()
+        if name != "mask"
+    }
+    if "mask" in videos:
+        mask = resize_mask(videos["mask"][..., 0], spec.height, spec.width)
+    else:
+        mask = np.zeros((spec.frames, spec.height, spec.width), np.uint8)
+    image = _read_first_frame(files.first_frame)
+    return Triplet(
+        video_id=files.video_id,
+        prompt=files.prompt,
+        mask=mask,
+        first_frame=resize_image(image, spec.height, spec.width),
+        extra=files.extra,
+        **colours,
+    )
+
+
+def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
+    """The videos to read; the lenient policy does without a mask or a truth that is not there."""
+    videos = {"prior": files.prior, "hands": files.hands, "mask": files.mask}
+    if files.truth is not None:
+        videos["truth"] = files.truth
+    if policy == "lenient":
+        for name in ("mask", "truth"):
+            if name in videos and not videos[name].exists():
+                del videos[name]
+    return videos
+
+
+def _length_problems(probed: dict[str, VideoInfo], needed: int) -> list[str]:
+    counts = {name: info.frames for name, info in probed.items()}
+    if len(set(counts.values())) > 1:
+        return [f"the frame counts disagree: {_table(counts)}. (--lenient repeats or cuts)"]
+    problems = []
+    for count in set(counts.values()):
+        try:
+            check_frame_count(count, what="a clip", fix="--lenient cuts or repeats frames")
+        except InputError as error:
+            problems.append(str(error))
+        if count < needed:
+            problems.append(
+                f"{count} frames are fewer than the {needed} that the window needs. "
+                "(--lenient repeats the last frame)"
+            )
+    return problems
+
+
+def _size_problems(sizes: dict[str, tuple[int, int]]) -> list[str]:
+    written = {name: f"{width}x{height}" for name, (height, width) in sizes.items()}
+    if len(set(written.values())) > 1:
+        return [f"the sizes disagree: {_table(written)}. (--lenient stretches each)"]
+    return [
+        f"{width}x{height} pixels: width and height must be multiples of 16. (--lenient stretches)"
+        for height, width in set(sizes.values())
+        if height % 16 or width % 16
+    ]
+
+
+def _table(values: dict[str, int] | dict[str, str]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def _read_window(path: Path, spec: VideoSpec, start: int) -> UInt8[np.ndarray, "f h w 3"]:
+    frames = read_video(path, start=start, stop=start + spec.frames).frames
+    return fit_length(frames, spec.frames)
+
+
+def _read_first_frame(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return read_video(path, stop=1).frames[0]
+    return read_image(path)

@@ -1,0 +1,183 @@
+"""Batches from shards: shuffled, split over processes, cut into windows, prefetched, resumable.
+
+The loader walks one endless sequence of records that depends on the seed alone: every epoch is a
+new permutation, and position k of the sequence has its own random numbers for its window. Process
+p of n takes positions p, p + n, p + 2n, ..., so that global batch b holds the same positions
+however many processes share it. Worker processes deal the positions out in the same order.
+
+A record that cannot be read is skipped, counted in `Loader.skipped` under its file and position,
+and replaced by the next one; more than `Loader.MAX_BAD` different ones stop the run.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import grain
+import numpy as np
+from absl import flags
+
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.types import InputError
+
+logger = logging.getLogger(__name__)
+
+_THREADS = 4
+
+Example = Mapping[str, np.ndarray]
+Transform = grain.transforms.RandomMap | grain.transforms.Map | Callable[[Example], Example] | None
+
+
+def make_loader(
+    source: ShardReader,
+    *,
+    batch_size: int,
+    seed: int,
+    process_index: int = 0,
+    process_count: int = 1,
+    workers: int = 0,
+    shuffle: bool = True,
+    repeat: bool = True,
+    transform: Transform = None,
+) -> Loader:
+    """An iterator over this process's part of each batch: `batch_size / process_count` examples.
+
+    `transform` turns a record's arrays into an example, with random numbers if it is a
+    `RandomMap`; examples also get `record`, their number in the source. Without `repeat` the
+    iterator ends after one pass, leaving out what does not fill a batch. `workers` processes
+    prepare examples; 0 prepares them in threads of this process.
+    """
+    if batch_size < 1 or batch_size % process_count:
+        raise InputError(
+            f"A batch of {batch_size} cannot be shared by {process_count} processes: it must be a "
+            "multiple of their number. (--batch-size)"
+        )
+    if len(source) < batch_size and not repeat:
+        raise InputError(
+            f"{source.folder} holds {len(source)} records, fewer than one batch of {batch_size}."
+        )
+    positions = grain.MapDataset.range(len(source)).seed(seed)
+    if shuffle:
+        positions = positions.shuffle()
+    whole = slice(len(source) // batch_size * batch_size)
+    positions = positions.repeat() if repeat else positions[whole]
+    examples = positions.random_map(_Read(source, transform))
+    mine = examples[process_index::process_count]
+    stream = mine.to_iter_dataset(
+        grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=2 * _THREADS)
+    )
+    if workers:
+        flags.FLAGS.mark_as_parsed()
+        stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
+    skipped: Counter[str] = Counter()
+    batches = stream.filter(_Healthy(skipped)).batch(
+        batch_size // process_count, drop_remainder=True
+    )
+    contract = {
+        "data": source.manifest.fingerprint,
+        "batch_size": batch_size,
+        "seed": seed,
+        "process_index": process_index,
+        "process_count": process_count,
+        "workers": workers,
+        "shuffle": shuffle,
+        "repeat": repeat,
+    }
+    return Loader(iter(batches), contract, skipped)
+
+
+class Loader(grain.DatasetIterator):
+    """Iterates over batches; its state goes into a checkpoint beside the weights.
+
+    `skipped` counts the bad records met so far, by name. `set_state` raises `InputError` when the
+    state was saved by a loader that would give another sequence. Close it when done: worker
+    processes live until then.
+    """
+
+    MAX_BAD = 16
+
+    def __init__(
+        self,
+        batches: grain.DatasetIterator,
+        contract: Mapping[str, Any],
+        skipped: Counter[str],
+    ):
+        super().__init__(batches)
+        self.contract, self.skipped = dict(contract), skipped
+        self._batches = batches
+
+    def __next__(self) -> dict[str, np.ndarray]:
+        return next(self._batches)
+
+    def get_state(self) -> dict[str, Any]:
+        """The position, and everything the sequence depends on, as JSON values."""
+        return {"contract": self.contract, "position": self._batches.get_state()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue where `get_state` was called."""
+        saved = state["contract"]
+        differing = [
+            f"  {name}: the state has {saved.get(name)}, this loader {value}"
+            for name, value in self.contract.items()
+            if saved.get(name) != value
+        ]
+        if differing:
+            raise InputError("\n".join(["The data would come in another order:", *differing]))
+        self._batches.set_state(state["position"])
+
+
+@dataclass(frozen=True)
+class _Bad:
+    """Stands for a record that cannot be read, on its way to be counted."""
+
+    message: str
+
+
+@dataclass(frozen=True)
+class _Read(grain.transforms.RandomMap):
+    """Record number to example."""
+
+    source: ShardReader
+    transform: Transform
+
+    def random_map(self, element: int, rng: np.random.Generator) -> Any:
+        """The example, or why there is none."""
+        try:
+            example = self._transformed(self.source[element].arrays, rng)
+        except InputError as error:
+            return _Bad(f"{self.source.name(element)}: {error}")
+        return {**example, "record": np.int32(element)}
+
+    def _transformed(self, arrays: Example, rng: np.random.Generator) -> Any:
+        match self.transform:
+            case None:
+                return arrays
+            case grain.transforms.RandomMap():
+                return self.transform.random_map(arrays, rng)
+            case grain.transforms.Map():
+                return self.transform.map(arrays)
+            case _:
+                return self.transform(arrays)
+
+
+@dataclass(frozen=True)
+class _Healthy(grain.transforms.Filter):
+    """Lets examples pass; counts the bad records and stops the run when there are too many."""
+
+    skipped: Counter[str]
+
+    def filter(self, element: Any) -> bool:
+        """Whether it is an example."""
+        if not isinstance(element, _Bad):
+            return True
+        if element.message not in self.skipped:
+            logger.warning("skipping %s", element.message)
+        self.skipped[element.message] += 1
+        if len(self.skipped) > Loader.MAX_BAD:
+            listing = "\n".join(f"  {message}" for message in self.skipped)
+            raise InputError(f"Too many records cannot be read:\n{listing}")
+        return False

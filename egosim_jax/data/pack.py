@@ -1,0 +1,49 @@
+"""Records from clips: the source's own files, or decoded frames at a model's size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egosim_jax.data.clips import check_clip, load_triplet
+from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.shards import Record
+from egosim_jax.types import InputError, VideoSpec
+
+
+def clip_metadata(files: ClipFiles) -> dict[str, object]:
+    """What a record says about its clip."""
+    return {"video_id": files.video_id, "prompt": files.prompt, "extra": dict(files.extra)}
+
+
+def encoded_record(files: ClipFiles) -> Record:
+    """The bytes of a clip's files, unchanged, after the strict checks.
+
+    Raises `InputError` listing what `check_clip` finds.
+    """
+    problems = check_clip(files, None)
+    if problems:
+        raise InputError("\n".join(problems))
+    paths = {
+        "prior": files.prior,
+        "hands": files.hands,
+        "mask": files.mask,
+        "first_frame": files.first_frame,
+    }
+    if files.truth is not None:
+        paths["truth"] = files.truth
+    arrays = {name: np.frombuffer(path.read_bytes(), np.uint8) for name, path in paths.items()}
+    return Record(arrays=arrays, metadata=clip_metadata(files))
+
+
+def decoded_record(files: ClipFiles, spec: VideoSpec) -> Record:
+    """A clip's first `spec.frames` frames at the size of `spec`, after the strict checks."""
+    triplet = load_triplet(files, spec)
+    arrays = {
+        "prior": triplet.prior,
+        "hands": triplet.hands,
+        "mask": triplet.mask,
+        "first_frame": triplet.first_frame,
+    }
+    if triplet.truth is not None:
+        arrays["truth"] = triplet.truth
+    return Record(arrays=arrays, metadata=clip_metadata(files))

@@ -1,0 +1,348 @@
+"""Triplet shards: ArrayRecord files of named arrays, and the manifest that describes them.
+
+A folder holds `manifest.json` and `shard-00000.array_record`, ... A record is the bytes of a
+safetensors file whose header carries the record's metadata as JSON. Three kinds of records:
+
+    kind      arrays
+    videos    truth, prior, hands, mask, first_frame: bytes of the source's own files (uint8 "n")
+    frames    the same, decoded at the manifest's spec: uint8 "f h w 3", mask "f h w", image "h w 3"
+    latents   what a training step reads: latents "f h w 16", packed mask "f h w 4", embeddings, ...
+
+All records of a folder hold the same arrays. The manifest is written last, so a folder is whole or
+is not a dataset. Reading trusts nothing: file names are matched against a pattern, sizes are held
+against the manifest at opening, ArrayRecord's hashes are verified on every read, and `check`
+verifies the files' SHA-256 and decodes every record.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import ml_dtypes
+import numpy as np
+import safetensors
+import safetensors.numpy
+from array_record.python.array_record_data_source import ArrayRecordDataSource
+from array_record.python.array_record_module import ArrayRecordWriter
+
+from egosim_jax.io.run import write_json
+from egosim_jax.types import InputError, VideoSpec
+
+Kind = Literal["videos", "frames", "latents"]
+
+VERSION = 1
+MANIFEST = "manifest.json"
+SHARD_NAME = re.compile(r"shard-\d{5}\.array_record")
+_OPTIONS = "group_size:1,uncompressed"
+_DTYPES = {
+    "BOOL": np.dtype(np.bool_),
+    "U8": np.dtype(np.uint8),
+    "I32": np.dtype(np.int32),
+    "I64": np.dtype(np.int64),
+    "F16": np.dtype(np.float16),
+    "BF16": np.dtype(ml_dtypes.bfloat16),
+    "F32": np.dtype(np.float32),
+}
+
+
+class RecordError(InputError):
+    """A record cannot be read; the message names the file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """One clip, or one window of a clip."""
+
+    arrays: Mapping[str, np.ndarray]
+    """Read-only arrays by name."""
+    metadata: Mapping[str, Any]
+    """`video_id`, `prompt`, `extra` and whatever the writer added; JSON values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayInfo:
+    """What all records have in common in one array."""
+
+    dtype: str
+    shape: tuple[int | None, ...]
+    """None where records differ."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardInfo:
+    """One file of records."""
+
+    file: str
+    records: int
+    size: int
+    """Bytes."""
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """The description of a folder of shards."""
+
+    version: int = VERSION
+    kind: Kind
+    spec: VideoSpec | None
+    """Length and size of the decoded frames or of what the latents encode; None for videos."""
+    arrays: Mapping[str, ArrayInfo]
+    shards: tuple[ShardInfo, ...]
+    provenance: Mapping[str, Any]
+    """Where the records come from: config, hashes of the encoders' weights, ..."""
+
+    @property
+    def records(self) -> int:
+        """Records in all."""
+        return sum(shard.records for shard in self.shards)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over the shards' own: equal if and only if the records are."""
+        return hashlib.sha256("".join(shard.sha256 for shard in self.shards).encode()).hexdigest()
+
+
+def to_bytes(record: Record) -> bytes:
+    """Serialise a record; `from_bytes` gives back equal arrays, bit for bit."""
+    arrays = {name: np.ascontiguousarray(array) for name, array in record.arrays.items()}
+    return safetensors.numpy.save(arrays, metadata={"json": json.dumps(dict(record.metadata))})
+
+
+def from_bytes(data: bytes, *, name: str = "the record") -> Record:
+    """Parse the bytes of a record. Raises `RecordError` if they are not one."""
+    try:
+        arrays = {
+            key: np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(tensor["shape"])
+            for key, tensor in safetensors.deserialize(data)
+        }
+        length = int.from_bytes(data[:8], "little")
+        metadata = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["json"])
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+        raise RecordError(f"{name} is not a record of arrays: {error}.") from error
+    return Record(arrays=arrays, metadata=metadata)
+
+
+class ShardWriter(AbstractContextManager["ShardWriter"]):
+    """Writes a folder of shards, or nothing: leaving by an exception removes what was written.
+
+    An existing dataset is replaced only with `overwrite`, and only once the new one is complete.
+    Raises `InputError` if the folder holds a dataset, or if records disagree in their arrays.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        kind: Kind,
+        spec: VideoSpec | None = None,
+        provenance: Mapping[str, Any] | None = None,
+        shard_bytes: int = 256 * 2**20,
+        overwrite: bool = False,
+    ):
+        if (folder / MANIFEST).exists() and not overwrite:
+            raise InputError(f"{folder} already holds shards. (--overwrite replaces them)")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
+        self.folder = folder
+        self.kind: Kind = kind
+        self.spec = spec
+        self.provenance = dict(provenance or {})
+        self.shard_bytes = shard_bytes
+        self._arrays: dict[str, ArrayInfo] = {}
+        self._shards: list[ShardInfo] = []
+        self._writer: ArrayRecordWriter | None = None
+        self._records = self._bytes = 0
+
+    def add(self, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any]) -> None:
+        """Append a record; a full shard is closed first."""
+        self._note(arrays, str(metadata.get("video_id", "a record")))
+        data = to_bytes(Record(arrays=arrays, metadata=metadata))
+        if self._bytes + len(data) > self.shard_bytes:
+            self._finish_shard()
+        writer = self._writer or ArrayRecordWriter(str(self._temporary()), _OPTIONS)
+        writer.write(data)
+        self._writer = writer
+        self._records += 1
+        self._bytes += len(data)
+
+    def close(self) -> Manifest:
+        """Put the shards in place, then the manifest."""
+        self._finish_shard()
+        if not self._shards:
+            raise InputError(f"No record was written to {self.folder}.")
+        (self.folder / MANIFEST).unlink(missing_ok=True)
+        for old in self.folder.iterdir():
+            if SHARD_NAME.fullmatch(old.name):
+                old.unlink()
+        for shard in self._shards:
+            (self.folder / f"{shard.file}.tmp").replace(self.folder / shard.file)
+        manifest = Manifest(
+            kind=self.kind,
+            spec=self.spec,
+            arrays=self._arrays,
+            shards=tuple(self._shards),
+            provenance=self.provenance,
+        )
+        write_json(self.folder / MANIFEST, dataclasses.asdict(manifest))
+        return manifest
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is None:
+            self.close()
+            return
+        if self._writer is not None:
+            self._writer.close()
+            self._temporary().unlink()
+        for shard in self._shards:
+            (self.folder / f"{shard.file}.tmp").unlink()
+
+    def _temporary(self) -> Path:
+        return self.folder / f"shard-{len(self._shards):05d}.array_record.tmp"
+
+    def _finish_shard(self) -> None:
+        if self._writer is None:
+            return
+        self._writer.close()
+        path = self._temporary()
+        self._shards.append(
+            ShardInfo(
+                file=path.stem,
+                records=self._records,
+                size=path.stat().st_size,
+                sha256=sha256(path),
+            )
+        )
+        self._writer, self._records, self._bytes = None, 0, 0
+
+    def _note(self, arrays: Mapping[str, np.ndarray], name: str) -> None:
+        """Merge a record's shapes into the manifest's; axes on which records differ become None."""
+        if self._arrays and arrays.keys() != self._arrays.keys():
+            raise InputError(
+                f"{name} holds {sorted(arrays)}, but the records before it hold "
+                f"{sorted(self._arrays)}."
+            )
+        for key, array in arrays.items():
+            info = self._arrays.get(key, ArrayInfo(dtype=array.dtype.name, shape=array.shape))
+            if array.dtype not in _DTYPES.values() or array.dtype.name != info.dtype:
+                raise InputError(f"{name}: {key} is {array.dtype}, wanted {info.dtype}.")
+            if array.ndim != len(info.shape):
+                raise InputError(f"{name}: {key} is {array.shape}, wanted {info.shape}.")
+            shape = tuple(
+                a if a == b else None for a, b in zip(info.shape, array.shape, strict=True)
+            )
+            self._arrays[key] = ArrayInfo(dtype=info.dtype, shape=shape)
+
+
+class ShardReader:
+    """Random access to the records of a folder: `len(reader)`, `reader[i]`.
+
+    Opening compares the folder with its manifest and raises `InputError` with every difference;
+    reading raises `RecordError`. Readers can be pickled and shared by threads.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.manifest = read_manifest(folder)
+        problems = []
+        for shard in self.manifest.shards:
+            problems += file_problems(folder, shard)
+        if problems:
+            listing = "\n".join(f"  {line}" for line in problems)
+            raise InputError(f"{folder} is not as its manifest says:\n{listing}")
+        self._source = ArrayRecordDataSource(
+            [f"{folder / shard.file}[0:{shard.records}]" for shard in self.manifest.shards]
+        )
+
+    def __len__(self) -> int:
+        return self.manifest.records
+
+    def __getitem__(self, index: int) -> Record:
+        if not 0 <= index < len(self):
+            raise IndexError(f"record {index} of {len(self)}")
+        name = self.name(index)
+        try:
+            data = self._source[index]
+        except RuntimeError as error:
+            raise RecordError(f"{name} cannot be read: {error}") from error
+        return from_bytes(data, name=name)
+
+    def __iter__(self) -> Iterator[Record]:
+        return (self[index] for index in range(len(self)))
+
+    def name(self, index: int) -> str:
+        """File and position of a record, for messages."""
+        for shard in self.manifest.shards:
+            if index < shard.records:
+                return f"{self.folder / shard.file}, record {index}"
+            index -= shard.records
+        raise IndexError(f"{self.folder} has no such record")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read and validate a folder's manifest. Raises `InputError` if there is none, or a bad one."""
+    path = folder / MANIFEST
+    try:
+        fields = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{folder} holds no dataset: there is no {MANIFEST}.") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from error
+    try:
+        if fields["version"] != VERSION or fields["kind"] not in get_args(Kind):
+            raise InputError(
+                f"{path} has version {fields['version']} and kind {fields['kind']}; this program "
+                f"reads version {VERSION} and kinds {', '.join(get_args(Kind))}."
+            )
+        shards = tuple(
+            ShardInfo(
+                file=str(shard["file"]),
+                records=int(shard["records"]),
+                size=int(shard["size"]),
+                sha256=str(shard["sha256"]),
+            )
+            for shard in fields["shards"]
+        )
+        unsafe = [shard.file for shard in shards if not SHARD_NAME.fullmatch(shard.file)]
+        if unsafe or not shards or any(shard.records < 1 for shard in shards):
+            raise InputError(
+                f"{path} must name shards like shard-00000.array_record of at least one record, "
+                f"not {', '.join(unsafe) or 'none or empty ones'}."
+            )
+        return Manifest(
+            kind=fields["kind"],
+            spec=None if fields["spec"] is None else VideoSpec(**fields["spec"]),
+            arrays={
+                name: ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
+                for name, info in fields["arrays"].items()
+            },
+            shards=shards,
+            provenance=dict(fields["provenance"]),
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is not a manifest of shards: {error!r}.") from error
+
+
+def file_problems(folder: Path, shard: ShardInfo) -> list[str]:
+    """What differs between a shard and the manifest, without reading it."""
+    path = folder / shard.file
+    if not path.is_file() or path.is_symlink():
+        return [f"{path}: missing"]
+    size = path.stat().st_size
+    return [] if size == shard.size else [f"{path}: {size} bytes, the manifest says {shard.size}"]
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,116 @@
+"""From the pixels of files to the pixels a model sees; the same code in training and inference.
+
+Every video is stretched to the model's size, without cropping and without keeping the aspect
+ratio: colours with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Pixels that
+have the right size already pass unchanged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import grain
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from egosim_jax.io.video import decode_image, decode_video, probe_encoded
+from egosim_jax.types import InputError, VideoSpec
+
+COLOURS = ("truth", "prior", "hands")
+"""The colour videos of a triplet, by their names in a record."""
+
+
+def resize_image(
+    image: UInt8[np.ndarray, "h w 3"], height: int, width: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Stretch an RGB image with LANCZOS."""
+    return _resize(image, height, width, Image.Resampling.LANCZOS)
+
+
+def resize_video(
+    frames: UInt8[np.ndarray, "f h w 3"], height: int, width: int
+) -> UInt8[np.ndarray, "f height width 3"]:
+    """Stretch every RGB frame with LANCZOS."""
+    return _resize_all(frames, height, width, Image.Resampling.LANCZOS)
+
+
+def resize_mask(
+    mask: UInt8[np.ndarray, "f h w"], height: int, width: int
+) -> UInt8[np.ndarray, "f height width"]:
+    """Stretch every frame of a mask with BILINEAR; edges become grey levels."""
+    return _resize_all(mask, height, width, Image.Resampling.BILINEAR)
+
+
+def fit_length(frames: UInt8[np.ndarray, "f ..."], count: int) -> UInt8[np.ndarray, "g ..."]:
+    """The first `count` frames, the last one repeated where there are too few."""
+    return frames[np.minimum(np.arange(count), len(frames) - 1)]
+
+
+@dataclass(frozen=True)
+class DecodeWindow(grain.transforms.RandomMap):
+    """A random window of `spec.frames` frames out of a record of videos, at the model's size.
+
+    Takes records of kind "videos", which it decodes, and of kind "frames". Gives `truth`, `prior`,
+    `hands`, `mask` and `first_frame`; the image stays the clip's own wherever the window begins.
+    """
+
+    spec: VideoSpec
+
+    def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
+        """Cut the same window out of every video. Raises `InputError` if the clip is shorter."""
+        have = record_length(element)
+        if have < self.spec.frames:
+            raise InputError(f"{have} frames are fewer than the window's {self.spec.frames}.")
+        start = int(rng.integers(0, have - self.spec.frames + 1))
+        return decode_record(element, self.spec, start=start)
+
+
+def record_length(arrays: Mapping[str, np.ndarray]) -> int:
+    """Frames of a record's prior, encoded or decoded."""
+    prior = arrays["prior"]
+    return len(prior) if prior.ndim > 1 else probe_encoded(prior.tobytes(), name="prior").frames
+
+
+def decode_record(
+    arrays: Mapping[str, np.ndarray], spec: VideoSpec, *, start: int = 0
+) -> dict[str, np.ndarray]:
+    """Frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
+
+    Raises `InputError` naming the video that cannot be decoded or ends too early.
+    """
+    stop = start + spec.frames
+    decoded: dict[str, np.ndarray] = {}
+    for name in (*COLOURS, "mask"):
+        if name not in arrays:
+            continue
+        frames = _frames(arrays[name], name, start, stop)
+        if len(frames) < spec.frames:
+            raise InputError(f"{name} ends before frame {stop}.")
+        if name == "mask":
+            mask = frames if frames.ndim == 3 else frames[..., 0]
+            decoded[name] = resize_mask(mask, spec.height, spec.width)
+        else:
+            decoded[name] = resize_video(frames, spec.height, spec.width)
+    image = arrays["first_frame"]
+    image = decode_image(image.tobytes(), name="first_frame") if image.ndim == 1 else image
+    decoded["first_frame"] = resize_image(image, spec.height, spec.width)
+    return decoded
+
+
+def _frames(array: np.ndarray, name: str, start: int, stop: int) -> np.ndarray:
+    if array.ndim > 1:
+        return array[start:stop]
+    return decode_video(array.tobytes(), start=start, stop=stop, name=name).frames
+
+
+def _resize_all(frames: np.ndarray, height: int, width: int, how: Image.Resampling) -> np.ndarray:
+    if frames.shape[1:3] == (height, width):
+        return frames
+    return np.stack([_resize(frame, height, width, how) for frame in frames])
+
+
+def _resize(image: np.ndarray, height: int, width: int, how: Image.Resampling) -> np.ndarray:
+    return np.asarray(Image.fromarray(image).resize((width, height), how))

@@ -1,0 +1,297 @@
+"""From conditions to a clip: encode, denoise, decode. The only place that jits inference.
+
+    triplet --tokenise, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
+
+Each arrow is one compiled program. All denoising steps are one program, a scan without a round trip
+to the host; what the steps share (embeddings, cross-attention keys and values, the condition's part
+of the patch embedding) is computed before the scan, and the noise is donated. An item's noise
+depends on its own seed only, so that a clip does not depend on the batch it was made in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from egosim_jax.conditioning import condition_channels, pack_mask
+from egosim_jax.conditioning.image import clip_pixels
+from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.conditioning.video import to_model, to_uint8
+from egosim_jax.diffusion.guidance import Guidance
+from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.diffusion.solver import Euler, UniPC, integrate
+from egosim_jax.io import weights
+from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
+from egosim_jax.models.umt5 import UMT5, UMT5Config
+from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
+from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.types import Clip, Condition, InputError, Triplet, VideoSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """A released model: its networks, its conditioning and how it is sampled."""
+
+    name: str
+    """The name that commands know it by."""
+    video: VideoSpec
+    """Length and size of its clips."""
+    dit: WanDiTConfig
+    """The denoiser."""
+    vae: WanVAEConfig = field(default_factory=WanVAEConfig)
+    """The video autoencoder."""
+    text: UMT5Config = field(default_factory=UMT5Config)
+    """The text encoder."""
+    image: CLIPVisionConfig | None = field(default_factory=CLIPVisionConfig)
+    """The image encoder; None for models without the image branch."""
+    tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
+    """Prompts to token ids."""
+    encoders: Literal["frozen", "joint"] = "frozen"
+    """Whether text and image encoder are given, or small and trained together with the denoiser."""
+    image_range: Literal["signed", "unit"] = "signed"
+    """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
+    schedule: FlowSchedule = field(default_factory=FlowSchedule)
+    """Noise levels."""
+    solver: Euler | UniPC = field(default_factory=Euler)
+    """Steps from noise to data."""
+    guidance: Guidance = field(default_factory=Guidance)
+    """Classifier-free guidance on the text."""
+    steps: int = 50
+    """Denoising steps."""
+
+    def __post_init__(self) -> None:
+        """Check that the networks fit each other."""
+        pairs = [
+            ("dit.text_dim", self.dit.text_dim, "text.dim", self.text.dim),
+            ("dit.out_channels", self.dit.out_channels, "vae.z_dim", self.vae.z_dim),
+            ("dit.image_dim", self.dit.image_dim, "image.dim", self.image and self.image.dim),
+        ]
+        for left, a, right, b in pairs:
+            if a != b:
+                raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+
+
+class Networks(nnx.Module):
+    """The four networks of a model."""
+
+    def __init__(self, config: ModelConfig, *, rngs: nnx.Rngs):
+        self.dit = WanDiT(config.dit, rngs=rngs)
+        self.vae = WanVAE(config.vae, rngs=rngs)
+        self.text = UMT5(config.text, rngs=rngs)
+        self.image = None if config.image is None else CLIPVision(config.image, rngs=rngs)
+
+    @classmethod
+    def load(cls, config: ModelConfig, folder: Path) -> Networks:
+        """The networks of a weights folder, which holds `<network>.safetensors` for each.
+
+        Raises `InputError` with every path that is missing, unknown or of another shape.
+        """
+        networks = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0)))
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder of weights. (--weights)")
+        for name, network in networks.parts().items():
+            weights.load(folder / f"{name}.safetensors", network)
+        return networks
+
+    @classmethod
+    def random(cls, config: ModelConfig, *, seed: int) -> Networks:
+        """Untrained networks, made in one compiled program."""
+        graph = nnx.graphdef(nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))))
+        make = jax.jit(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
+        return nnx.merge(graph, make())
+
+    def save(self, folder: Path) -> None:
+        """Write a weights folder."""
+        for name, network in self.parts().items():
+            weights.save(folder / f"{name}.safetensors", network)
+
+    def parts(self) -> dict[str, nnx.Module]:
+        """The networks by name."""
+        named = {"dit": self.dit, "vae": self.vae, "text": self.text, "image": self.image}
+        return {name: network for name, network in named.items() if network is not None}
+
+
+@no_type_check
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """A batch of triplets as arrays."""
+
+    prior: UInt8[Any, "b f h w 3"]
+    hands: UInt8[Any, "b f h w 3"]
+    mask: UInt8[Any, "b lf lh lw 4"]
+    ids: Int[Any, "b n"]
+    ids_mask: Bool[Any, "b n"]
+    pixels: Float[Any, "b s s 3"] | None
+
+    @classmethod
+    def of(cls, triplets: Sequence[Triplet], config: ModelConfig) -> Inputs:
+        """Tokenise the prompts, pack the masks and prepare the image for CLIP."""
+        tokens = config.tokenizer.tokenize([t.prompt for t in triplets])
+        return cls(
+            prior=np.stack([t.prior for t in triplets]),
+            hands=np.stack([t.hands for t in triplets]),
+            mask=np.stack([pack_mask(t.mask) for t in triplets]),
+            ids=tokens.ids,
+            ids_mask=tokens.mask,
+            pixels=config.image
+            and clip_pixels(
+                np.stack([t.first_frame for t in triplets]),
+                image_size=config.image.image_size,
+                image_range=config.image_range,
+            ),
+        )
+
+    @classmethod
+    def shapes(cls, batch: int, config: ModelConfig) -> Inputs:
+        """The shapes and dtypes of a batch, to compile for before there is one."""
+        shape = lambda dtype, *sizes: jax.ShapeDtypeStruct((batch, *sizes), dtype)  # noqa: E731
+        video, tokens = config.video, config.tokenizer.max_tokens
+        frames = shape(np.uint8, video.frames, video.height, video.width, 3)
+        size = config.image and config.image.image_size
+        return cls(
+            prior=frames,
+            hands=frames,
+            mask=shape(np.uint8, *video.latent_shape, 4),
+            ids=shape(np.int32, tokens),
+            ids_mask=shape(np.bool_, tokens),
+            pixels=size and shape(np.float32, size, size, 3),
+        )
+
+
+def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
+    """Run the frozen parts: videos to latents, prompt and image to tokens."""
+    return Condition(
+        mask=inputs.mask.astype(jnp.float32),
+        prior=networks.vae.encode(to_model(inputs.prior)),
+        hands=networks.vae.encode(to_model(inputs.hands)),
+        text=networks.text(inputs.ids, inputs.ids_mask),
+        image=None if networks.image is None else networks.image(inputs.pixels),
+    )
+
+
+def denoise(
+    dit: WanDiT, condition: Condition, noise: Float[Array, "b f h w 16"], config: ModelConfig
+) -> Float[Array, "b f h w 16"]:
+    """Walk from noise to latents; the unconditional branch knows no text."""
+    channels = condition_channels(condition)
+    context = dit.prepare(channels, condition.text, condition.image)
+
+    def unconditional(x: Array, t: Array) -> Array:
+        empty = dit.prepare(channels, jnp.zeros_like(condition.text), condition.image)
+        return dit.denoise(x, t, empty)
+
+    return integrate(
+        config.guidance.guide(lambda x, t: dit.denoise(x, t, context), unconditional),
+        noise,
+        schedule=config.schedule,
+        solver=config.solver,
+        steps=config.steps,
+    )
+
+
+class Program:
+    """A function of the networks and arrays, compiled once for each shape of its arguments."""
+
+    def __init__(self, function: Callable[..., Any], networks: nnx.Module, **options: Any):
+        graph, self._params = nnx.split(networks, nnx.Param)
+        self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
+        self._compiled: dict[Any, Any] = {}
+
+    def compile(self, *args: Any) -> Any:
+        """Compile for these arguments, arrays or shapes, and give the shapes of the answer."""
+        lowered = self._jit.lower(self._params, *args)
+        self._compiled[_signature(args)] = lowered.compile()
+        return lowered.out_info
+
+    def __call__(self, *args: Any) -> Any:
+        """Run, compiling first if nobody has."""
+        if (signature := _signature(args)) not in self._compiled:
+            self.compile(*args)
+        return self._compiled[signature](self._params, *args)
+
+
+def _signature(args: Any) -> Any:
+    return tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(args))
+
+
+class Generator:
+    """A model ready to generate."""
+
+    def __init__(self, config: ModelConfig, networks: Networks):
+        self.config = config
+        self._encode = Program(encode_condition, networks)
+        self._latents = Program(lambda vae, video: vae.encode(to_model(video)), networks.vae)
+        self._denoise = Program(
+            lambda dit, condition, noise: denoise(dit, condition, noise, config),
+            networks.dit,
+            donate_argnums=2,
+        )
+        self._decode = Program(lambda vae, x: to_uint8(vae.decode(x)), networks.vae)
+
+    def compile(self, batch: int) -> None:
+        """Compile everything that `generate` needs for batches of this size."""
+        condition = self._encode.compile(Inputs.shapes(batch, self.config))
+        noise = jax.eval_shape(lambda: self.noise(range(batch)))
+        self._decode.compile(self._denoise.compile(condition, noise))
+
+    def generate(self, triplets: Sequence[Triplet], seeds: Sequence[int]) -> list[Clip]:
+        """One clip for each triplet, from the noise of its seed.
+
+        Raises `FloatingPointError` naming the clips whose latents are not finite.
+        """
+        condition = self._encode(Inputs.of(triplets, self.config))
+        latents = self._denoise(condition, self.noise(seeds))
+        finite = np.isfinite(np.asarray(latents)).all(axis=(1, 2, 3, 4))
+        if not finite.all():
+            bad = [t.video_id for t, fine in zip(triplets, finite, strict=True) if not fine]
+            raise FloatingPointError(f"The latents of {bad} are not finite (NaN or infinity).")
+        return self._clips(latents)
+
+    def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
+        """The truth through the autoencoder and back: the best any denoiser could give."""
+        return self._clips(self._latents(_truths(triplets)))
+
+    def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w 16"]:
+        """The starting noise of each seed."""
+        shape = (*self.config.video.latent_shape, self.config.vae.z_dim)
+        return jnp.stack([jax.random.normal(jax.random.key(seed), shape) for seed in seeds])
+
+    def cache(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
+        """What training needs of each triplet, encoded once: the arrays of a latents shard.
+
+        With frozen encoders these are their embeddings; with joint ones, the encoders' inputs.
+        """
+        inputs = Inputs.of(triplets, self.config)
+        condition = self._encode(inputs)
+        arrays = {
+            "truth": self._latents(_truths(triplets)),
+            "prior": condition.prior,
+            "hands": condition.hands,
+            "mask": inputs.mask,
+        }
+        if self.config.encoders == "joint":
+            arrays |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
+        else:
+            arrays |= {"text": condition.text, "image": condition.image}
+        present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
+        return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
+
+    def _clips(self, latents: Float[Array, "b f h w 16"]) -> list[Clip]:
+        frames = np.asarray(self._decode(latents))
+        return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
+
+
+def _truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
+    without = [t.video_id for t in triplets if t.truth is None]
+    if without:
+        raise InputError(f"{', '.join(without)}: no truth to encode. (column video)")
+    return np.stack([t.truth for t in triplets if t.truth is not None])

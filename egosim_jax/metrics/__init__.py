@@ -1,0 +1,1 @@
+"""How close a generated video is to the recorded one."""

@@ -1,0 +1,1 @@
+"""The networks, one file each: pure flax.nnx, no input or output, no mesh."""

@@ -1,0 +1,105 @@
+"""Scaled dot-product attention behind one name, with a choice of kernel.
+
+    out = softmax(s) v,    s = scale · q kᵀ
+
+Neither kernel keeps the scores for the backward pass. From out and the log-sum-exp l of each row
+of s, p = exp(s - l) gives, for the cotangent g of out,
+
+    dv = pᵀ g,    ds = p · (g vᵀ - rowsum(g · out)),    dq = scale · ds k,    dk = scale · dsᵀ q
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from einops import rearrange
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float
+
+Kernel = Literal["xla", "cudnn"]
+"""`xla` runs anywhere, one head at a time, so that the scores of a single head are in memory;
+`cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only)."""
+
+
+def attention(
+    q: Float[Array, "b n h k"],
+    k: Float[Array, "b m h k"],
+    v: Float[Array, "b m h k"],
+    *,
+    bias: Float[Array, "#b h n m"] | None = None,
+    scale: float | None = None,
+    kernel: Kernel = "xla",
+) -> Float[Array, "b n h k"]:
+    """Attend without a mask; scores and softmax are float32 in both kernels.
+
+    `bias` is added to the scores; `scale` is 1/sqrt(k) unless given. A dense bias keeps the flash
+    kernels from being used well, so that only the text encoder passes one.
+    """
+    if bias is not None or kernel == "cudnn":
+        return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation=kernel)
+    scale = q.shape[-1] ** -0.5 if scale is None else scale
+    heads = (rearrange(x, "b n h k -> h b n k") for x in (q, k, v))
+    return rearrange(_by_head(*heads, scale), "h b n k -> b n h k")
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _by_head(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> jax.Array:
+    return _forward(q, k, v, scale)[0]
+
+
+def _forward(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> tuple[jax.Array, tuple]:
+    def head(qkv: tuple) -> tuple[jax.Array, jax.Array]:
+        q, k, v = qkv
+        s = _scores(q, k, scale)
+        top = s.max(-1, keepdims=True)
+        p = jnp.exp(s - top)
+        total = p.sum(-1, keepdims=True)
+        out = _matmul("b n m, b m k -> b n k", p.astype(v.dtype), v) / total
+        return out.astype(v.dtype), top + jnp.log(total)
+
+    out, log_total = jax.lax.map(head, (q, k, v))
+    if q.shape == k.shape:
+        out, log_total = (checkpoint_name(x, SELF_ATTENTION) for x in (out, log_total))
+    return out, (q, k, v, out, log_total)
+
+
+def _backward(scale: float, residuals: tuple, g: jax.Array) -> tuple:
+    def head(inputs: tuple) -> tuple[jax.Array, jax.Array, jax.Array]:
+        q, k, v, out, log_total, g = inputs
+        p = jnp.exp(_scores(q, k, scale) - log_total)
+        delta = (g.astype(jnp.float32) * out.astype(jnp.float32)).sum(-1, keepdims=True)
+        ds = (p * (_matmul("b n k, b m k -> b n m", g, v) - delta)).astype(q.dtype)
+        dv = _matmul("b n m, b n k -> b m k", p.astype(g.dtype), g)
+        dq = _matmul("b n m, b m k -> b n k", ds, k) * scale
+        dk = _matmul("b n m, b n k -> b m k", ds, q) * scale
+        return dq.astype(q.dtype), dk.astype(k.dtype), dv.astype(v.dtype)
+
+    return jax.lax.map(head, (*residuals, g))
+
+
+_by_head.defvjp(_forward, _backward)
+
+
+def _scores(q: jax.Array, k: jax.Array, scale: float) -> jax.Array:
+    return _matmul("b n k, b m k -> b n m", q, k) * scale
+
+
+def _matmul(pattern: str, a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.einsum(pattern, a, b, preferred_element_type=jnp.float32)
+
+
+SELF_ATTENTION = "self_attention"
+
+
+def keep_attention(primitive: Any, *operands: Any, **parameters: Any) -> bool:
+    """Say which values a checkpointed block keeps: what self-attention returns, nothing else.
+
+    The kernels' backward passes need the output and the log-sum-exp; keeping both spares the
+    recomputation of the scores. Cross-attention, which has few keys, is recomputed.
+    """
+    if primitive.name == "dot_product_attention_fwd_wrapper":
+        return operands[0].shape == operands[1].shape
+    return primitive.name == "name" and parameters["name"] == SELF_ATTENTION

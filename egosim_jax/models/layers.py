@@ -1,0 +1,127 @@
+"""Layers that the networks share.
+
+Precision: parameters keep the dtype they were given (float32 by default); `Linear` and `Embed`
+compute in their `dtype`; norms compute and answer in float32, and the next `Linear` casts down.
+
+Every parameter names its logical axes (`axes=`), which `sharding.py` maps to the mesh:
+`embed` the model width, `mlp` the hidden width, `heads` heads x head size, `vocab`, `layers` the
+stacked blocks, None an axis that is never sharded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float, Int
+
+Axes = tuple[str | None, ...]
+Initializer = Callable[..., jax.Array]
+Block = TypeVar("Block", bound=nnx.Module)
+
+lecun_normal = nnx.initializers.lecun_normal()
+zeros = nnx.initializers.zeros_init()
+ones = nnx.initializers.ones_init()
+
+
+class Linear(nnx.Module):
+    """`x @ kernel + bias`, kernel `[in, out]`, computed in `dtype`."""
+
+    def __init__(
+        self,
+        in_dim: int,
+        out_dim: int,
+        *,
+        axes: Axes,
+        bias: bool = True,
+        dtype: str = "float32",
+        kernel_init: Initializer = lecun_normal,
+        rngs: nnx.Rngs,
+    ):
+        self.dtype = jnp.dtype(dtype)
+        self.kernel = nnx.Param(kernel_init(rngs.params(), (in_dim, out_dim)), axes=axes)
+        self.bias = nnx.Param(jnp.zeros(out_dim), axes=axes[1:]) if bias else None
+
+    def __call__(self, x: Float[Array, "*b i"]) -> Float[Array, "*b o"]:
+        """Project the last axis."""
+        y = x.astype(self.dtype) @ self.kernel[...].astype(self.dtype)
+        return y if self.bias is None else y + self.bias[...].astype(self.dtype)
+
+
+class Embed(nnx.Module):
+    """A table of token embeddings `[vocab, d]`, read in `dtype`."""
+
+    def __init__(self, vocab: int, dim: int, *, dtype: str = "float32", rngs: nnx.Rngs):
+        self.dtype = jnp.dtype(dtype)
+        table = nnx.initializers.normal(1.0)(rngs.params(), (vocab, dim))
+        self.embedding = nnx.Param(table, axes=("vocab", "embed"))
+
+    def __call__(self, ids: Int[Array, "*b"]) -> Float[Array, "*b d"]:
+        """Look the ids up."""
+        return self.embedding[...].astype(self.dtype)[ids]
+
+
+class LayerNorm(nnx.Module):
+    """Layer norm over the last axis in float32, with or without a learned scale and bias."""
+
+    def __init__(self, dim: int, *, eps: float, affine: bool = True):
+        self.eps = eps
+        self.scale = nnx.Param(jnp.ones(dim), axes=("embed",)) if affine else None
+        self.bias = nnx.Param(jnp.zeros(dim), axes=("embed",)) if affine else None
+
+    def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+        """Normalise; the answer is float32."""
+        x = x.astype(jnp.float32)
+        x = x - x.mean(-1, keepdims=True)
+        x = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
+        if self.scale is None or self.bias is None:
+            return x
+        return x * self.scale[...].astype(jnp.float32) + self.bias[...].astype(jnp.float32)
+
+
+class RMSNorm(nnx.Module):
+    """Root-mean-square norm over the last axis in float32, with a learned scale."""
+
+    def __init__(self, dim: int, *, eps: float, axes: Axes = ("embed",)):
+        self.eps = eps
+        self.scale = nnx.Param(jnp.ones(dim), axes=axes)
+
+    def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+        """Normalise; the answer is float32."""
+        x = x.astype(jnp.float32)
+        x = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
+        return x * self.scale[...].astype(jnp.float32)
+
+
+def stack(make: Callable[[nnx.Rngs], Block], layers: int, *, rngs: nnx.Rngs) -> Block:
+    """Build `layers` equal blocks as one whose parameters have a leading `layers` axis."""
+    split = nnx.split_rngs(splits=layers)
+    blocks = split(nnx.vmap(make, in_axes=(0,), out_axes=0))(rngs)
+    for _, parameter in nnx.to_flat_state(nnx.state(blocks, nnx.Param)):
+        parameter.set_metadata(axes=("layers", *parameter.get_metadata()["axes"]))
+    return blocks
+
+
+def scan_blocks(
+    step: Callable[[Block, Any, Any], tuple[Any, Any]],
+    blocks: Block,
+    x: Any,
+    per_layer: Any = None,
+    *,
+    remat: Callable[[Callable], Callable] | None = None,
+) -> tuple[Any, Any]:
+    """Run `step(block, x, inputs) -> (x, outputs)` over stacked blocks as one scan.
+
+    `x` is a pytree, `per_layer` one with a leading layers axis; the outputs are stacked so too.
+    `remat` wraps the scanned body, for instance a `jax.checkpoint` with a policy.
+    """
+    graph, state = nnx.split(blocks)
+
+    def body(x: Any, inputs: tuple) -> tuple[Any, Any]:
+        layer, extra = inputs
+        return step(nnx.merge(graph, layer), x, extra)
+
+    return jax.lax.scan(remat(body) if remat else body, x, (state, per_layer))

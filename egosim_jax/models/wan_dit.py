@@ -1,0 +1,176 @@
+"""The video diffusion transformer of Wan 2.1, in all its published shapes, and EgoSim's.
+
+Noisy latents of 16 channels and a condition of 0 (text to video), 20 (image to video) or 36
+channels (EgoSim) are cut into patches of 1 x 2 x 2 cells, one token each, which pass through the
+blocks of `wan_layers` and become the velocity of the noisy latents.
+
+Everything that does not depend on the step is computed once by `prepare`: the patch embedding is
+linear, so that the condition's summand stands alone; keys and values of the cross-attentions depend
+on text and image only. `denoise` is what a solver calls at each step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import no_type_check
+
+import jax
+import jax.numpy as jnp
+from einops import rearrange
+from flax import nnx
+from jaxtyping import Array, Float
+
+from egosim_jax.models import rope
+from egosim_jax.models.attention import keep_attention
+from egosim_jax.models.layers import scan_blocks, stack
+from egosim_jax.models.wan_layers import (
+    MLP,
+    PATCH,
+    Block,
+    CrossAttention,
+    Head,
+    ImageEmbedding,
+    KeysValues,
+    PatchEmbedding,
+    TimeEmbedding,
+    WanDiTConfig,
+    gelu_tanh,
+    normal,
+)
+from egosim_jax.types import InputError
+
+
+@no_type_check
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class DiTContext:
+    """All that is the same at every denoising step."""
+
+    patches: Float[Array, "b n d"]
+    """The condition's share of the patch embedding, with its bias."""
+    text: KeysValues
+    """Cross-attention keys and values of the text, for all layers."""
+    image: KeysValues | None
+    """The same of the image."""
+    rotation: Float[Array, "n p 2"]
+    """Rotary table of the tokens."""
+
+
+class WanDiT(nnx.Module):
+    """Velocity of noisy video latents, given time, condition, text and image."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        self.config = config
+        self.patch = PatchEmbedding(config, rngs=rngs)
+        self.time = TimeEmbedding(config, rngs=rngs)
+        sizes = (config.text_dim, config.dim, config.dim)
+        self.text = MLP(config, sizes, gelu_tanh, init=normal, rngs=rngs)
+        width = config.image_dim
+        self.image = None if width is None else ImageEmbedding(config, width, rngs=rngs)
+        self.blocks = stack(lambda rngs: Block(config, rngs=rngs), config.layers, rngs=rngs)
+        self.head = Head(config, rngs=rngs)
+
+    def prepare(
+        self,
+        condition: Float[Array, "b f h w c"],
+        text: Float[Array, "b n e"],
+        image: Float[Array, "b m i"] | None = None,
+    ) -> DiTContext:
+        """Compute what all steps share.
+
+        `condition` holds the channels after the noisy ones (none for text to video), `text` the
+        text encoder's tokens, `image` the image encoder's, for models with the image branch.
+        """
+        self._check(condition.shape, has_image=image is not None)
+        _, f, h, w, _ = condition.shape
+        text_tokens = self.text(text)
+        image_tokens = None if self.image is None or image is None else self.image(image)
+
+        def step(layer: CrossAttention, x: None, _: None) -> tuple:
+            image_kv = layer.image and layer.image.keys_values(image_tokens)
+            return x, (layer.keys_values(text_tokens), image_kv)
+
+        _, (text_kv, image_kv) = scan_blocks(step, self.blocks.cross_attn, None, remat=self._remat)
+        return DiTContext(
+            patches=self.patch.condition(condition),
+            text=text_kv,
+            image=image_kv,
+            rotation=rope.rotations(f, h // PATCH, w // PATCH, self.config.head_dim),
+        )
+
+    def denoise(
+        self, noisy: Float[Array, "b f h w c"], t: Float[Array, " b"], context: DiTContext
+    ) -> Float[Array, "b f h w c"]:
+        """Velocity, in float32, of noisy latents at times in [0, 1000]."""
+        _, _, h, w, _ = noisy.shape
+        time, modulation = self.time(t)
+
+        def step(block: Block, x: jax.Array, kv: tuple) -> tuple:
+            return block(x, modulation, context.rotation, *kv), None
+
+        x = self.patch.noisy(noisy) + context.patches
+        x, _ = scan_blocks(step, self.blocks, x, (context.text, context.image), remat=self._remat)
+        return rearrange(
+            self.head(x, time),
+            "b (f h w) (i j c) -> b f (h i) (w j) c",
+            h=h // PATCH,
+            w=w // PATCH,
+            i=PATCH,
+            j=PATCH,
+        )
+
+    def __call__(
+        self,
+        latents: Float[Array, "b f h w c"],
+        t: Float[Array, " b"],
+        text: Float[Array, "b n e"],
+        image: Float[Array, "b m i"] | None = None,
+    ) -> Float[Array, "b f h w v"]:
+        """Velocity for noisy latents and condition in one array, as in training."""
+        noisy, condition = jnp.split(latents, [self.config.out_channels], axis=-1)
+        return self.denoise(noisy, t, self.prepare(condition, text, image))
+
+    @property
+    def _remat(self) -> Callable[[Callable], Callable] | None:
+        checkpoint = partial(jax.checkpoint, prevent_cse=False)
+        return {
+            "none": None,
+            "full": checkpoint,
+            "attention": partial(checkpoint, policy=keep_attention),
+        }[self.config.remat]
+
+    def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
+        _, _, h, w, channels = condition
+        if channels != self.config.condition_channels:
+            raise InputError(
+                f"The condition has {channels} channels; this model reads "
+                f"{self.config.condition_channels} beside the {self.config.out_channels} noisy ones "
+                f"(in_channels {self.config.in_channels})."
+            )
+        if h % PATCH or w % PATCH:
+            raise InputError(
+                f"Latents of {h} x {w} cells do not split into patches of {PATCH} x {PATCH}: both "
+                "sizes must be even (pixels in multiples of 16)."
+            )
+        if has_image != (self.config.image_dim is not None):
+            needs = "no image tokens" if has_image else "image tokens"
+            raise InputError(
+                f"This model needs {needs} (image_dim {self.config.image_dim}): "
+                f"{'leave image out' if has_image else 'pass the image encoder output as image'}."
+            )
+
+
+T2V_14B = WanDiTConfig(in_channels=16, image_dim=None)
+"""Wan 2.1 text to video, 14B."""
+T2V_1_3B = WanDiTConfig(in_channels=16, image_dim=None, dim=1536, ffn_dim=8960, heads=12, layers=30)
+"""Wan 2.1 text to video, 1.3B."""
+I2V_14B = WanDiTConfig(in_channels=36)
+"""Wan 2.1 image to video and Wan 2.1 Fun InP, 14B."""
+INP_1_3B = WanDiTConfig(in_channels=36, dim=1536, ffn_dim=8960, heads=12, layers=30)
+"""Wan 2.1 Fun InP, 1.3B."""
+EGOSIM_14B = WanDiTConfig()
+"""EgoSim, 14B."""
+EGOSIM_1_3B = WanDiTConfig(dim=1536, ffn_dim=8960, heads=12, layers=30)
+"""EgoSim's input on the 1.3B model."""

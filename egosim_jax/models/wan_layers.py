@@ -1,0 +1,337 @@
+"""The parts of Wan 2.1's video transformer, and the config that shapes them.
+
+With e = modulation + time embedding, six vectors shift, scale, gate for attention and for the MLP,
+a block is
+
+    x <- x + gate_a · SelfAttention((1 + scale_a) · LN(x) + shift_a)
+    x <- x + CrossAttention(LN(x) · g + b, text, image)
+    x <- x + gate_m · MLP((1 + scale_m) · LN(x) + shift_m)
+
+with RMS norm of queries and keys over the full width, rotary positions in self-attention, and one
+query for two cross-attentions, to the text and to the image, whose outputs are summed.
+
+Norms, modulation, gates and rotations are float32; matrix products and the residual stream are in
+the config's `dtype`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from einops import rearrange
+from flax import nnx
+from jaxtyping import Array, Float
+
+from egosim_jax.models import rope
+from egosim_jax.models.attention import Kernel, attention
+from egosim_jax.models.layers import Axes, Initializer, LayerNorm, Linear, RMSNorm, zeros
+from egosim_jax.models.sinusoid import time_sinusoid
+from egosim_jax.types import InputError
+
+PATCH = 2
+"""Latent rows and columns of a token; a token has one latent frame."""
+IMAGE_NORM_EPS = 1e-5
+"""Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
+
+Activation = Callable[[jax.Array], jax.Array]
+KeysValues = tuple[Float[Array, "*l b m h k"], Float[Array, "*l b m h k"]]
+Remat = Literal["none", "full", "attention"]
+
+xavier = nnx.initializers.xavier_uniform()
+normal = nnx.initializers.normal(0.02)
+gelu_tanh = partial(jax.nn.gelu, approximate=True)
+gelu_erf = partial(jax.nn.gelu, approximate=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WanDiTConfig:
+    """Shape and numerics of the transformer; the defaults are EgoSim's 14B."""
+
+    in_channels: int = 52
+    """Channels of the noisy latents and the condition together."""
+    out_channels: int = 16
+    """Channels of the noisy latents and the velocity."""
+    dim: int = 5120
+    """Width of a token."""
+    ffn_dim: int = 13824
+    """Hidden width of the MLP."""
+    heads: int = 40
+    """Attention heads, each of dim / heads."""
+    layers: int = 40
+    """Blocks."""
+    text_dim: int = 4096
+    """Width of the text encoder's tokens."""
+    image_dim: int | None = 1280
+    """Width of the image encoder's tokens; None for a model without the image branch."""
+    freq_dim: int = 256
+    """Width of the time sinusoid."""
+    eps: float = 1e-6
+    """Epsilon of the norms."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Compute dtype of matrix products and the residual stream."""
+    attention: Kernel = "xla"
+    """Attention kernel."""
+    remat: Remat = "none"
+    """What the backward pass recomputes: nothing, every block, or blocks but self-attention."""
+
+    def __post_init__(self) -> None:
+        """Check that the sizes fit each other and the kernel fits the dtype."""
+        for name in ("out_channels", "dim", "ffn_dim", "heads", "layers", "text_dim", "freq_dim"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
+        if self.in_channels < self.out_channels:
+            raise InputError(
+                f"in_channels {self.in_channels} must hold the {self.out_channels} noisy channels "
+                "(out_channels) and those of the condition."
+            )
+        if self.dim % self.heads or self.head_dim % 2 or self.head_dim < 6:
+            raise InputError(
+                f"dim {self.dim} does not split into {self.heads} heads: a head needs an even size "
+                "of at least 6, so that frames, rows and columns each turn a pair. Change heads."
+            )
+        if self.freq_dim % 2:
+            raise InputError(f"freq_dim must be even (cosines and sines), not {self.freq_dim}.")
+        if self.attention == "cudnn" and self.dtype == "float32":
+            raise InputError('The cudnn attention kernel needs dtype "bfloat16", not "float32".')
+
+    @property
+    def head_dim(self) -> int:
+        """Size of an attention head."""
+        return self.dim // self.heads
+
+    @property
+    def condition_channels(self) -> int:
+        """Channels of the condition that is concatenated to the noisy latents."""
+        return self.in_channels - self.out_channels
+
+
+def modulate(
+    x: Float[Array, "b n d"], shift: Float[Array, "b 1 d"], scale: Float[Array, "b 1 d"]
+) -> Float[Array, "b n d"]:
+    """Scale and shift normalised tokens."""
+    return x * (1 + scale) + shift
+
+
+def linear(
+    config: WanDiTConfig,
+    sizes: tuple[int, int],
+    axes: Axes,
+    rngs: nnx.Rngs,
+    init: Initializer = xavier,
+) -> Linear:
+    """Make a linear layer in the compute dtype."""
+    return Linear(*sizes, axes=axes, dtype=config.dtype, kernel_init=init, rngs=rngs)
+
+
+def modulation_table(rows: int, dim: int, rngs: nnx.Rngs) -> nnx.Param:
+    """Make learned shifts, scales and gates, which are added to those of the time."""
+    table = jax.random.normal(rngs.params(), (rows, dim)) / dim**0.5
+    return nnx.Param(table, axes=(None, "embed"))
+
+
+class PatchEmbedding(nnx.Module):
+    """A linear map of each patch, with a kernel `[channel, row, column, out]`."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        shape = (config.in_channels, PATCH, PATCH, config.dim)
+        init = nnx.initializers.xavier_uniform(in_axis=(0, 1, 2))
+        self.noisy_channels, self.dtype = config.out_channels, jnp.dtype(config.dtype)
+        self.kernel = nnx.Param(init(rngs.params(), shape), axes=(None, None, None, "embed"))
+        self.bias = nnx.Param(jnp.zeros(config.dim), axes=("embed",))
+
+    def noisy(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
+        """The noisy channels' summand."""
+        return self._project(latents, self.kernel[...][: self.noisy_channels])
+
+    def condition(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
+        """The condition's summand, which has the bias."""
+        share = self._project(latents, self.kernel[...][self.noisy_channels :])
+        return share + self.bias[...].astype(self.dtype)
+
+    def _project(
+        self, latents: Float[Array, "b f h w c"], kernel: Float[Array, "c i j d"]
+    ) -> Float[Array, "b n d"]:
+        patches = rearrange(latents, "b f (h i) (w j) c -> b (f h w) (c i j)", i=PATCH, j=PATCH)
+        kernel = rearrange(kernel, "c i j d -> (c i j) d")
+        return patches.astype(self.dtype) @ kernel.astype(self.dtype)
+
+
+class MLP(nnx.Module):
+    """Linear, activation, linear."""
+
+    def __init__(
+        self,
+        config: WanDiTConfig,
+        sizes: tuple[int, int, int],
+        activation: Activation,
+        *,
+        init: Initializer = xavier,
+        rngs: nnx.Rngs,
+    ):
+        self.up = linear(config, sizes[:2], ("embed", "mlp"), rngs, init)
+        self.down = linear(config, sizes[1:], ("mlp", "embed"), rngs, init)
+        self.activation = activation
+
+    def __call__(self, x: Float[Array, "*b i"]) -> Float[Array, "*b o"]:
+        """Map the last axis."""
+        return self.down(self.activation(self.up(x)))
+
+
+class TimeEmbedding(nnx.Module):
+    """Times to one vector for the head and six for the blocks, in float32."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        sizes = (config.freq_dim, config.dim, config.dim)
+        self.freq_dim = config.freq_dim
+        self.mlp = MLP(config, sizes, jax.nn.silu, init=normal, rngs=rngs)
+        self.modulation = linear(config, (config.dim, 6 * config.dim), ("embed", None), rngs)
+
+    def __call__(
+        self, t: Float[Array, " b"]
+    ) -> tuple[Float[Array, "b 1 d"], Float[Array, "b 6 d"]]:
+        """Embed times in [0, 1000]."""
+        vector = self.mlp(time_sinusoid(t, self.freq_dim))
+        modulation = rearrange(self.modulation(jax.nn.silu(vector)), "b (k d) -> b k d", k=6)
+        return vector[:, None].astype(jnp.float32), modulation.astype(jnp.float32)
+
+
+class ImageEmbedding(nnx.Module):
+    """The image encoder's tokens to the model's width."""
+
+    def __init__(self, config: WanDiTConfig, width: int, *, rngs: nnx.Rngs):
+        self.norm_in = LayerNorm(width, eps=IMAGE_NORM_EPS)
+        self.mlp = MLP(config, (width, width, config.dim), gelu_erf, rngs=rngs)
+        self.norm_out = LayerNorm(config.dim, eps=IMAGE_NORM_EPS)
+
+    def __call__(self, image: Float[Array, "b m e"]) -> Float[Array, "b m d"]:
+        """Embed; the answer is float32."""
+        return self.norm_out(self.mlp(self.norm_in(image)))
+
+
+class KeyValue(nnx.Module):
+    """Keys, normalised over the full width, and values, by head."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        sizes, axes = (config.dim, config.dim), ("embed", "heads")
+        self.heads, self.dtype = config.heads, jnp.dtype(config.dtype)
+        self.k = linear(config, sizes, axes, rngs)
+        self.v = linear(config, sizes, axes, rngs)
+        self.norm_k = RMSNorm(config.dim, eps=config.eps, axes=("heads",))
+
+    def keys(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
+        """Keys, in float32."""
+        return self._by_head(self.norm_k(self.k(tokens)))
+
+    def values(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
+        """Values, in the compute dtype."""
+        return self._by_head(self.v(tokens))
+
+    def keys_values(self, tokens: Float[Array, "b m d"]) -> KeysValues:
+        """Keys and values, both in the compute dtype."""
+        return self.keys(tokens).astype(self.dtype), self.values(tokens)
+
+    def _by_head(self, x: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
+        return rearrange(x, "b m (h k) -> b m h k", h=self.heads)
+
+
+class Attention(KeyValue):
+    """What self- and cross-attention have in common."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        super().__init__(config, rngs=rngs)
+        sizes = (config.dim, config.dim)
+        self.kernel: Kernel = config.attention
+        self.q = linear(config, sizes, ("embed", "heads"), rngs)
+        self.norm_q = RMSNorm(config.dim, eps=config.eps, axes=("heads",))
+        self.o = linear(config, sizes, ("heads", "embed"), rngs)
+
+    def queries(self, x: Float[Array, "b n d"]) -> Float[Array, "b n h k"]:
+        """Normalised queries, in float32."""
+        return self._by_head(self.norm_q(self.q(x)))
+
+    def attend(
+        self, q: Float[Array, "b n h k"], k: Float[Array, "b m h k"], v: Float[Array, "b m h k"]
+    ) -> Float[Array, "b n d"]:
+        """Attend in the compute dtype and join the heads."""
+        out = attention(q.astype(self.dtype), k.astype(self.dtype), v, kernel=self.kernel)
+        return rearrange(out, "b n h k -> b n (h k)")
+
+
+class SelfAttention(Attention):
+    """Attention among the video's tokens, with rotary positions."""
+
+    def __call__(
+        self, x: Float[Array, "b n d"], rotation: Float[Array, "n p 2"]
+    ) -> Float[Array, "b n d"]:
+        """Attend."""
+        q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
+        return self.o(self.attend(q, k, self.values(x)))
+
+
+class CrossAttention(Attention):
+    """One query to the text and, in models that have the branch, to the image."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        super().__init__(config, rngs=rngs)
+        self.image = None if config.image_dim is None else KeyValue(config, rngs=rngs)
+
+    def __call__(
+        self, x: Float[Array, "b n d"], text: KeysValues, image: KeysValues | None
+    ) -> Float[Array, "b n d"]:
+        """Attend to the keys and values that `WanDiT.prepare` made."""
+        q = self.queries(x)
+        out = self.attend(q, *text)
+        return self.o(out if image is None else out + self.attend(q, *image))
+
+
+class Block(nnx.Module):
+    """Self-attention, cross-attention and MLP, each on the residual stream."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        sizes = (config.dim, config.ffn_dim, config.dim)
+        self.norm = LayerNorm(config.dim, eps=config.eps, affine=False)
+        self.self_attn = SelfAttention(config, rngs=rngs)
+        self.cross_norm = LayerNorm(config.dim, eps=config.eps)
+        self.cross_attn = CrossAttention(config, rngs=rngs)
+        self.mlp = MLP(config, sizes, gelu_tanh, rngs=rngs)
+        self.modulation = modulation_table(6, config.dim, rngs)
+
+    def __call__(
+        self,
+        x: Float[Array, "b n d"],
+        modulation: Float[Array, "b 6 d"],
+        rotation: Float[Array, "n p 2"],
+        text: KeysValues,
+        image: KeysValues | None,
+    ) -> Float[Array, "b n d"]:
+        """Update the residual stream; sums are taken in float32 and kept in x's dtype."""
+        shifts = self.modulation[...].astype(jnp.float32) + modulation
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = rearrange(shifts, "b k d -> k b 1 d")
+        attended = self.self_attn(modulate(self.norm(x), shift_a, scale_a), rotation)
+        x = (x + gate_a * attended).astype(x.dtype)
+        x = x + self.cross_attn(self.cross_norm(x), text, image)
+        mapped = self.mlp(modulate(self.norm(x), shift_m, scale_m))
+        return (x + gate_m * mapped).astype(x.dtype)
+
+
+class Head(nnx.Module):
+    """Tokens to velocity patches, their values in the order (row, column, channel)."""
+
+    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+        sizes = (config.dim, config.out_channels * PATCH**2)
+        self.norm = LayerNorm(config.dim, eps=config.eps, affine=False)
+        self.modulation = modulation_table(2, config.dim, rngs)
+        self.linear = linear(config, sizes, ("embed", None), rngs, zeros)
+
+    def __call__(
+        self, x: Float[Array, "b n d"], time: Float[Array, "b 1 d"]
+    ) -> Float[Array, "b n o"]:
+        """Project; zero at initialisation."""
+        shifts = self.modulation[...].astype(jnp.float32) + time
+        shift, scale = rearrange(shifts, "b k d -> k b 1 d")
+        return self.linear(modulate(self.norm(x), shift, scale)).astype(jnp.float32)

@@ -1,0 +1,1 @@
+"""Public fixtures: sample clips in the official format, made by formula."""

@@ -1,0 +1,98 @@
+"""Solvers against diffusers' schedulers, along a velocity that is not linear in the latents."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from diffusers import FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
+
+from egosim_jax.diffusion import Euler, FlowSchedule, UniPC, integrate
+
+# Both round to float32: ours the latents, diffusers its coefficients.
+TOLERANCE = 1e-6
+SHAPE = (2, 3, 4, 5, 16)
+
+
+def velocity(x, t):
+    """A smooth velocity field, for NumPy and jax alike."""
+    return 1.2 * x / (1 + 0.3 * x**2) + 0.5 * (1 + t / 500) ** 0.5 * x - 0.2 * t / 1000
+
+
+def relative(actual, expected):
+    return np.linalg.norm(np.asarray(actual) - expected) / np.linalg.norm(expected)
+
+
+@pytest.fixture(scope="module")
+def noise():
+    return np.random.default_rng(0).standard_normal(SHAPE)
+
+
+def euler_latents(noise, sigmas_before_shift):
+    """diffusers' latents after each step."""
+    scheduler = FlowMatchEulerDiscreteScheduler(shift=5.0)
+    scheduler.set_timesteps(sigmas=sigmas_before_shift)
+    x, latents = torch.from_numpy(noise), []
+    for t, sigma in zip(scheduler.timesteps, scheduler.sigmas[:-1], strict=True):
+        v = torch.from_numpy(velocity(x.numpy(), 1000 * sigma.item()))
+        # The scheduler answers in the velocity's dtype.
+        x = scheduler.step(v, t, x, return_dict=False)[0].double()
+        latents.append(x.numpy())
+    return latents
+
+
+def unipc_latents(noise, scheduler):
+    """diffusers' latents after each step."""
+    x, latents = torch.from_numpy(noise), []
+    for t, sigma in zip(scheduler.timesteps, scheduler.sigmas[:-1], strict=True):
+        v = torch.from_numpy(velocity(x.numpy(), 1000 * sigma.item()))
+        x = scheduler.step(v, t, x, return_dict=False)[0]
+        latents.append(x.numpy())
+    return latents
+
+
+@pytest.mark.parametrize("steps", [10, 50])
+def test_euler_ends_where_diffusers_ends(noise, steps):
+    expected = euler_latents(noise, np.linspace(1, 0, steps + 1)[:-1])[-1]
+    actual = integrate(
+        lambda x, t: velocity(x, t[:, None, None, None, None]),
+        jnp.asarray(noise, jnp.float32),
+        schedule=FlowSchedule(shift=5.0),
+        solver=Euler(),
+        steps=steps,
+    )
+    assert relative(actual, expected) < TOLERANCE
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("steps", [10, 50])
+def test_unipc_follows_diffusers_step_by_step(noise, steps, order):
+    scheduler = UniPCMultistepScheduler(
+        prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=5.0, solver_order=order
+    )
+    scheduler.set_timesteps(steps)
+    sigmas = scheduler.sigmas.double().numpy()
+    expected = unipc_latents(noise, scheduler)
+
+    solver = UniPC(order=order)
+    plan, step = solver.plan(sigmas), jax.jit(solver.step)
+    state = solver.start(jnp.asarray(noise, jnp.float32))
+    errors = []
+    for i in range(steps):
+        v = jnp.asarray(velocity(np.asarray(state.x, np.float64), 1000 * sigmas[i]), jnp.float32)
+        state = step(state, v, jax.tree.map(lambda column, i=i: column[i], plan))
+        errors.append(relative(state.x, expected[i]))
+    assert max(errors) < TOLERANCE
+
+
+def test_euler_follows_diffusers_step_by_step(noise):
+    expected = euler_latents(noise, np.linspace(1, 0, 51)[:-1])
+    solver = Euler()
+    sigmas = FlowSchedule(shift=5.0).sigmas(50)
+    state = solver.start(jnp.asarray(noise, jnp.float32))
+    errors = []
+    for i, row in enumerate(solver.plan(sigmas)):
+        v = jnp.asarray(velocity(np.asarray(state.x, np.float64), 1000 * sigmas[i]), jnp.float32)
+        state = solver.step(state, v, jnp.asarray(row))
+        errors.append(relative(state.x, expected[i]))
+    assert max(errors) < TOLERANCE

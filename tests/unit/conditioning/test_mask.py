@@ -1,0 +1,94 @@
+"""Each rule of the mask against plain loops."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.conditioning import pack_mask
+from egosim_jax.types import InputError
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """A grey video in which no two selected pixels are told apart by chance alone."""
+    return np.random.default_rng(0).integers(0, 256, (13, 32, 48), np.uint8)
+
+
+def one_pixel(frame, row, column, shape=(61, 32, 48)):
+    frames = np.zeros(shape, np.uint8)
+    frames[frame, row, column] = 255
+    return frames
+
+
+def test_the_whole_rule_on_a_random_video(frames):
+    packed = pack_mask(frames)
+    padded = [*frames, frames[-1], frames[-1], frames[-1], frames[-1]][: 4 * 4 + 1]
+    assert packed.shape == (4, 4, 6, 4)
+    for f in range(4):
+        source = padded[int(f * len(padded) / 4)]
+        for i in range(4):
+            for j in range(6):
+                for dh in range(2):
+                    for dw in range(2):
+                        row = int((2 * i + dh) * 32 / 8)
+                        column = int((2 * j + dw) * 48 / 12)
+                        unobserved = f > 0 and source[row, column] / 255 > 0.5
+                        assert packed[f, i, j, 2 * dh + dw] == unobserved
+
+
+def test_white_is_generated_and_black_is_kept():
+    frames = np.zeros((5, 16, 16), np.uint8)
+    frames[:, :, 8:] = 255
+    packed = pack_mask(frames)
+    assert packed[1, :, 0].tolist() == [[0] * 4, [0] * 4]
+    assert packed[1, :, 1].tolist() == [[1] * 4, [1] * 4]
+
+
+def test_the_first_frame_is_observed_whatever_the_video_says():
+    packed = pack_mask(np.full((9, 16, 16), 255, np.uint8))
+    assert packed[0].max() == 0
+    assert packed[1:].min() == 1
+
+
+@pytest.mark.parametrize(("grey", "generate"), [(0, 0), (127, 0), (128, 1), (255, 1)])
+def test_the_threshold_is_one_half_of_white(grey, generate):
+    packed = pack_mask(np.full((5, 16, 16), grey, np.uint8))
+    assert (packed[1] == generate).all()
+
+
+@pytest.mark.parametrize("frame", range(1, 61))
+def test_latent_frame_i_is_decided_by_pixel_frame_4i(frame):
+    packed = pack_mask(one_pixel(frame, 0, 0))
+    expected = [int(4 * i == frame) for i in range(16)]
+    assert packed.max(axis=(1, 2, 3)).tolist() == expected
+
+
+def test_without_padding_the_frames_are_those_of_the_continuous_runner():
+    frames = np.zeros((61, 16, 16), np.uint8)
+    chosen = [0, 3, 7, 11, 15, 19, 22, 26, 30, 34, 38, 41, 45, 49, 53, 57]
+    frames[chosen] = 255
+    assert pack_mask(frames, padding="none").min(axis=(1, 2, 3)).tolist() == [0] + [1] * 15
+    frames = 255 - frames
+    assert pack_mask(frames, padding="none").max() == 0
+
+
+@pytest.mark.parametrize("dh", [0, 1])
+@pytest.mark.parametrize("dw", [0, 1])
+def test_channel_2dh_plus_dw_holds_pixel_8i_plus_4dh_8j_plus_4dw(dh, dw):
+    packed = pack_mask(one_pixel(8, 8 * 3 + 4 * dh, 8 * 5 + 4 * dw))
+    assert np.argwhere(packed).tolist() == [[2, 3, 5, 2 * dh + dw]]
+
+
+def test_pixels_between_the_selected_ones_do_not_count():
+    frames = np.full((5, 16, 16), 255, np.uint8)
+    frames[:, ::4, ::4] = 0
+    assert pack_mask(frames).max() == 0
+
+
+def test_a_length_that_the_vae_cannot_encode_is_refused():
+    with pytest.raises(InputError, match=r"4k\+1"):
+        pack_mask(np.zeros((62, 16, 16), np.uint8))
+
+
+def test_a_size_without_whole_latent_cells_is_refused():
+    with pytest.raises(InputError, match="16 x 20"):
+        pack_mask(np.zeros((5, 16, 20), np.uint8))

@@ -1,0 +1,37 @@
+import jax.numpy as jnp
+import numpy as np
+
+from egosim_jax.diffusion import Guidance
+
+X = jnp.arange(32.0).reshape(2, 1, 2, 2, 4)
+T = jnp.array([1000.0, 500.0])
+
+
+def with_prompt(x, t):
+    return 2 * x + t[:, None, None, None, None]
+
+
+def without_prompt(x, t):
+    return (x - 1).astype(jnp.bfloat16)
+
+
+def test_guidance_extrapolates_from_the_unconditional_velocity():
+    guided = Guidance(scale=3.0).guide(with_prompt, without_prompt)(X, T)
+    for index in np.ndindex(*X.shape):
+        t = float(T[index[0]])
+        cond, uncond = 2 * float(X[index]) + t, float(X[index]) - 1
+        # Small whole numbers, exact in every dtype at hand.
+        assert guided[index] == uncond + 3 * (cond - uncond)
+
+
+def test_scale_one_never_runs_the_unconditional_branch():
+    def must_not_run(x, t):
+        raise AssertionError("the unconditional branch was run")
+
+    guided = Guidance(scale=1.0).guide(with_prompt, must_not_run)(X, T)
+    np.testing.assert_array_equal(guided, with_prompt(X, T))
+
+
+def test_scale_zero_is_the_unconditional_velocity():
+    guided = Guidance(scale=0.0).guide(with_prompt, without_prompt)(X, T)
+    np.testing.assert_array_equal(guided, X - 1)

@@ -1,0 +1,129 @@
+"""Training the video VAE from scratch: reconstruction, edges and a KL term.
+
+For a clip x in [-1, 1] with moments mu, log s^2 and a sample z = mu + s e, e ~ N(0, 1), decoded
+to y, the loss is
+
+    |y - x| + edges * (|dx/du - dy/du| over rows and columns) + kl * KL(N(mu, s^2) || N(0, 1))
+
+each term a mean over its elements. The absolute error and the edge term keep fingers and small
+objects, which a squared error blurs first. The encoder sees all three videos of a triplet (truth,
+scene and hands), because all three are encoded later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float
+
+from egosim_jax.conditioning.video import to_model
+from egosim_jax.data.transforms import COLOURS, DecodeWindow
+from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.train.step import Batch, Metrics
+from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
+
+@dataclass(frozen=True, kw_only=True)
+class Autoencoding:
+    """The task of training the video VAE on random pieces of clips."""
+
+    vae: WanVAEConfig
+    """The network."""
+    video: VideoSpec
+    """Frames of a piece, and the size of the videos it is cut from."""
+    crop: tuple[int, int] = (64, 64)
+    """Rows and columns of a piece in pixels."""
+    weights: tuple[float, float, float] = (0.6, 0.25, 0.15)
+    """How often a piece is of the truth, the scene and the hands."""
+    edges: float = 0.5
+    """Weight of the edge term."""
+    kl: float = 1e-4
+    """Weight of the KL term."""
+
+    def __post_init__(self) -> None:
+        """Check that a piece fits into the video and that the VAE can encode it."""
+        for name, crop, size in zip(
+            ("rows", "columns"), self.crop, (self.video.height, self.video.width), strict=True
+        ):
+            if crop % SPATIAL_STRIDE or not 0 < crop <= size:
+                raise InputError(
+                    f"A piece of {crop} {name} cannot be cut out of {size}: it must be a multiple "
+                    f"of {SPATIAL_STRIDE} and at most the video's. (crop)"
+                )
+
+    def networks(self, rngs: nnx.Rngs) -> WanVAE:
+        """The VAE with random weights."""
+        return WanVAE(self.vae, rngs=rngs)
+
+    def examples(self) -> grain.transforms.RandomMap:
+        """Cut one random piece out of a record."""
+        return _RandomPiece(self)
+
+    def loss(self, networks: WanVAE, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
+        """The loss above, for sampled latents."""
+        video = to_model(batch["video"])
+        mean, logvar = networks.moments(video)
+        latents = mean + jnp.exp(logvar / 2) * jax.random.normal(key, mean.shape)
+        decoded = networks.decode_whole(latents)
+        absolute = jnp.abs(decoded - video).mean()
+        edges = _edge_error(decoded, video)
+        kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
+        metrics = {"absolute": absolute, "edges": edges, "kl": kl, "psnr": _psnr(decoded, video)}
+        return absolute + self.edges * edges + self.kl * kl, metrics
+
+    def validate(self, networks: WanVAE, batch: Batch) -> Metrics:
+        """Reconstruction of the mean latents."""
+        video = to_model(batch["video"])
+        decoded = networks.decode_whole(networks.moments(video)[0])
+        return {"psnr": _psnr(decoded, video)}
+
+
+class _RandomPiece(grain.transforms.RandomMap):
+    def __init__(self, task: Autoencoding):
+        self.task = task
+
+    def random_map(
+        self, element: Mapping[str, np.ndarray], rng: np.random.Generator
+    ) -> dict[str, np.ndarray]:
+        """A piece at a random place of a random stream."""
+        task, (rows, columns) = self.task, self.task.crop
+        stream = str(rng.choice(COLOURS, p=task.weights))
+        window = DecodeWindow(task.video, streams=(stream,)).random_map(element, rng)
+        video = window[stream]
+        top = int(rng.integers(0, task.video.height - rows + 1))
+        left = int(rng.integers(0, task.video.width - columns + 1))
+        return {"video": video[:, top : top + rows, left : left + columns]}
+
+
+def _edge_error(a: Float[Array, "b f h w 3"], b: Float[Array, "b f h w 3"]) -> jax.Array:
+    difference = a - b
+    rows = jnp.abs(difference[:, :, 1:] - difference[:, :, :-1]).mean()
+    columns = jnp.abs(difference[:, :, :, 1:] - difference[:, :, :, :-1]).mean()
+    return rows + columns
+
+
+def _psnr(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) -> jax.Array:
+    """Mean over the clips, in dB, of float frames clipped to [-1, 1]."""
+    error = jnp.square(jnp.clip(decoded, -1, 1) - video).mean(axis=(1, 2, 3, 4))
+    return (10 * jnp.log10(4.0 / jnp.maximum(error, 1e-10))).mean()
+
+
+def latent_statistics(
+    vae: WanVAE, videos: Iterable[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of each latent channel over uint8 videos `f h w 3`."""
+    graph, params = nnx.split(vae)
+
+    @jax.jit
+    def sums(params: Any, video: jax.Array) -> jax.Array:
+        mean, _ = nnx.merge(graph, params).moments(to_model(video)[None])
+        return jnp.stack([mean.mean((0, 1, 2, 3)), jnp.square(mean).mean((0, 1, 2, 3))])
+
+    first, second = np.mean([np.asarray(sums(params, video)) for video in videos], axis=0)
+    return first, np.sqrt(second - first**2)

@@ -1,0 +1,105 @@
+"""Training the denoiser on cached latents, with its small encoders if the model has them.
+
+The loss is the flow-matching objective (`diffusion/objective.py`) of the velocity under a condition
+from which prior, mask, hands and text are dropped at random (`conditioning/dropout.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float
+
+from egosim_jax.conditioning import assemble
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.diffusion.objective import Objective
+from egosim_jax.generator import ModelConfig
+from egosim_jax.models.clip_vision import CLIPVision
+from egosim_jax.models.umt5 import UMT5
+from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.train.step import Batch, Metrics
+from egosim_jax.types import Condition
+
+VALIDATION_TIMES = (0.2, 0.5, 0.8, 0.97)
+"""Noise levels at which the validation loss is measured."""
+
+
+class Denoiser(nnx.Module):
+    """The networks that are trained: the DiT, and the encoders of a model that trains its own."""
+
+    def __init__(self, config: ModelConfig, *, rngs: nnx.Rngs):
+        joint = config.encoders == "joint"
+        self.dit = WanDiT(config.dit, rngs=rngs)
+        self.text = UMT5(config.text, rngs=rngs) if joint else None
+        self.image = CLIPVision(config.image, rngs=rngs) if joint and config.image else None
+
+    def condition(self, batch: Batch) -> Condition:
+        """The condition of a cached batch."""
+        text = batch["text"] if self.text is None else self.text(batch["ids"], batch["ids_mask"])
+        image = batch.get("image") if self.image is None else self.image(batch["pixels"])
+        return Condition(
+            mask=batch["mask"].astype(jnp.float32),
+            prior=batch["prior"],
+            hands=batch["hands"],
+            text=text,
+            image=image,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Denoising:
+    """The task of training the denoiser."""
+
+    model: ModelConfig
+    """The model whose denoiser is trained."""
+    objective: Objective = field(default_factory=Objective)
+    """How noise levels are drawn and errors weighted."""
+    dropout: ConditionDropout = field(default_factory=ConditionDropout)
+    """How often each condition is hidden."""
+
+    def networks(self, rngs: nnx.Rngs) -> Denoiser:
+        """The trained networks with random weights."""
+        return Denoiser(self.model, rngs=rngs)
+
+    def examples(self) -> grain.transforms.Map:
+        """Drop what is not an array of the batch."""
+        return _Arrays()
+
+    def loss(self, networks: Denoiser, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
+        """The flow-matching loss of a batch under dropped conditions."""
+        drop, draw = jax.random.split(key)
+        condition = self.dropout.apply(networks.condition(batch), drop)
+        loss, _ = self.objective.loss(_velocity(networks, condition), batch["truth"], draw)
+        return loss, {}
+
+    def validate(self, networks: Denoiser, batch: Batch) -> Metrics:
+        """Errors at fixed noise levels and with fixed noise, under the full condition."""
+        velocity = _velocity(networks, networks.condition(batch))
+        truth = batch["truth"]
+        noise = jax.random.normal(jax.random.key(0), truth.shape)
+        errors = {
+            f"loss_{time}": self.objective.loss_at(
+                velocity, truth, noise, jnp.full(truth.shape[:1], time)
+            ).mean()
+            for time in VALIDATION_TIMES
+        }
+        return {"loss": sum(errors.values()) / len(errors), **errors}
+
+
+class _Arrays(grain.transforms.Map):
+    def map(self, element: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The arrays of a record."""
+        return dict(element)
+
+
+def _velocity(networks: Denoiser, condition: Condition):  # noqa: ANN202
+    def velocity(x: Float[Array, "b f h w c"], t: Float[Array, " b"]) -> Float[Array, "b f h w c"]:
+        return networks.dit(assemble(x, condition), t, condition.text, condition.image)
+
+    return velocity
