@@ -9,13 +9,14 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from egosim_jax.types import InputError
 
 DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = 0, 1, 2, 3, 70, 75
 
 
+@runtime_checkable
 class Command(Protocol):
     """A parsed command line."""
 
@@ -37,7 +38,7 @@ def main(commands: Any, *, program: str, description: str, args: Sequence[str] |
         prog=program,
         description=description,
         args=args,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+        config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     return guarded(command.run)
 

@@ -6,11 +6,12 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.run import write_text
 
 
+@runtime_checkable
 class Writer(Protocol):
     """Something that takes a step's numbers."""
 

@@ -94,8 +94,7 @@ class _RandomPiece(grain.transforms.RandomMap):
         """A piece at a random place of a random stream."""
         task, (rows, columns) = self.task, self.task.crop
         stream = str(rng.choice(COLOURS, p=task.weights))
-        window = DecodeWindow(task.video, streams=(stream,)).random_map(element, rng)
-        video = window[stream]
+        video = DecodeWindow(task.video).random_map(element, rng)[stream]
         top = int(rng.integers(0, task.video.height - rows + 1))
         left = int(rng.integers(0, task.video.width - columns + 1))
         return {"video": video[:, top : top + rows, left : left + columns]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import optax
@@ -15,6 +15,7 @@ Batch = Mapping[str, jax.Array]
 Metrics = dict[str, jax.Array]
 
 
+@runtime_checkable
 class Task(Protocol):
     """What is trained, on what, and by which loss."""
 
@@ -47,7 +48,7 @@ def make_update(
             return task.loss(nnx.merge(graph, params), batch, key)
 
         (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
-        metrics = {"loss": value, "gradient_norm": optax.global_norm(gradients), **metrics}
+        metrics = {"loss": value, "gradient_norm": optax.tree.norm(gradients), **metrics}
         return state.apply(gradients, optimizer), metrics
 
     return update

@@ -1,7 +1,8 @@
 """Names of the video transformer's weights: Wan 2.1's official files and diffusers' model.
 
 EgoSim and Wan 2.1 Fun InP have the official names. Like every table: `wan` and `diffusers` give
-the rules of a naming, `ignored` the patterns of names, in any naming, that the network does not use.
+the rules of a naming, `ignored` the patterns of names, in any naming, that the network does not
+use.
 """
 
 from __future__ import annotations

@@ -78,10 +78,14 @@ class Evaluate:
         splits = summarise_splits([(window.split, scores) for window, scores in compared])
         out = self.out or self.generated
         write_text(out / "metrics.jsonl", "".join(f"{json.dumps(line)}\n" for line in lines))
-        write_json(
-            out / "report.json",
-            {"definitions": {**DEFINITIONS, "frames": "1 to the last"}, "splits": splits},
-        )
+        report = {
+            "definitions": {**DEFINITIONS, "frames": "1 to the last"},
+            "splits": {
+                split: {method: asdict(summary) for method, summary in methods.items()}
+                for split, methods in splits.items()
+            },
+        }
+        write_json(out / "report.json", report)
         _print(splits)
         return PARTIAL if failed else DONE
 

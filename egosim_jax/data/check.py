@@ -45,23 +45,25 @@ def _shard_problems(folder: Path, shard: ShardInfo, manifest: Manifest) -> list[
         problems.append(f"{path}: its SHA-256 is not the manifest's")
     try:
         reader = ArrayRecordReader(str(path))
+        if reader.num_records() != shard.records:
+            problems.append(
+                f"{path}: {reader.num_records()} records, the manifest says {shard.records}"
+            )
+        for index in range(reader.num_records()):
+            name = f"{path}, record {index}"
+            problems += [f"{name}: {line}" for line in _read_problems(reader, index, manifest)]
+        reader.close()
     except RuntimeError as error:
-        return [*problems, f"{path}: not an ArrayRecord file: {error}"]
-    count = reader.num_records()
-    if count != shard.records:
-        problems.append(f"{path}: {count} records, the manifest says {shard.records}")
-    for index in range(count):
-        name = f"{path}, record {index}"
-        try:
-            record = from_bytes(reader.read([index])[0], name=name)
-        except RecordError as error:
-            problems.append(str(error))
-        except RuntimeError as error:
-            problems.append(f"{name} cannot be read: {error}")
-        else:
-            problems += [f"{name}: {problem}" for problem in _record_problems(record, manifest)]
-    reader.close()
+        problems.append(f"{path}: {error}")
     return problems
+
+
+def _read_problems(reader: ArrayRecordReader, index: int, manifest: Manifest) -> list[str]:
+    try:
+        record = from_bytes(reader.read([index])[0])
+    except (RuntimeError, RecordError) as error:
+        return [f"cannot be read: {error}"]
+    return _record_problems(record, manifest)
 
 
 def _record_problems(record: Record, manifest: Manifest) -> list[str]:

@@ -182,8 +182,9 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         if not self._shards:
             raise InputError(f"No record was written to {self.folder}.")
         (self.folder / MANIFEST).unlink(missing_ok=True)
+        ours = {f"{shard.file}.tmp" for shard in self._shards}
         for old in self.folder.iterdir():
-            if SHARD_NAME.fullmatch(old.name):
+            if SHARD_NAME.fullmatch(old.name.removesuffix(".tmp")) and old.name not in ours:
                 old.unlink()
         for shard in self._shards:
             (self.folder / f"{shard.file}.tmp").replace(self.folder / shard.file)

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO, no_type_check
+from typing import no_type_check
 
 import av
 import numpy as np
@@ -105,7 +105,7 @@ def decode_video(
 
 
 def write_video(
-    path: Path, frames: UInt8[np.ndarray, "f h w 3"], fps: float | Fraction, *, crf: int = 10
+    path: Path, frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = 10
 ) -> None:
     """Write an H.264 mp4: to a temporary name, then renamed, so that it is whole or absent."""
     data = encode_video(frames, fps, crf=crf)
@@ -116,7 +116,7 @@ def write_video(
 
 
 def encode_video(
-    frames: UInt8[np.ndarray, "f h w 3"], fps: float | Fraction, *, crf: int = 10
+    frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = 10
 ) -> bytes:
     """Encode RGB frames as an H.264 (yuv420p) mp4 file.
 
@@ -160,7 +160,7 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
     return _decode_image(io.BytesIO(data), name)
 
 
-def _probe(file: BinaryIO, name: str) -> VideoInfo:
+def _probe(file: io.BufferedReader | io.BytesIO, name: str) -> VideoInfo:
     with _open_video(file, name) as container:
         stream = container.streams.video[0]
         count = sum(1 for packet in container.demux(stream) if packet.size)
@@ -171,7 +171,14 @@ def _probe(file: BinaryIO, name: str) -> VideoInfo:
         )
 
 
-def _decode(file: BinaryIO, name: str, *, start: int, stop: int | None, max_frames: int) -> Video:
+def _decode(
+    file: io.BufferedReader | io.BytesIO,
+    name: str,
+    *,
+    start: int,
+    stop: int | None,
+    max_frames: int,
+) -> Video:
     frames = []
     with _open_video(file, name, max_frames=max_frames) as container:
         stream = container.streams.video[0]
@@ -197,7 +204,7 @@ def _decode(file: BinaryIO, name: str, *, start: int, stop: int | None, max_fram
 
 
 @contextmanager
-def _open_file(path: Path) -> Iterator[BinaryIO]:
+def _open_file(path: Path) -> Iterator[io.BufferedReader | io.BytesIO]:
     """A file opened here, so that no video library ever resolves a name."""
     try:
         file = path.open("rb")
@@ -213,7 +220,7 @@ def _open_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _open_video(
-    file: BinaryIO, name: str, *, max_frames: int = MAX_FRAMES
+    file: io.BufferedReader | io.BytesIO, name: str, *, max_frames: int = MAX_FRAMES
 ) -> Iterator[InputContainer]:
     """A container with a video stream of an allowed size; decoder errors become `InputError`."""
     limits = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "none"}
@@ -245,7 +252,7 @@ def _rate(container: InputContainer, name: str) -> Fraction:
     return rate
 
 
-def _decode_image(file: BinaryIO, name: str) -> np.ndarray:
+def _decode_image(file: io.BufferedReader | io.BytesIO, name: str) -> np.ndarray:
     try:
         with Image.open(file) as image:
             if image.width * image.height > MAX_IMAGE_PIXELS:

@@ -3,18 +3,21 @@
     y[t, p] = sum_(k, s) x[t + k, p + s] W[k, s]        VALID in time, SAME in space
 
 The caller puts the frames of the past in front of `x`. GPUs and TPUs have a kernel for it. XLA's
-CPU backend has a good one for images only, so that there the sum over k is taken over images: as a
-sum of convolutions or, where x has few channels, as one convolution of the 3 frames' channels
-side by side. For large images it is also poor at the gradient
+CPU backend has a good one for images only, so that there the sum over k is one over images: of
+convolutions or, where x has few channels, of channels, with the frames' channels side by side. It
+is also slow at the gradient for large images,
 
     dW[k, s] = sum_(t, p) x[t + k, p + s] dy[t, p]
 
 which is computed here as a product of matrices, one frame of x at a time: its shifted copies side
-by side, against the frames of dy that it reaches. `tests/benchmarks/bench_causal_conv.py` has the
-times of all forms.
+by side times the frames of dy that it reaches. `tests/benchmarks/bench_causal_conv.py` compares
+the forms.
 """
 
 from __future__ import annotations
+
+from functools import reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
@@ -22,63 +25,93 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 FEW_CHANNELS = 8
-"""Up to this many input channels, the CPU convolves all frames' channels at once."""
+"""Up to this many input channels, the CPU puts the frames' channels side by side."""
 LARGE_IMAGE = 32 * 32
-"""From this many pixels on, the CPU computes the kernel's gradient as a product of matrices."""
+"""From this many pixels on, the CPU takes the kernel's gradient as a product of matrices."""
 
 
 def convolve(
     x: Float[Array, "b f h w i"], kernel: Float[Array, "kt kh kw i o"]
 ) -> Float[Array, "b g h w o"]:
-    """Convolve a video with a kernel of odd rows and columns; g = f - kt + 1, but at least 0."""
+    """Convolve a video with a kernel of odd height and width; g = f - kt + 1 frames."""
     return by_image(x, kernel) if jax.default_backend() == "cpu" else direct(x, kernel)
 
 
 def direct(
     x: Float[Array, "b f h w i"], kernel: Float[Array, "kt kh kw i o"]
 ) -> Float[Array, "b g h w o"]:
-    """`convolve` as one 3D convolution of XLA's."""
-    _, rows, columns, _, _ = kernel.shape
-    padding = ((0, 0), (rows // 2, rows // 2), (columns // 2, columns // 2))
+    """`convolve` as one 3D convolution."""
+    _, height, width, _, _ = kernel.shape
+    padding = ((0, 0), (height // 2, height // 2), (width // 2, width // 2))
     return jax.lax.conv_general_dilated(
         x, kernel, (1, 1, 1), padding, dimension_numbers=("NDHWC", "DHWIO", "NDHWC")
     )
+
+
+def sum_of_images(
+    x: Float[Array, "b f h w i"], kernel: Float[Array, "kt kh kw i o"]
+) -> Float[Array, "b g h w o"]:
+    """`convolve` as 2D convolutions, with the gradient that they have."""
+    taps = kernel.shape[0]
+    frames = x.shape[1] - taps + 1
+    reached = [rearrange(x[:, k : k + frames], "b f h w i -> (b f) h w i") for k in range(taps)]
+    if x.shape[-1] <= FEW_CHANNELS:
+        reached = [jnp.concatenate(reached, axis=-1)]
+        kernel = rearrange(kernel, "t h w i o -> 1 h w (t i) o")
+    terms = [
+        jax.lax.conv_general_dilated(
+            images, tap, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        for images, tap in zip(reached, kernel, strict=True)
+    ]
+    return rearrange(reduce(add, terms), "(b f) h w o -> b f h w o", b=x.shape[0])
 
 
 @jax.custom_vjp
 def by_image(
     x: Float[Array, "b f h w i"], kernel: Float[Array, "kt kh kw i o"]
 ) -> Float[Array, "b g h w o"]:
-    """`convolve` as 2D convolutions; differentiable in reverse mode only."""
-    taps = kernel.shape[0]
-    frames = max(0, x.shape[1] - taps + 1)
-    reached = [rearrange(x[:, k : k + frames], "b f h w i -> (b f) h w i") for k in range(taps)]
-    if x.shape[-1] <= FEW_CHANNELS:
-        images = jnp.concatenate(reached, axis=-1)
-        y = _convolve_images(images, rearrange(kernel, "t h w i o -> h w (t i) o"))
-    else:
-        y = sum(map(_convolve_images, reached, kernel))
-    return rearrange(y, "(b f) h w o -> b f h w o", b=x.shape[0])
-
-
-def _convolve_images(x: Array, kernel: Array) -> Array:
-    return jax.lax.conv_general_dilated(
-        x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
+    """`sum_of_images` with a faster gradient, in reverse mode only."""
+    return sum_of_images(x, kernel)
 
 
 def _forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
-    return by_image(x, kernel), (x, kernel)
+    return sum_of_images(x, kernel), (x, kernel)
 
 
 def _backward(saved: tuple[Array, Array], dy: Array) -> tuple[Array, Array]:
     x, kernel = saved
     past = kernel.shape[0] - 1
-    dy = jnp.pad(dy, ((0, 0), (past, past), (0, 0), (0, 0), (0, 0)))
-    dx = by_image(dy, rearrange(kernel[::-1, ::-1, ::-1], "t h w i o -> t h w o i"))
-    if x.shape[2] * x.shape[3] < LARGE_IMAGE:
-        
-    return dx, _kernel_gradient(x, dy, kernel)
+    padded = jnp.pad(dy, ((0, 0), (past, past), (0, 0), (0, 0), (0, 0)))
+    flipped = rearrange(kernel[::-1, ::-1, ::-1], "t h w i o -> t h w o i")
+    dx = sum_of_images(padded, flipped)
+    if x.shape[2] * x.shape[3] >= LARGE_IMAGE and x.shape[-1] > FEW_CHANNELS:
+        return dx, _kernel_gradient(x, padded, kernel)
+    return dx, *jax.vjp(lambda kernel: sum_of_images(x, kernel), kernel)[1](dy)
 
 
 by_image.defvjp(_forward, _backward)
+
+
+def _kernel_gradient(x: Array, dy: Array, kernel: Array) -> Array:
+    """The sum over t and p; `dy` with kt - 1 frames of zeros before and after."""
+    taps, rows, columns, _, _ = kernel.shape
+    frames, height, width = x.shape[1:4]
+    x = jnp.pad(x, ((0, 0), (0, 0), (rows // 2,) * 2, (columns // 2,) * 2, (0, 0)))
+    reaching = jnp.stack([dy[:, taps - 1 - k :][:, :frames] for k in range(taps)], axis=-2)
+
+    def step(total: Array, frame: tuple[Array, Array]) -> tuple[Array, None]:
+        image, dy = frame
+        shifted = jnp.concatenate(
+            [image[i : i + height, j : j + width] for i in range(rows) for j in range(columns)],
+            axis=-1,
+        )
+        left = rearrange(shifted, "h w c -> (h w) c")
+        right = rearrange(dy, "h w t o -> (h w) (t o)")
+        return total + jnp.matmul(left.T, right, preferred_element_type=jnp.float32), None
+
+    xs = (rearrange(x, "b f ... -> (b f) ..."), rearrange(reaching, "b f ... -> (b f) ..."))
+    start = jnp.zeros((rows * columns * x.shape[-1], taps * dy.shape[-1]), jnp.float32)
+    total, _ = jax.lax.scan(step, start, xs)
+    names = {"h": rows, "w": columns, "t": taps}
+    return rearrange(total, "(h w i) (t o) -> t h w i o", **names).astype(kernel.dtype)

@@ -50,10 +50,8 @@ class DiTContext:
 
     patches: Float[Array, "b n d"]
     """The condition's share of the patch embedding, with its bias."""
-    text: KeysValues
-    """Cross-attention keys and values of the text, for all layers."""
-    image: KeysValues | None
-    """The same of the image."""
+    sources: tuple[KeysValues, ...]
+    """Cross-attention keys and values of all layers: of the text, then of the image if any."""
     rotation: Float[Array, "n p 2"]
     """Rotary table of the tokens."""
 
@@ -85,18 +83,18 @@ class WanDiT(nnx.Module):
         """
         self._check(condition.shape, has_image=image is not None)
         _, f, h, w, _ = condition.shape
-        text_tokens = self.text(text)
-        image_tokens = None if self.image is None or image is None else self.image(image)
+        tokens = [self.text(text)]
+        if self.image is not None and image is not None:
+            tokens.append(self.image(image))
 
         def step(layer: CrossAttention, x: None, _: None) -> tuple:
-            image_kv = layer.image and layer.image.keys_values(image_tokens)
-            return x, (layer.keys_values(text_tokens), image_kv)
+            branches = zip(layer.branches, tokens, strict=True)
+            return x, tuple(branch.keys_values(y) for branch, y in branches)
 
-        _, (text_kv, image_kv) = scan_blocks(step, self.blocks.cross_attn, None, remat=self._remat)
+        _, sources = scan_blocks(step, self.blocks.cross_attn, None, remat=self._remat)
         return DiTContext(
             patches=self.patch.condition(condition),
-            text=text_kv,
-            image=image_kv,
+            sources=sources,
             rotation=rope.rotations(f, h // PATCH, w // PATCH, self.config.head_dim),
         )
 
@@ -107,11 +105,11 @@ class WanDiT(nnx.Module):
         _, _, h, w, _ = noisy.shape
         time, modulation = self.time(t)
 
-        def step(block: Block, x: jax.Array, kv: tuple) -> tuple:
-            return block(x, modulation, context.rotation, *kv), None
+        def step(block: Block, x: jax.Array, sources: tuple[KeysValues, ...]) -> tuple:
+            return block(x, modulation, context.rotation, sources), None
 
         x = self.patch.noisy(noisy) + context.patches
-        x, _ = scan_blocks(step, self.blocks, x, (context.text, context.image), remat=self._remat)
+        x, _ = scan_blocks(step, self.blocks, x, context.sources, remat=self._remat)
         return rearrange(
             self.head(x, time),
             "b (f h w) (i j c) -> b f (h i) (w j) c",
@@ -143,22 +141,22 @@ class WanDiT(nnx.Module):
 
     def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
         _, _, h, w, channels = condition
-        if channels != self.config.condition_channels:
+        config = self.config
+        if channels != config.condition_channels:
             raise InputError(
-                f"The condition has {channels} channels; this model reads "
-                f"{self.config.condition_channels} beside the {self.config.out_channels} noisy ones "
-                f"(in_channels {self.config.in_channels})."
+                f"A condition of {channels} channels does not fit this model: it reads "
+                f"{config.condition_channels} beside the {config.out_channels} noisy ones "
+                f"(in_channels {config.in_channels})."
             )
         if h % PATCH or w % PATCH:
             raise InputError(
                 f"Latents of {h} x {w} cells do not split into patches of {PATCH} x {PATCH}: both "
                 "sizes must be even (pixels in multiples of 16)."
             )
-        if has_image != (self.config.image_dim is not None):
-            needs = "no image tokens" if has_image else "image tokens"
+        if has_image != (config.image_dim is not None):
+            given, fix = ("were", "Leave them out") if has_image else ("were not", "Pass them")
             raise InputError(
-                f"This model needs {needs} (image_dim {self.config.image_dim}): "
-                f"{'leave image out' if has_image else 'pass the image encoder output as image'}."
+                f"Image tokens {given} given to a model with image_dim {config.image_dim}. {fix}."
             )
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import Literal
 
 import jax
@@ -39,7 +39,7 @@ IMAGE_NORM_EPS = 1e-5
 """Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
 
 Activation = Callable[[jax.Array], jax.Array]
-KeysValues = tuple[Float[Array, "*l b m h k"], Float[Array, "*l b m h k"]]
+KeysValues = tuple[Float[Array, "*l b _ h k"], Float[Array, "*l b _ h k"]]
 Remat = Literal["none", "full", "attention"]
 
 xavier = nnx.initializers.xavier_uniform()
@@ -280,13 +280,17 @@ class CrossAttention(Attention):
         super().__init__(config, rngs=rngs)
         self.image = None if config.image_dim is None else KeyValue(config, rngs=rngs)
 
+    @property
+    def branches(self) -> tuple[KeyValue, ...]:
+        """What makes the keys and values of the text and, if any, of the image."""
+        return (self,) if self.image is None else (self, self.image)
+
     def __call__(
-        self, x: Float[Array, "b n d"], text: KeysValues, image: KeysValues | None
+        self, x: Float[Array, "b n d"], sources: tuple[KeysValues, ...]
     ) -> Float[Array, "b n d"]:
-        """Attend to the keys and values that `WanDiT.prepare` made."""
+        """Attend to each source by itself and add the results."""
         q = self.queries(x)
-        out = self.attend(q, *text)
-        return self.o(out if image is None else out + self.attend(q, *image))
+        return self.o(reduce(jnp.add, (self.attend(q, *keys_values) for keys_values in sources)))
 
 
 class Block(nnx.Module):
@@ -306,15 +310,14 @@ class Block(nnx.Module):
         x: Float[Array, "b n d"],
         modulation: Float[Array, "b 6 d"],
         rotation: Float[Array, "n p 2"],
-        text: KeysValues,
-        image: KeysValues | None,
+        sources: tuple[KeysValues, ...],
     ) -> Float[Array, "b n d"]:
         """Update the residual stream; sums are taken in float32 and kept in x's dtype."""
         shifts = self.modulation[...].astype(jnp.float32) + modulation
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = rearrange(shifts, "b k d -> k b 1 d")
         attended = self.self_attn(modulate(self.norm(x), shift_a, scale_a), rotation)
         x = (x + gate_a * attended).astype(x.dtype)
-        x = x + self.cross_attn(self.cross_norm(x), text, image)
+        x = x + self.cross_attn(self.cross_norm(x), sources)
         mapped = self.mlp(modulate(self.norm(x), shift_m, scale_m))
         return (x + gate_m * mapped).astype(x.dtype)
 

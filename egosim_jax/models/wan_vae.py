@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from egosim_jax.models.attention import attention
+from egosim_jax.models.causal_conv import convolve
 from egosim_jax.models.layers import Initializer, Linear, RMSNorm, lecun_normal
 from egosim_jax.types import SPATIAL_STRIDE, TEMPORAL_STRIDE, InputError, check_frame_count
 
@@ -46,7 +47,6 @@ Cache = Any
 Input = Float[Array, "b f h w i"]
 Output = tuple[Float[Array, "b g y x o"], Cache]
 Layer = Callable[[Array, Cache], tuple[Array, Cache]]
-Padding = str | Sequence[tuple[int, int]]
 _small = nnx.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
 
 
@@ -81,9 +81,9 @@ class WanVAEConfig:
         """Check that the strides are 4 x 8 x 8 and that the statistics fit the latents."""
         if len(self.dim_mult) != 4 or len(self.temporal_downsample) != 3:
             raise InputError(
-                f"{len(self.dim_mult)} levels and {len(self.temporal_downsample)} temporal flags do "
-                f"not give a stride of {SPATIAL_STRIDE} pixels: dim_mult needs 4 entries and "
-                "temporal_downsample 3."
+                f"{len(self.dim_mult)} levels with {len(self.temporal_downsample)} steps between "
+                f"them do not give a stride of {SPATIAL_STRIDE} pixels: dim_mult needs 4 entries "
+                "and temporal_downsample 3."
             )
         if sum(self.temporal_downsample) != 2:
             raise InputError(
@@ -96,31 +96,6 @@ class WanVAEConfig:
                     f"{name} has {len(getattr(self, name))} entries for {self.z_dim} latent "
                     "channels (z_dim): give one number per channel."
                 )
-
-
-def conv2d(
-    x: Float[Array, "n h w i"],
-    kernel: Float[Array, "kh kw i o"],
-    *,
-    stride: int = 1,
-    padding: Padding = "SAME",
-) -> Float[Array, "n h2 w2 o"]:
-    """Convolve images."""
-    return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), padding, dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
-
-
-def conv3d(
-    x: Float[Array, "b f h w i"], kernel: Float[Array, "kt kh kw i o"], *, stride: int = 1
-) -> Float[Array, "b f2 h w o"]:
-    """Convolve a video, VALID in time (to which `stride` applies) and SAME in space."""
-    frames = max(0, (x.shape[1] - kernel.shape[0]) // stride + 1)
-    terms = [
-        conv2d(rearrange(x[:, k::stride][:, :frames], "b f h w i -> (b f) h w i"), tap)
-        for k, tap in enumerate(kernel)
-    ]
-    return rearrange(sum(terms), "(b f) h w o -> b f h w o", b=x.shape[0])
 
 
 class Conv(nnx.Module):
@@ -141,22 +116,28 @@ class Conv(nnx.Module):
         self.kernel = nnx.Param(kernel, axes=(*(None for _ in size), None, "mlp"))
         self.bias = nnx.Param(jnp.zeros(out_dim), axes=("mlp",))
 
-    def __call__(
-        self, x: Float[Array, "b f h w i"], *, stride: int = 1, padding: Padding = "SAME"
-    ) -> Float[Array, "b f2 h2 w2 o"]:
-        """Convolve; a stride belongs to time if the kernel has it, else to rows and columns."""
-        x, kernel = x.astype(self.dtype), self.kernel[...].astype(self.dtype)
-        if kernel.ndim == 5:
-            y = conv3d(x, kernel, stride=stride)
-        else:
-            images = rearrange(x, "b f h w i -> (b f) h w i")
-            y = conv2d(images, kernel, stride=stride, padding=padding)
-            y = rearrange(y, "(b f) h w o -> b f h w o", b=x.shape[0])
+    def __call__(self, x: Input) -> Float[Array, "b g h w o"]:
+        """Convolve, SAME in space and, with a kernel over time, VALID in time."""
+        kernel = self.kernel[...].astype(self.dtype)
+        y = convolve(x.astype(self.dtype), kernel if kernel.ndim == 5 else kernel[None])
+        return y + self.bias[...].astype(self.dtype)
+
+    def halve(self, x: Input) -> Float[Array, "b f y x o"]:
+        """Convolve images with stride 2, padded by a row below and a column on the right."""
+        images = rearrange(x.astype(self.dtype), "b f h w i -> (b f) h w i")
+        y = jax.lax.conv_general_dilated(
+            images,
+            self.kernel[...].astype(self.dtype),
+            (2, 2),
+            ((0, 1), (0, 1)),
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )
+        y = rearrange(y, "(b f) h w o -> b f h w o", b=x.shape[0])
         return y + self.bias[...].astype(self.dtype)
 
 
 def causal(conv: Conv, x: Input, cache: Cache) -> Output:
-    """Convolve each frame with the two before it, zeros before the first; the cache is those two."""
+    """Convolve each frame with the two before it, or zeros; the cache is the last two."""
     if cache is None:
         cache = jnp.zeros((x.shape[0], 2, *x.shape[2:]), conv.dtype)
     x = jnp.concatenate([cache, x.astype(conv.dtype)], axis=1)
@@ -212,15 +193,14 @@ class Downsample(nnx.Module):
         self.time = Conv((3, 1, 1), dim, dim, dtype=dtype, rngs=rngs) if temporal else None
 
     def __call__(self, x: Input, cache: Cache) -> Output:
-        """Downsample; the cache is the last frame that the temporal convolution has seen."""
-        x = self.space(x, stride=2, padding=((0, 1), (0, 1)))
+        """Downsample; the cache is that of the temporal convolution."""
+        x = self.space.halve(x)
         if self.time is None:
             return x, None
+        y, after = causal(self.time, x, cache)
         if cache is None:
-            first = x[:, :1]
-            return jnp.concatenate([first, self.time(x, stride=2)], axis=1), x[:, -1:]
-        y = self.time(jnp.concatenate([cache, x], axis=1), stride=2)
-        return y, x[:, -1:]
+            return jnp.concatenate([x[:, :1], y[:, 2::2]], axis=1), after
+        return y[:, 1::2], after
 
 
 class Upsample(nnx.Module):
@@ -342,7 +322,7 @@ class WanVAE(nnx.Module):
         return self.normalise(self.moments(video)[0])
 
     def decode_whole(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
-        """The video of latents that are not normalised, in one pass and not clipped: for training."""
+        """The video of latents not normalised, in one pass and not clipped: for training."""
         video, _ = self.decoder(self.from_latents(latents), None)
         return video.astype(jnp.float32)
 
@@ -404,9 +384,10 @@ def standardise_latents(vae: WanVAE, mean: Float[Any, " z"], std: Float[Any, " z
     is encoded gives the same video as before.
     """
     encode, decode = vae.to_moments, vae.from_latents
+    encode_bias, decode_bias = cast(nnx.Param, encode.bias), cast(nnx.Param, decode.bias)
     scale = jnp.concatenate([1 / std, jnp.ones_like(std)])
     shift = jnp.concatenate([-mean / std, -2 * jnp.log(std)])
     encode.kernel[...] = encode.kernel[...] * scale
-    encode.bias[...] = encode.bias[...] * scale + shift
-    decode.bias[...] = decode.bias[...] + mean @ decode.kernel[...]
+    encode_bias[...] = encode_bias[...] * scale + shift
+    decode_bias[...] = decode_bias[...] + mean @ decode.kernel[...]
     decode.kernel[...] = std[:, None] * decode.kernel[...]

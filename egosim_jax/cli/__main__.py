@@ -1,0 +1,66 @@
+"""`egosim`: generate clips, compare them with the truth, prepare data."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from egosim_jax import command
+from egosim_jax.cli.data import Check, Encode, Pack, Sample, Stats
+from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.cli.experiment import RealTiny
+from egosim_jax.cli.generate import Generate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Data:
+    """Prepare data: sample clips, shards of videos, frames or latents."""
+
+    command: (
+        Annotated[Sample, tyro.conf.subcommand("sample")]
+        | Annotated[Pack, tyro.conf.subcommand("pack")]
+        | Annotated[Encode, tyro.conf.subcommand("encode")]
+        | Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Stats, tyro.conf.subcommand("stats")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Repeat a documented experiment: training, generation and its table, by one command."""
+
+    command: Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
+
+    def run(self) -> int:
+        """Run the chosen experiment."""
+        return self.command.run()
+
+
+Commands = (
+    Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Data, tyro.conf.subcommand("data")]
+    | Annotated[Experiment, tyro.conf.subcommand("experiment")]
+)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run `egosim`."""
+    return command.main(
+        Commands,
+        program="egosim",
+        description="An egocentric world simulator in JAX.",
+        args=args,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

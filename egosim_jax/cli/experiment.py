@@ -1,0 +1,134 @@
+"""`egosim experiment`: documented experiments, each by one command that resumes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.cli.generate import RESULTS, Generate
+from egosim_jax.command import DONE
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egosim_jax.data.metadata import ClipFiles
+    from egosim_jax.train.script import Training
+
+SHEET_FRAMES = (4, 10, 16)
+"""Frames of each clip on the contact sheet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealTiny:
+    """Train `real_tiny` on the train split, generate both splits, compare, and draw a sheet.
+
+    Beside the clips as they are, generates each with the prior, mask and hands of another clip:
+    what that costs is what the model takes from them. Writes report.json and contact_sheet.png.
+    """
+
+    metadata: Path
+    """CSV or JSONL in EgoSim's columns, with video and split; clips of 61 frames."""
+    out: Path
+    """Folder of the run."""
+    config: str = "real_tiny"
+    """Name of the model."""
+    start: tuple[int, ...] = (0, 22, 44)
+    """First frames of the windows that are generated."""
+    seed: int = 0
+    """Seed of the generated clips."""
+    batch_size: int = 5
+    """Clips generated together."""
+
+    def run(self) -> int:
+        """Train, generate, compare, draw."""
+        from egosim_jax.io.run import write_json
+        from egosim_jax.train.recipes import RealTiny as Recipe
+
+        Recipe(metadata=self.metadata, out=self.out, config=self.config).run()
+        swapped = self._swap()
+        reports = {
+            name: self._report(name, metadata)
+            for name, metadata in (("generated", self.metadata), ("swapped", swapped))
+        }
+        for split, methods in reports["generated"]["splits"].items():
+            other = reports["swapped"]["splits"][split]["generated"]["psnr"]
+            cost = methods["generated"]["psnr"] - other
+            print(f"{split}: another clip's prior and hands cost {cost:.2f} dB")
+        write_json(self.out / "report.json", reports)
+        sheet = self.out / "contact_sheet.png"
+        draw_sheet(self.out / "generated", sheet)
+        print(sheet)
+        return DONE
+
+    def _report(self, name: str, metadata: Path) -> dict[str, Any]:
+        """Generate and compare; the comparison's report."""
+        folder = self.out / name
+        Generate(
+            config=self.config,
+            metadata=metadata,
+            out=folder,
+            weights=self.out / "weights",
+            start=self.start,
+            seed=self.seed,
+            batch_size=self.batch_size,
+            skip_existing=True,
+            reconstruct=name == "generated",
+        ).run()
+        print(name)
+        Evaluate(generated=folder, metadata=metadata).run()
+        return json.loads((folder / "report.json").read_text("utf-8"))
+
+    def _swap(self) -> Path:
+        """A metadata file in which each clip has the conditions of the next one of its split."""
+        from egosim_jax.data.metadata import read_metadata
+        from egosim_jax.io.run import write_text
+
+        items = read_metadata(self.metadata)
+        lines = []
+        for split in sorted({item.extra["split"] for item in items}):
+            clips = [item for item in items if item.extra["split"] == split]
+            for clip, other in zip(clips, [*clips[1:], clips[0]], strict=True):
+                lines.append(json.dumps(_row(clip, other)))
+        path = self.out / "swapped.jsonl"
+        write_text(path, "".join(f"{line}\n" for line in lines))
+        return path
+
+
+def _row(clip: ClipFiles, other: ClipFiles) -> dict[str, str]:
+    """A metadata row with the prior (beside which the mask lies) and the hands of another clip."""
+    return {
+        "video": str(clip.truth and clip.truth.resolve()),
+        "ego_prior_video": str(other.prior.resolve()),
+        "hand_keypoint_video": str(other.hands.resolve()),
+        "first_frame": str(clip.first_frame.resolve()),
+        "prompt": clip.prompt,
+        "video_id": clip.video_id,
+        **clip.extra,
+    }
+
+
+def draw_sheet(folder: Path, out: Path) -> None:
+    """Three frames of each generated clip: prior, hands, generated and truth in every row."""
+    import numpy as np
+    from PIL import Image, ImageDraw
+
+    from egosim_jax.io.video import read_video
+
+    lines = [json.loads(line) for line in (folder / RESULTS).read_text("utf-8").splitlines()]
+    shown = {line["source_id"]: line for line in reversed(lines) if line["status"] == "done"}
+    rows = []
+    for line in sorted(shown.values(), key=lambda line: (line.get("split", ""), line["video_id"])):
+        frames = read_video(folder / f"{line['video_id']}_cmp.mp4").frames
+        picture = np.concatenate([frames[min(i, len(frames) - 1)] for i in SHEET_FRAMES], axis=1)
+        header = Image.new("RGB", (picture.shape[1], 14), "white")
+        text = f"{line.get('split', '')}  {line['video_id']}  prior | hands | generated | truth"
+        ImageDraw.Draw(header).text((2, 1), text, fill="black")
+        rows += [np.asarray(header), picture]
+    temporary = out.with_suffix(".tmp.png")
+    Image.fromarray(np.concatenate(rows)).save(temporary)
+    temporary.replace(out)

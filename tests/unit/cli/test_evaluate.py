@@ -1,0 +1,133 @@
+"""`egosim evaluate`: what is compared with what."""
+
+import json
+
+import numpy as np
+import pytest
+
+from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.io.video import read_video, write_video
+from egosim_jax.metrics.image import psnr, ssim
+from egosim_jax.types import InputError
+
+
+@pytest.fixture
+def run(clips, tmp_path):
+    """A folder of generated clips: the truth a little darker."""
+    folder = tmp_path / "run"
+    for name in ("clip0", "clip1"):
+        write_video(folder / f"{name}.mp4", truth(clips, name) // 2 + 50, 16)
+    return folder
+
+
+def truth(clips, name):
+    return read_video(clips.parent / name / "video.mp4").frames
+
+
+def metrics(folder):
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return {line["video_id"]: line for line in map(json.loads, lines)}
+
+
+def test_a_clip_is_compared_with_its_truth_from_frame_1_on(clips, run):
+    assert Evaluate(generated=run, metadata=clips).run() == DONE
+    generated, reference = read_video(run / "clip1.mp4").frames, truth(clips, "clip1")
+    scores = metrics(run)["clip1"]
+    assert scores["generated"]["psnr"] == pytest.approx(psnr(generated, reference)[1:].mean())
+    assert scores["generated"]["ssim"] == pytest.approx(ssim(generated, reference)[1:].mean())
+    assert scores["split"] == "test"
+
+
+def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):
+    Evaluate(generated=run, metadata=clips).run()
+    scores, reference = metrics(run)["clip0"], truth(clips, "clip0")
+    prior = read_video(clips.parent / "clip0" / "ego_prior_video.mp4").frames
+    still = np.broadcast_to(reference[:1], reference.shape)
+    assert scores["prior"]["psnr"] == pytest.approx(psnr(prior, reference)[1:].mean())
+    assert scores["still"]["psnr"] == pytest.approx(psnr(still, reference)[1:].mean())
+    assert scores["prior_fit"]["psnr"] > scores["prior"]["psnr"]
+    assert "vae" not in scores
+
+
+def test_a_reconstruction_beside_a_clip_is_the_ceiling(clips, run):
+    write_video(run / "clip0_vae.mp4", truth(clips, "clip0"), 16)
+    Evaluate(generated=run, metadata=clips).run()
+    copy, reference = read_video(run / "clip0_vae.mp4").frames, truth(clips, "clip0")
+    assert metrics(run)["clip0"]["vae"]["psnr"] == pytest.approx(psnr(copy, reference)[1:].mean())
+    assert "vae" not in metrics(run)["clip1"]
+
+
+def test_the_truth_is_stretched_to_the_generated_size(clips, run):
+    small = truth(clips, "clip0")[:, ::2, ::2]
+    write_video(run / "clip0.mp4", small, 16)
+    Evaluate(generated=run, metadata=clips).run()
+    assert metrics(run)["clip0"]["generated"]["psnr"] > 25
+
+
+def test_results_name_the_windows(clips, run):
+    write_video(run / "clip0_3.mp4", truth(clips, "clip0")[3:8], 16)
+    line = {"video_id": "clip0_3", "source_id": "clip0", "start": 3, "status": "done"}
+    (run / "results.jsonl").write_text(json.dumps(line) + "\n")
+    assert Evaluate(generated=run, metadata=clips).run() == DONE
+    assert list(metrics(run)) == ["clip0_3"]
+    generated, reference = read_video(run / "clip0_3.mp4").frames, truth(clips, "clip0")[3:8]
+    expected = psnr(generated, reference)[1:].mean()
+    assert metrics(run)["clip0_3"]["generated"]["psnr"] == pytest.approx(expected)
+
+
+def test_the_last_line_of_a_clip_counts(clips, run):
+    lines = [{"video_id": "clip0", "source_id": "clip0", "start": 0, "status": "failed"}]
+    lines.append({**lines[0], "status": "done"})
+    (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert Evaluate(generated=run, metadata=clips).run() == DONE
+
+
+def test_a_clip_that_failed_is_left_out_and_named(clips, run, capsys):
+    lines = [
+        {"video_id": name, "source_id": name, "start": 0, "status": status}
+        for name, status in (("clip0", "failed"), ("clip1", "done"))
+    ]
+    (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert "left out: clip0: it was not generated" in capsys.readouterr().err
+    assert list(metrics(run)) == ["clip1"]
+
+
+def test_a_missing_clip_is_left_out_and_named(clips, run, capsys):
+    (run / "clip0.mp4").unlink()
+    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert "left out: clip0: There is no file" in capsys.readouterr().err
+
+
+def test_rows_are_selected_by_column(clips, run):
+    assert Evaluate(generated=run, metadata=clips, where="split=test").run() == DONE
+    assert list(metrics(run)) == ["clip1"]
+
+
+def test_the_report_has_definitions_and_a_summary_for_each_split(clips, run, tmp_path, capsys):
+    Evaluate(generated=run, metadata=clips, out=tmp_path / "report").run()
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert set(report["definitions"]) == {"psnr", "ssim", "spread", "frames"}
+    assert report["splits"]["train"]["generated"]["clips"] == 1
+    printed = capsys.readouterr().out
+    assert "train, 1 clips" in printed
+    assert "test, 1 clips" in printed
+
+
+def test_a_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
+    write_video(run / "clip0.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
+    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert "ends before frame 13" in capsys.readouterr().err
+
+
+def test_metadata_without_truth_is_refused(clips, run):
+    lines = clips.read_text().splitlines()
+    clips.write_text("\n".join(line.split(",", 1)[1] for line in lines))
+    with pytest.raises(InputError, match="could be compared"):
+        Evaluate(generated=run, metadata=clips).run()
+
+
+def test_a_missing_folder_is_refused(clips, tmp_path):
+    with pytest.raises(InputError, match="There is no folder"):
+        Evaluate(generated=tmp_path / "none", metadata=clips).run()

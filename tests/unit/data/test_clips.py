@@ -1,0 +1,168 @@
+"""Reading a clip at a model's length and size, strictly or as the EgoSim release does."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egosim_jax.data.clips import check_clip, load_triplet
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.io.video import read_image, read_video, write_video
+from egosim_jax.types import InputError, VideoSpec
+
+NATIVE = VideoSpec(frames=9, height=32, width=48)
+
+
+@pytest.fixture
+def files(clips):
+    return read_metadata(clips)[0]
+
+
+def shorten(path, frames):
+    write_video(path, read_video(path).frames[:frames], 16)
+
+
+def shrink(path, height, width):
+    write_video(path, read_video(path).frames[:, :height, :width], 16)
+
+
+def test_a_clip_of_the_models_size_passes_unchanged(files):
+    triplet = load_triplet(files, NATIVE)
+    np.testing.assert_array_equal(triplet.prior, read_video(files.prior).frames)
+    np.testing.assert_array_equal(triplet.hands, read_video(files.hands).frames)
+    np.testing.assert_array_equal(triplet.truth, read_video(files.truth).frames)
+    np.testing.assert_array_equal(triplet.mask, read_video(files.mask).frames[..., 0])
+    np.testing.assert_array_equal(triplet.first_frame, read_image(files.first_frame))
+
+
+def test_id_prompt_and_further_columns_come_from_the_metadata(files):
+    triplet = load_triplet(files, NATIVE)
+    assert (triplet.video_id, triplet.prompt) == ("clip0", "hands move, clip 0")
+    assert triplet.extra == {"split": "train"}
+
+
+def test_colours_are_stretched_with_lanczos(files):
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=64))
+    frame = Image.fromarray(read_video(files.prior).frames[3])
+    expected = frame.resize((64, 16), Image.Resampling.LANCZOS)
+    np.testing.assert_array_equal(triplet.prior[3], np.asarray(expected))
+
+
+def test_the_mask_is_channel_0_of_the_bilinear_frames(files):
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=64))
+    frame = Image.fromarray(read_video(files.mask).frames[3])
+    expected = np.asarray(frame.resize((64, 16), Image.Resampling.BILINEAR))[..., 0]
+    np.testing.assert_array_equal(triplet.mask[3], expected)
+
+
+def test_a_longer_clip_gives_the_window_at_start(files):
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), start=3)
+    np.testing.assert_array_equal(triplet.hands, read_video(files.hands).frames[3:8])
+
+
+def test_the_image_is_the_clips_own_wherever_the_window_begins(files):
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), start=3)
+    np.testing.assert_array_equal(triplet.first_frame, read_image(files.first_frame))
+
+
+def test_the_first_frame_may_be_a_video(files):
+    files = dataclasses.replace(files, first_frame=files.truth)
+    np.testing.assert_array_equal(
+        load_triplet(files, NATIVE).first_frame, read_video(files.truth).frames[0]
+    )
+
+
+def test_a_clip_without_truth_has_none(files):
+    assert load_triplet(dataclasses.replace(files, truth=None), NATIVE).truth is None
+
+
+def test_a_sound_clip_has_no_problems(files):
+    assert check_clip(files, NATIVE) == []
+
+
+@pytest.mark.parametrize("name", ["prior", "hands", "mask", "first_frame", "truth"])
+def test_strict_refuses_a_missing_file_by_row_and_path(files, name):
+    path = getattr(files, name)
+    path.unlink()
+    assert check_clip(files, NATIVE) == [f"metadata.csv line 2 (clip0): There is no file {path}."]
+
+
+def test_every_missing_file_is_listed(files):
+    files.prior.unlink()
+    files.hands.unlink()
+    assert len(check_clip(files, NATIVE)) == 2
+
+
+def test_strict_refuses_frame_counts_that_disagree(files):
+    shorten(files.hands, 5)
+    with pytest.raises(InputError, match="disagree: prior 9, hands 5, mask 9, truth 9"):
+        load_triplet(files, NATIVE)
+
+
+def test_strict_refuses_a_count_that_is_not_4k_plus_1(make_clips):
+    (files,) = read_metadata(make_clips(count=1, frames=10))
+    with pytest.raises(InputError, match=r"10 frames cannot be encoded.*Nearest: 9 or 13"):
+        load_triplet(files, NATIVE)
+
+
+def test_strict_refuses_a_clip_shorter_than_the_window(files):
+    with pytest.raises(InputError, match="9 frames are fewer than the 12"):
+        load_triplet(files, NATIVE, start=3)
+
+
+def test_strict_refuses_sizes_that_disagree(files):
+    shrink(files.hands, 16, 48)
+    with pytest.raises(InputError, match="disagree: prior 48x32, hands 48x16"):
+        load_triplet(files, NATIVE)
+
+
+def test_strict_refuses_sizes_that_are_not_multiples_of_16(make_clips):
+    (files,) = read_metadata(make_clips(count=1, height=24))
+    with pytest.raises(InputError, match="48x24 pixels: width and height must be multiples of 16"):
+        load_triplet(files, NATIVE)
+
+
+def test_strict_refuses_an_unreadable_video(files):
+    files.prior.write_bytes(b"no video")
+    with pytest.raises(InputError, match=r"ego_prior_video\.mp4 is not a readable video"):
+        load_triplet(files, NATIVE)
+
+
+def test_lenient_repeats_the_last_frame(files):
+    shorten(files.hands, 6)
+    hands = load_triplet(files, NATIVE, policy="lenient").hands
+    have = read_video(files.hands).frames
+    np.testing.assert_array_equal(hands, have[[0, 1, 2, 3, 4, 5, 5, 5, 5]])
+
+
+def test_lenient_cuts(files):
+    shorten(files.prior, 6)
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), policy="lenient")
+    np.testing.assert_array_equal(triplet.prior, read_video(files.prior).frames[:5])
+
+
+def test_lenient_stretches_each_video_to_the_size(files):
+    shrink(files.hands, 16, 32)
+    hands = load_triplet(files, NATIVE, policy="lenient").hands
+    frame = Image.fromarray(read_video(files.hands).frames[0])
+    expected = frame.resize((48, 32), Image.Resampling.LANCZOS)
+    np.testing.assert_array_equal(hands[0], np.asarray(expected))
+
+
+def test_lenient_takes_a_missing_mask_for_all_observed(files):
+    files.mask.unlink()
+    mask = load_triplet(files, NATIVE, policy="lenient").mask
+    assert mask.shape == (9, 32, 48)
+    assert not mask.any()
+
+
+def test_lenient_does_without_a_missing_truth(files):
+    files.truth.unlink()
+    assert load_triplet(files, NATIVE, policy="lenient").truth is None
+
+
+def test_lenient_still_refuses_a_missing_prior(files):
+    files.prior.unlink()
+    with pytest.raises(InputError, match="There is no file"):
+        load_triplet(files, NATIVE, policy="lenient")

@@ -1,0 +1,209 @@
+"""The order of the data: by seed alone, shared by processes, resumed exactly."""
+
+import grain
+import numpy as np
+import pytest
+
+from egosim_jax.data.loader import Loader, make_loader
+from egosim_jax.data.shards import ShardReader, ShardWriter, to_bytes
+from egosim_jax.data.transforms import DecodeWindow
+from egosim_jax.types import InputError, VideoSpec
+
+RECORDS = 12
+
+
+@pytest.fixture
+def source(tmp_path):
+    """Twelve records; the number of each is in all of its array."""
+    with ShardWriter(tmp_path / "shards", kind="latents", shard_bytes=2000) as writer:
+        for index in range(RECORDS):
+            writer.add({"x": np.full((9, 2), index, np.float32)}, {"video_id": f"clip{index}"})
+    return ShardReader(tmp_path / "shards")
+
+
+class Noise(grain.transforms.RandomMap):
+    """An example that is a random number."""
+
+    def random_map(self, element, rng):
+        return {"noise": rng.random(), "x": element["x"]}
+
+
+def numbers(loader, batches):
+    return [next(loader)["record"].tolist() for _ in range(batches)]
+
+
+def test_a_batch_stacks_the_records_it_names(source):
+    batch = next(make_loader(source, batch_size=4, seed=0))
+    assert batch["x"].shape == (4, 9, 2)
+    np.testing.assert_array_equal(batch["x"][:, 0, 0], batch["record"])
+
+
+def test_every_epoch_holds_every_record_once_in_another_order(source):
+    loader = make_loader(source, batch_size=RECORDS, seed=0)
+    first, second = numbers(loader, 2)
+    assert sorted(first) == sorted(second) == list(range(RECORDS))
+    assert first != second
+
+
+def test_the_same_seed_gives_the_same_order(source):
+    assert numbers(make_loader(source, batch_size=4, seed=7), 9) == numbers(
+        make_loader(source, batch_size=4, seed=7), 9
+    )
+
+
+def test_another_seed_gives_another_order(source):
+    assert numbers(make_loader(source, batch_size=4, seed=7), 9) != numbers(
+        make_loader(source, batch_size=4, seed=8), 9
+    )
+
+
+def test_without_shuffle_and_repeat_it_is_one_pass_of_whole_batches(source):
+    loader = make_loader(source, batch_size=5, seed=0, shuffle=False, repeat=False)
+    assert [batch["record"].tolist() for batch in loader] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
+
+
+def test_two_processes_read_disjoint_halves_of_an_epoch(source):
+    seen = []
+    for p in range(2):
+        loader = make_loader(source, batch_size=4, seed=0, process_index=p, process_count=2)
+        seen += [number for batch in numbers(loader, 3) for number in batch]
+    assert sorted(seen) == list(range(RECORDS))
+
+
+def test_a_global_batch_is_the_same_for_any_number_of_processes(source):
+    alone = numbers(make_loader(source, batch_size=4, seed=0), 7)
+    shared = [
+        numbers(make_loader(source, batch_size=4, seed=0, process_index=p, process_count=4), 7)
+        for p in range(4)
+    ]
+    together = np.concatenate(shared, axis=1).tolist()
+    assert together == alone
+
+
+def test_random_numbers_belong_to_the_position_not_to_the_process(source):
+    def noise(**processes):
+        loader = make_loader(source, batch_size=4, seed=0, transform=Noise(), **processes)
+        return [next(loader)["noise"].tolist() for _ in range(3)]
+
+    alone = noise()
+    second = noise(process_index=1, process_count=2)
+    assert second == [batch[1::2] for batch in alone]
+
+
+def test_random_numbers_differ_between_epochs(source):
+    loader = make_loader(source, batch_size=RECORDS, seed=0, transform=Noise(), shuffle=False)
+    assert set(next(loader)["noise"]).isdisjoint(next(loader)["noise"])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_restored_state_gives_the_same_next_100_records(source, workers):
+    loader = make_loader(source, batch_size=4, seed=3, workers=workers)
+    numbers(loader, 5)
+    state = loader.get_state()
+    expected = numbers(loader, 25)
+    loader.close()
+    resumed = make_loader(source, batch_size=4, seed=3, workers=workers)
+    resumed.set_state(state)
+    assert numbers(resumed, 25) == expected
+    resumed.close()
+
+
+def test_workers_deal_out_the_same_order(source):
+    with_workers = make_loader(source, batch_size=4, seed=3, workers=2, transform=Noise())
+    without = make_loader(source, batch_size=4, seed=3, transform=Noise())
+    for _ in range(4):
+        np.testing.assert_array_equal(next(with_workers)["noise"], next(without)["noise"])
+    with_workers.close()
+
+
+@pytest.mark.parametrize(
+    "change", [{"seed": 4}, {"batch_size": 2}, {"workers": 1}, {"shuffle": False}]
+)
+def test_a_state_of_another_order_is_refused(source, change):
+    state = make_loader(source, batch_size=4, seed=3).get_state()
+    other = make_loader(source, **{"batch_size": 4, "seed": 3, **change})
+    (name,) = change
+    with pytest.raises(InputError, match=f"{name}: the state has"):
+        other.set_state(state)
+    other.close()
+
+
+def test_a_state_of_other_records_is_refused(source, tmp_path):
+    state = make_loader(source, batch_size=1, seed=3).get_state()
+    with ShardWriter(tmp_path / "other", kind="latents") as writer:
+        writer.add({"x": np.zeros(3, np.float32)}, {"video_id": "a"})
+    with pytest.raises(InputError, match="data: the state has"):
+        make_loader(ShardReader(tmp_path / "other"), batch_size=1, seed=3).set_state(state)
+
+
+@pytest.fixture
+def damaged(source):
+    """The source with a flipped byte in record 1."""
+    path = source.folder / "shard-00000.array_record"
+    data = bytearray(path.read_bytes())
+    data[data.index(to_bytes(source[1])[100:])] ^= 0xFF
+    path.write_bytes(data)
+    return ShardReader(source.folder)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_damaged_record_is_skipped_counted_and_named(damaged, workers):
+    loader = make_loader(damaged, batch_size=4, seed=0, shuffle=False, workers=workers)
+    assert numbers(loader, 6) == [
+        [0, 2, 3, 4],
+        [5, 6, 7, 8],
+        [9, 10, 11, 0],
+        [2, 3, 4, 5],
+        [6, 7, 8, 9],
+        [10, 11, 0, 2],
+    ]
+    ((name, count),) = loader.skipped.items()
+    assert name.startswith(str(damaged.folder / "shard-00000.array_record, record 1"))
+    assert count == 3
+    loader.close()
+
+
+def test_too_many_damaged_records_stop_the_run_with_their_names(source, monkeypatch):
+    def refuse(arrays):
+        raise InputError("no good")
+
+    monkeypatch.setattr(Loader, "MAX_BAD", 3)
+    loader = make_loader(source, batch_size=4, seed=0, transform=refuse)
+    with pytest.raises(InputError, match=r"(?s)Too many.*no good.*no good"):
+        next(loader)
+
+
+def test_a_mistake_in_a_transform_is_not_taken_for_a_bad_record(source):
+    loader = make_loader(source, batch_size=4, seed=0, transform=lambda arrays: arrays["typo"])
+    with pytest.raises(KeyError, match="typo"):
+        next(loader)
+
+
+def test_a_batch_that_processes_cannot_share_is_refused(source):
+    with pytest.raises(InputError, match="A batch of 5 cannot be shared by 2 processes"):
+        make_loader(source, batch_size=5, seed=0, process_count=2)
+
+
+def test_a_single_pass_over_less_than_a_batch_is_refused(source):
+    with pytest.raises(InputError, match="fewer than one batch"):
+        make_loader(source, batch_size=RECORDS + 1, seed=0, repeat=False)
+
+
+def test_a_window_is_cut_from_all_videos_alike(tmp_path):
+    frames = np.arange(9, dtype=np.uint8)[:, None, None, None]
+    video = np.broadcast_to(frames, (9, 16, 16, 3))
+    arrays = {"truth": video, "prior": video + 20, "hands": video + 40, "mask": video[..., 0] + 60}
+    with ShardWriter(tmp_path, kind="frames") as writer:
+        writer.add({**arrays, "first_frame": video[0] + 99}, {"video_id": "a"})
+    spec = VideoSpec(frames=5, height=16, width=16)
+    loader = make_loader(ShardReader(tmp_path), batch_size=1, seed=0, transform=DecodeWindow(spec))
+    starts = set()
+    for _ in range(40):
+        batch = next(loader)
+        start = int(batch["truth"][0, 0, 0, 0, 0])
+        starts.add(start)
+        for name, offset in (("truth", 0), ("prior", 20), ("hands", 40), ("mask", 60)):
+            window = batch[name][0, :, 0, 0].reshape(5, -1)[:, 0]
+            np.testing.assert_array_equal(window, np.arange(start, start + 5) + offset)
+        assert (batch["first_frame"] == 99).all()
+    assert starts == {0, 1, 2, 3, 4}

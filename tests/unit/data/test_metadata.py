@@ -1,0 +1,171 @@
+"""What a metadata file says, and every way in which it can be wrong."""
+
+import json
+
+import pytest
+
+from egosim_jax.data.metadata import read_metadata, select
+from egosim_jax.types import InputError
+
+HEADER = "video,ego_prior_video,hand_keypoint_video,first_frame,prompt,video_id,split"
+ROW = "a/video.mp4,a/prior.mp4,a/hands.mp4,a/first.png,pick it up,a,train"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(*lines, name="metadata.csv"):
+        path = tmp_path / name
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_paths_are_relative_to_the_metadata(write, tmp_path):
+    (item,) = read_metadata(write(HEADER, ROW))
+    assert item.prior == tmp_path / "a/prior.mp4"
+    assert item.hands == tmp_path / "a/hands.mp4"
+    assert item.first_frame == tmp_path / "a/first.png"
+    assert item.truth == tmp_path / "a/video.mp4"
+
+
+def test_the_mask_lies_beside_the_prior(write, tmp_path):
+    (item,) = read_metadata(write(HEADER, ROW.replace("a/prior.mp4", "renders/a/p.mp4")))
+    assert item.mask == tmp_path / "renders/a/pc_mask_video.mp4"
+
+
+def test_further_columns_are_carried(write):
+    (item,) = read_metadata(write(HEADER, ROW))
+    assert item.extra == {"split": "train"}
+
+
+def test_a_further_column_may_be_empty(write):
+    (item,) = read_metadata(write(HEADER, ROW.removesuffix("train")))
+    assert item.extra == {"split": ""}
+
+
+def test_a_file_without_the_column_video_has_no_truth(write):
+    lines = [line.split(",", 1)[1] for line in (HEADER, ROW)]
+    assert read_metadata(write(*lines))[0].truth is None
+
+
+def test_json_lines_say_the_same_as_csv(write):
+    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True))
+    (from_json,) = read_metadata(write("", json.dumps(row), name="metadata.jsonl"))
+    (from_csv,) = read_metadata(write(HEADER, ROW))
+    assert vars(from_json) == {**vars(from_csv), "row": "metadata.jsonl line 2"}
+
+
+def test_a_prompt_may_hold_commas_and_line_breaks(write):
+    items = read_metadata(
+        write(HEADER, ROW.replace("pick it up", '"pick it up,\nput it down"'), _other("b"))
+    )
+    assert items[0].prompt == "pick it up,\nput it down"
+    assert [item.row for item in items] == ["metadata.csv line 2", "metadata.csv line 4"]
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_column(write):
+    assert read_metadata(write("\ufeff" + HEADER, ROW))[0].truth is not None
+
+
+def test_all_missing_columns_are_listed(write):
+    with pytest.raises(InputError, match="no column hand_keypoint_video, first_frame"):
+        read_metadata(write("video,ego_prior_video,prompt,video_id", "v.mp4,p.mp4,x,a"))
+
+
+@pytest.mark.parametrize("cell", ["", "  ", "nan", "NaN"])
+@pytest.mark.parametrize("column", ["video", "ego_prior_video", "prompt", "video_id"])
+def test_an_empty_cell_is_named_by_line_and_column(write, column, cell):
+    cells = ROW.split(",")
+    cells[HEADER.split(",").index(column)] = cell
+    with pytest.raises(InputError, match=f"line 3, column {column}: the cell is empty"):
+        read_metadata(write(HEADER, _other("b"), ",".join(cells)))
+
+
+def test_null_is_an_empty_cell(write):
+    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True))
+    with pytest.raises(InputError, match="line 1, column prompt"):
+        read_metadata(write(json.dumps({**row, "prompt": None}), name="metadata.jsonl"))
+
+
+@pytest.mark.parametrize("video_id", ["a/b", "../a", ".a", "a b", "a\\b", "é", "a" * 201])
+def test_an_id_that_cannot_name_a_file_is_refused(write, video_id):
+    with pytest.raises(InputError, match=r"line 2: video_id .* cannot name a file"):
+        read_metadata(write(HEADER, _other(video_id)))
+
+
+def test_a_repeated_id_is_named_with_both_lines(write):
+    with pytest.raises(InputError, match="line 3: video_id 'a' is already that of line 2"):
+        read_metadata(write(HEADER, ROW, ROW))
+
+
+def test_every_problem_is_listed_at_once(write):
+    with pytest.raises(InputError) as caught:
+        read_metadata(write(HEADER, _other("a/b"), ROW.replace("pick it up", "")))
+    assert "line 2" in str(caught.value)
+    assert "line 3" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("lines", "name", "message"),
+    [
+        ([HEADER], "m.csv", "lists no clips"),
+        ([HEADER, ROW + ",more"], "m.csv", "line 2: 8 cells, but the header has 7"),
+        ([HEADER + ",split", ROW + ",x"], "m.csv", "more than one column split"),
+        ([HEADER, '"open'], "m.csv", "cannot be read as CSV"),
+        (["{"], "m.jsonl", "line 1 is not JSON"),
+        (["[]"], "m.jsonl", "line 1 is not a JSON object"),
+        (["{}"], "m.jsonl", "line 1: no column ego_prior_video"),
+    ],
+)
+def test_a_file_that_is_no_table_is_refused(write, lines, name, message):
+    with pytest.raises(InputError, match=message):
+        read_metadata(write(*lines, name=name))
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path):
+    with pytest.raises(InputError, match=r"none\.csv"):
+        read_metadata(tmp_path / "none.csv")
+
+
+@pytest.fixture
+def items(write):
+    lines = [_other(name, split) for name, split in (("a", "x"), ("b", "y"), ("c", "x"))]
+    return read_metadata(write(HEADER, *lines))
+
+
+def test_rows_are_selected_by_column(items):
+    assert [item.video_id for item in select(items, where="split=x")] == ["a", "c"]
+
+
+def test_rows_are_selected_by_id_in_the_given_order(items):
+    assert [item.video_id for item in select(items, video_ids=["c", "a"])] == ["c", "a"]
+
+
+def test_a_limit_takes_the_first_rows(items):
+    assert [item.video_id for item in select(items, limit=2)] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"where": "splt=x"}, "with one of the columns split"),
+        ({"where": "split"}, "must be COLUMN=VALUE"),
+        ({"where": "split=z"}, "split is one of: x, y"),
+        ({"video_ids": ["d"]}, "No clip is called d"),
+        ({"limit": 0}, "--limit must be at least 1, not 0"),
+    ],
+)
+def test_a_selection_of_nothing_is_refused(items, arguments, message):
+    with pytest.raises(InputError, match=message):
+        select(items, **arguments)
+
+
+def test_a_mistyped_id_gets_the_nearest_name(write):
+    items = read_metadata(write(HEADER, _other("fold_cloth_7"), _other("pick_place_2")))
+    with pytest.raises(InputError, match=r"Did you mean fold_cloth_7\?"):
+        select(items, video_ids=["fold_cloth_8"])
+
+
+def _other(video_id, split="train"):
+    return f"v.mp4,p.mp4,h.mp4,f.png,pick it up,{video_id},{split}"

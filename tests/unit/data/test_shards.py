@@ -1,0 +1,359 @@
+"""Shards: what goes in comes out bit for bit, and what is broken is named."""
+
+import json
+import pickle
+
+import ml_dtypes
+import numpy as np
+import pytest
+
+from egosim_jax.data.check import check
+from egosim_jax.data.shards import (
+    MANIFEST,
+    Record,
+    RecordError,
+    ShardReader,
+    ShardWriter,
+    from_bytes,
+    read_manifest,
+    to_bytes,
+)
+from egosim_jax.io.video import encode_video
+from egosim_jax.types import InputError, VideoSpec
+
+SPEC = VideoSpec(frames=9, height=32, width=48)
+
+
+def latents(index, shape=(3, 4, 6, 16)):
+    rng = np.random.default_rng(index)
+    return {
+        "truth": rng.standard_normal(shape).astype(ml_dtypes.bfloat16),
+        "mask": rng.integers(0, 2, (3, 4, 6, 4)).astype(np.uint8),
+        "text": rng.standard_normal((5, 8)).astype(np.float32),
+    }
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Seven records of latents in several shards."""
+    with ShardWriter(
+        tmp_path / "shards",
+        kind="latents",
+        spec=SPEC,
+        provenance={"vae": "abc"},
+        shard_bytes=13_000,
+    ) as writer:
+        for index in range(7):
+            writer.add(latents(index), {"video_id": f"clip{index}", "prompt": f"é {index}"})
+    return tmp_path / "shards"
+
+
+def rewrite_manifest(folder, change):
+    fields = json.loads((folder / MANIFEST).read_text())
+    change(fields)
+    (folder / MANIFEST).write_text(json.dumps(fields))
+
+
+def first_shard(folder):
+    return folder / "shard-00000.array_record"
+
+
+def problems(folder):
+    return [problem for _, found in check(folder) for problem in found]
+
+
+@pytest.mark.parametrize(
+    "dtype", [np.uint8, np.int32, np.int64, np.float16, np.float32, np.bool_, ml_dtypes.bfloat16]
+)
+def test_a_record_survives_bit_for_bit(dtype):
+    array = np.arange(24).reshape(2, 3, 4).astype(dtype)
+    record = Record(arrays={"x": array}, metadata={"video_id": "a", "extra": {"split": "é"}})
+    back = from_bytes(to_bytes(record))
+    assert back.metadata == record.metadata
+    assert back.arrays["x"].dtype == array.dtype
+    assert back.arrays["x"].shape == array.shape
+    assert back.arrays["x"].tobytes() == array.tobytes()
+
+
+def test_a_transposed_array_keeps_its_order():
+    array = np.arange(6, dtype=np.int32).reshape(2, 3).T
+    back = from_bytes(to_bytes(Record(arrays={"x": array}, metadata={})))
+    np.testing.assert_array_equal(back.arrays["x"], array)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"short", bytes(64), to_bytes(Record(arrays={}, metadata={}))[:-1]]
+)
+def test_bytes_that_are_no_record_are_refused(data):
+    with pytest.raises(RecordError, match="is not a record"):
+        from_bytes(data)
+
+
+def test_records_are_read_in_any_order(folder):
+    reader = ShardReader(folder)
+    assert len(reader) == 7
+    for index in (6, 0, 3):
+        record = reader[index]
+        assert record.metadata == {"video_id": f"clip{index}", "prompt": f"é {index}"}
+        for name, array in latents(index).items():
+            assert record.arrays[name].tobytes() == array.tobytes()
+
+
+def test_iterating_ends_after_the_last_record(folder):
+    ids = [record.metadata["video_id"] for record in ShardReader(folder)]
+    assert ids == [f"clip{index}" for index in range(7)]
+
+
+@pytest.mark.parametrize("index", [-1, 7])
+def test_there_is_no_record_beyond_the_ends(folder, index):
+    with pytest.raises(IndexError):
+        ShardReader(folder)[index]
+
+
+def test_a_reader_can_be_pickled(folder):
+    reader = pickle.loads(pickle.dumps(ShardReader(folder)))  # noqa: S301
+    assert reader[5].metadata["video_id"] == "clip5"
+
+
+def test_a_full_shard_is_followed_by_another(folder):
+    manifest = read_manifest(folder)
+    # A record takes about 3.2 kB, so 13,000 bytes hold four.
+    assert [shard.records for shard in manifest.shards] == [4, 3]
+    assert manifest.records == 7
+
+
+def test_the_manifest_describes_the_records(folder):
+    manifest = read_manifest(folder)
+    assert (manifest.kind, manifest.spec, manifest.provenance) == ("latents", SPEC, {"vae": "abc"})
+    assert manifest.arrays["truth"].dtype == "bfloat16"
+    assert manifest.arrays["truth"].shape == (3, 4, 6, 16)
+
+
+def test_axes_on_which_records_differ_are_left_open(tmp_path):
+    with ShardWriter(tmp_path, kind="videos") as writer:
+        writer.add({"x": np.zeros((2, 3), np.uint8)}, {"video_id": "a"})
+        writer.add({"x": np.zeros((2, 5), np.uint8)}, {"video_id": "b"})
+        writer.add({"x": np.zeros((2, 3), np.uint8)}, {"video_id": "c"})
+    assert read_manifest(tmp_path).arrays["x"].shape == (2, None)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        ({"y": np.zeros(3, np.uint8)}, "holds .'y'., but the records before it hold .'x'."),
+        ({"x": np.zeros(3, np.float32)}, "x is float32, wanted uint8"),
+        ({"x": np.zeros((3, 1), np.uint8)}, r"x is \(3, 1\), wanted \(3,\)"),
+        ({"x": np.zeros(3, np.complex64)}, "x is complex64"),
+    ],
+)
+def test_records_must_hold_the_same_arrays(tmp_path, second, message):
+    def write():
+        with ShardWriter(tmp_path, kind="latents") as writer:
+            writer.add({"x": np.zeros(3, np.uint8)}, {"video_id": "a"})
+            writer.add(second, {"video_id": "b"})
+
+    with pytest.raises(InputError, match=message):
+        write()
+
+
+def test_an_interrupted_writer_leaves_nothing(tmp_path):
+    def write():
+        with ShardWriter(tmp_path, kind="latents", shard_bytes=4000) as writer:
+            writer.add(latents(0), {"video_id": "a"})
+            writer.add(latents(1), {"video_id": "b"})
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_manifest_is_no_dataset(folder):
+    (folder / MANIFEST).unlink()
+    with pytest.raises(InputError, match=r"holds no dataset: there is no manifest\.json"):
+        ShardReader(folder)
+
+
+def test_shards_are_not_replaced_unasked(folder):
+    with pytest.raises(InputError, match="--overwrite"):
+        ShardWriter(folder, kind="latents")
+
+
+def test_overwriting_replaces_all_of_the_old_shards(folder):
+    with ShardWriter(folder, kind="latents", overwrite=True) as writer:
+        writer.add(latents(9), {"video_id": "new"})
+    assert [record.metadata["video_id"] for record in ShardReader(folder)] == ["new"]
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path):
+    (tmp_path / "shard-00007.array_record.tmp").write_bytes(b"half a shard")
+    with ShardWriter(tmp_path, kind="latents") as writer:
+        writer.add(latents(0), {"video_id": "a"})
+    assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "shard-00000.array_record"}
+
+
+def test_the_old_shards_stay_until_the_new_ones_are_whole(folder):
+    def write():
+        with ShardWriter(folder, kind="latents", overwrite=True) as writer:
+            writer.add(latents(9), {"video_id": "new"})
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert len(ShardReader(folder)) == 7
+
+
+def test_writing_no_record_is_refused(tmp_path):
+    with pytest.raises(InputError, match="No record was written"):
+        ShardWriter(tmp_path, kind="latents").close()
+
+
+def test_sound_shards_have_no_problems(folder):
+    assert problems(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "missing"),
+        (lambda path: path.write_bytes(b""), "0 bytes, the manifest says"),
+        (lambda path: path.write_bytes(path.read_bytes()[:1000]), "1000 bytes, the manifest says"),
+    ],
+)
+def test_a_missing_empty_or_truncated_shard_is_named_at_opening(folder, damage, message):
+    damage(first_shard(folder))
+    with pytest.raises(InputError, match=message) as caught:
+        ShardReader(folder)
+    assert str(first_shard(folder)) in str(caught.value)
+    assert message in problems(folder)[0]
+
+
+def flip(path, position):
+    data = bytearray(path.read_bytes())
+    data[position] ^= 0xFF
+    path.write_bytes(data)
+
+
+def test_a_flipped_byte_is_named_when_its_record_is_read(folder):
+    path = first_shard(folder)
+    # Past the first record, within the second one's arrays.
+    flip(path, path.read_bytes().index(to_bytes(ShardReader(folder)[1])[200:300]))
+    reader = ShardReader(folder)
+    assert reader[0].metadata["video_id"] == "clip0"
+    with pytest.raises(RecordError, match="record 1 cannot be read"):
+        reader[1]
+
+
+def test_check_names_a_flipped_byte(folder):
+    path = first_shard(folder)
+    flip(path, path.read_bytes().index(to_bytes(ShardReader(folder)[1])[200:300]))
+    found = problems(folder)
+    assert found[0] == f"{path}: its SHA-256 is not the manifest's"
+    assert found[1].startswith(f"{path}, record 1: cannot be read")
+    assert len(found) == 2
+
+
+def test_check_names_a_file_that_is_no_array_record(folder):
+    path = first_shard(folder)
+    path.write_bytes(b"x" * path.stat().st_size)
+    assert f"{path}: 0 records, the manifest says 4" in problems(folder)
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "shard-1.array_record", ""])
+def test_a_manifest_that_names_other_paths_is_refused(folder, name):
+    rewrite_manifest(folder, lambda fields: fields["shards"][0].update(file=name))
+    with pytest.raises(InputError, match="must name shards like"):
+        ShardReader(folder)
+
+
+def test_a_shard_that_is_a_link_is_refused(folder):
+    path = first_shard(folder)
+    path.rename(folder / "elsewhere")
+    path.symlink_to(folder / "elsewhere")
+    with pytest.raises(InputError, match="missing"):
+        ShardReader(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda fields: fields.update(version=2), "version 2"),
+        (lambda fields: fields.update(kind="pickles"), "kind pickles"),
+        (lambda fields: fields.pop("shards"), "is not a manifest"),
+        (lambda fields: fields.update(shards=[]), "at least one record"),
+        (lambda fields: fields["shards"][0].update(records=0), "at least one record"),
+        (lambda fields: fields["spec"].update(frames=10), "4k[+]1"),
+        (lambda fields: fields["spec"].update(run="rm"), "is not a manifest"),
+        (lambda fields: fields.update(arrays=3), "is not a manifest"),
+    ],
+)
+def test_a_bad_manifest_is_refused(folder, change, message):
+    rewrite_manifest(folder, change)
+    with pytest.raises(InputError, match=message):
+        read_manifest(folder)
+
+
+def test_a_manifest_that_is_not_json_is_refused(folder):
+    (folder / MANIFEST).write_text("{")
+    with pytest.raises(InputError, match=r"manifest\.json cannot be read"):
+        read_manifest(folder)
+
+
+def test_check_names_a_wrong_record_count(folder):
+    rewrite_manifest(folder, lambda fields: fields["shards"][0].update(records=3))
+    assert problems(folder) == [f"{first_shard(folder)}: 4 records, the manifest says 3"]
+
+
+def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
+    def change(fields):
+        fields["arrays"]["text"]["shape"] = [5, 9]
+        fields["arrays"]["mask"]["dtype"] = "int32"
+        fields["arrays"]["hands"] = fields["arrays"].pop("truth")
+
+    rewrite_manifest(folder, change)
+    found = "\n".join(problems(folder))
+    assert "text is float32 (5, 8), the manifest says float32 (5, 9)" in found
+    assert "mask is uint8 (3, 4, 6, 4), the manifest says int32" in found
+    assert "truth is not in the manifest" in found
+    assert "hands is not in the record" in found
+
+
+def test_check_names_numbers_that_are_not_finite(tmp_path):
+    arrays = latents(0)
+    arrays["truth"][0, 0, 0, 0] = np.nan
+    with ShardWriter(tmp_path, kind="latents") as writer:
+        writer.add(arrays, {"video_id": "a"})
+    assert problems(tmp_path) == [
+        f"{first_shard(tmp_path)}, record 0: truth holds numbers that are not finite"
+    ]
+
+
+def test_check_names_an_id_that_is_a_path(tmp_path):
+    with ShardWriter(tmp_path, kind="latents") as writer:
+        writer.add(latents(0), {"video_id": "../../etc/x"})
+    assert "'../../etc/x' cannot name a file" in problems(tmp_path)[0]
+
+
+def as_bytes(frames):
+    return np.frombuffer(encode_video(np.zeros((frames, 32, 48, 3), np.uint8), 16), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("prior", "hands", "message"),
+    [
+        (as_bytes(10), as_bytes(10), "prior of 10 frames cannot be encoded"),
+        (as_bytes(9), as_bytes(5), "the frame counts disagree"),
+        (as_bytes(9), np.zeros(99, np.uint8), "hands is not a readable video"),
+    ],
+)
+def test_check_decodes_every_video(tmp_path, prior, hands, message):
+    with ShardWriter(tmp_path, kind="videos") as writer:
+        writer.add({"prior": prior, "hands": hands}, {"video_id": "a"})
+    assert any(message in problem for problem in problems(tmp_path))
+
+
+def test_check_decodes_every_image(tmp_path):
+    with ShardWriter(tmp_path, kind="videos") as writer:
+        writer.add({"first_frame": np.zeros(99, np.uint8)}, {"video_id": "a"})
+    assert "first_frame is not a readable image" in problems(tmp_path)[0]

@@ -1,0 +1,64 @@
+"""Attention against the textbook formula in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from egosim_jax.models.attention import attention
+
+ROUNDING = 2e-6
+"""Absolute, of float32 sums over at most 7 keys or 8 channels of order 1."""
+
+
+def draw(*shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def formula(q, k, v, scale):
+    scores = np.einsum("bnhk,bmhk->bhnm", q, k) * scale
+    weights = np.exp(scores - scores.max(-1, keepdims=True))
+    weights /= weights.sum(-1, keepdims=True)
+    return np.einsum("bhnm,bmhk->bnhk", weights, v)
+
+
+def inputs(keys):
+    return draw(2, 5, 3, 8), draw(2, keys, 3, 8, seed=1), draw(2, keys, 3, 8, seed=2)
+
+
+@pytest.mark.parametrize("keys", [5, 7])
+@pytest.mark.parametrize("scale", [None, 1.0])
+def test_attention_is_the_softmax_average_of_the_values(keys, scale):
+    q, k, v = inputs(keys)
+    have = attention(*map(jnp.float32, (q, k, v)), scale=scale)
+    want = formula(q, k, v, 8**-0.5 if scale is None else scale)
+    np.testing.assert_allclose(have, want, rtol=0, atol=ROUNDING)
+
+
+def test_scores_of_a_thousand_do_not_overflow():
+    q, k, v = inputs(5)
+    have = attention(*map(jnp.float32, (q, k, v)), scale=1000.0)
+    np.testing.assert_allclose(have, formula(q, k, v, 1000.0), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("argument", [0, 1, 2])
+def test_gradients_are_finite_differences_of_the_formula(argument):
+    arrays, g, direction = list(inputs(7)), draw(2, 5, 3, 8, seed=3), None
+    direction = draw(*arrays[argument].shape, seed=4)
+
+    def value(step):
+        moved = list(arrays)
+        moved[argument] = arrays[argument] + step * direction
+        return (formula(*moved, 8**-0.5) * g).sum()
+
+    want = (value(1e-5) - value(-1e-5)) / 2e-5
+    _, pull = jax.vjp(attention, *map(jnp.float32, arrays))
+    have = (np.asarray(pull(jnp.float32(g))[argument], np.float64) * direction).sum()
+    np.testing.assert_allclose(have, want, rtol=1e-5)
+
+
+def test_a_bias_is_added_to_the_scores():
+    q, k, v = inputs(7)
+    bias = np.where(np.arange(7) == 3, 0.0, -1e9).reshape(1, 1, 1, 7).repeat(5, 2).repeat(3, 1)
+    have = attention(*map(jnp.float32, (q, k, v)), bias=jnp.float32(bias))
+    np.testing.assert_allclose(have, np.repeat(v[:, 3:4], 5, 1), rtol=0, atol=ROUNDING)

@@ -1,0 +1,192 @@
+"""The video transformer: sizes, the split between context and step, precision, bad input."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from egosim_jax.models import wan_dit
+from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
+from egosim_jax.types import InputError
+
+TINY = WanDiTConfig(dim=48, heads=2, ffn_dim=64, layers=2, text_dim=20, image_dim=12)
+REORDERED = 1e-5
+"""Relative L2 between programs that add the same float32 numbers in another order."""
+TIMES = jnp.array([3.5, 250, 500, 1000])
+
+
+def abstract(config):
+    return nnx.eval_shape(lambda: WanDiT(config, rngs=nnx.Rngs(0)))
+
+
+@cache
+def new_weights():
+    model = nnx.jit(lambda: WanDiT(TINY, rngs=nnx.Rngs(0)))()
+    return nnx.state(model)
+
+
+@cache
+def weights():
+    """Weights whose head, zero at initialisation, is drawn too."""
+    state = jax.tree.map(lambda x: x, new_weights())
+    head = state["head"]["linear"]["kernel"]
+    head.set_value(jax.random.normal(jax.random.key(1), head.shape) * 0.1)
+    return state
+
+
+@cache
+def compiled(config, method="__call__"):
+    """A method of the network as a function of weights and inputs."""
+    graph, _ = nnx.split(abstract(config))
+    return jax.jit(lambda state, *given: getattr(nnx.merge(graph, state), method)(*given))
+
+
+def inputs(config, batch=4):
+    keys = jax.random.split(jax.random.key(0), 3)
+    latents = jax.random.normal(keys[0], (batch, 2, 4, 6, config.in_channels))
+    text = jax.random.normal(keys[1], (batch, 7, config.text_dim))
+    image = jax.random.normal(keys[2], (batch, 5, config.image_dim)) if config.image_dim else None
+    return latents, TIMES[:batch], text, image
+
+
+def relative(have, want):
+    return np.linalg.norm(have - want) / np.linalg.norm(want)
+
+
+@pytest.mark.parametrize(
+    ("config", "parameters"),
+    [
+        (wan_dit.EGOSIM_14B, 16_395_206_464),
+        (wan_dit.I2V_14B, 16_394_878_784),
+        (wan_dit.T2V_14B, 14_288_491_584),
+    ],
+)
+def test_published_shapes_have_their_parameter_counts(config, parameters):
+    state = nnx.state(abstract(config), nnx.Param)
+    assert sum(leaf.size for leaf in jax.tree.leaves(state)) == parameters
+
+
+def test_every_axis_of_every_weight_has_a_logical_name():
+    for path, weight in nnx.to_flat_state(nnx.state(abstract(TINY), nnx.Param)):
+        axes = weight.get_metadata()["axes"]
+        assert len(axes) == weight.ndim, path
+        assert (axes[0] == "layers") == (path[0] == "blocks"), path
+
+
+def test_a_new_network_answers_zero():
+    velocity = compiled(TINY)(new_weights(), *inputs(TINY))
+    assert velocity.shape == (4, 2, 4, 6, 16)
+    assert not np.any(velocity)
+
+
+def test_blocks_are_initialised_differently():
+    kernel = new_weights()["blocks"]["mlp"]["up"]["kernel"][...]
+    assert not np.allclose(kernel[0], kernel[1])
+
+
+def test_one_context_serves_every_step():
+    latents, t, text, image = inputs(TINY)
+    context = compiled(TINY, "prepare")(weights(), latents[..., 16:], text, image)
+    for step in (0, 1):
+        noisy, now = latents[..., :16] * (1 - step / 2), t * (1 - step / 2)
+        whole = jnp.concatenate([noisy, latents[..., 16:]], axis=-1)
+        have = compiled(TINY, "denoise")(weights(), noisy, now, context)
+        want = compiled(TINY)(weights(), whole, now, text, image)
+        assert relative(have, want) <= REORDERED
+
+
+@pytest.mark.parametrize("argument", [0, 1, 2, 3])
+def test_velocity_depends_on_every_input(argument):
+    velocity = partial(compiled(TINY), weights())
+    given = list(inputs(TINY))
+    before = velocity(*given)
+    given[argument] = given[argument][::-1]
+    assert relative(velocity(*given), before) > 1e-3
+
+
+def test_a_batch_of_4_is_4_batches_of_1():
+    velocity = partial(compiled(TINY), weights())
+    given = inputs(TINY)
+    alone = [velocity(*(x[i : i + 1] for x in given)) for i in range(4)]
+    assert relative(velocity(*given), np.concatenate(alone)) <= REORDERED
+
+
+def loss_of(config):
+    graph, _ = nnx.split(abstract(config))
+    given = inputs(config)
+    return lambda state: jnp.square(nnx.merge(graph, state)(*given)).mean()
+
+
+@cache
+def gradients(config):
+    return jax.tree.leaves(jax.jit(jax.grad(loss_of(config)))(weights()))
+
+
+@pytest.mark.parametrize("remat", ["full", "attention"])
+def test_gradients_do_not_depend_on_what_is_recomputed(remat):
+    recomputed = gradients(replace(TINY, remat=remat))
+    for have, want in zip(recomputed, gradients(TINY), strict=True):
+        assert np.linalg.norm(have - want) <= REORDERED * np.linalg.norm(want)
+
+
+def kept_shapes(config):
+    """What the forward pass hands to the backward pass."""
+    pull = jax.eval_shape(lambda state: jax.vjp(loss_of(config), state)[1], weights())
+    return [leaf.shape for leaf in jax.tree.leaves(pull) if leaf.ndim]
+
+
+def test_remat_of_all_but_attention_keeps_its_output_and_log_sum():
+    kept = kept_shapes(replace(TINY, remat="attention"))
+    for shape in kept_shapes(replace(TINY, remat="full")):
+        kept.remove(shape)
+    heads, batch, tokens, head_dim = 2, 4, 12, 24
+    output, log_sum = (heads, batch, tokens, head_dim), (heads, batch, tokens, 1)
+    assert sorted(kept) == sorted([(TINY.layers, *output), (TINY.layers, *log_sum)])
+
+
+def test_bfloat16_stays_near_float32_and_answers_in_float32():
+    want = compiled(TINY)(weights(), *inputs(TINY))
+    have = compiled(replace(TINY, dtype="bfloat16"))(weights(), *inputs(TINY))
+    assert have.dtype == jnp.float32
+    # bfloat16 keeps 8 bits: 4e-3 a rounding.
+    assert relative(have, want) < 3e-2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"in_channels": 15}, "in_channels 15"),
+        ({"heads": 5}, "5 heads"),
+        ({"dim": 8}, "at least 6"),
+        ({"freq_dim": 3}, "freq_dim"),
+        ({"layers": 0}, "layers"),
+        ({"attention": "cudnn"}, "bfloat16"),
+    ],
+)
+def test_a_config_that_cannot_work_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(TINY, **change)
+
+
+def test_a_condition_of_the_wrong_width_is_refused():
+    _, _, text, image = inputs(TINY)
+    with pytest.raises(InputError, match="20 channels"):
+        abstract(TINY).prepare(jnp.zeros((4, 2, 4, 6, 20)), text, image)
+
+
+def test_latents_of_odd_size_are_refused():
+    _, _, text, image = inputs(TINY)
+    with pytest.raises(InputError, match="5 x 6"):
+        abstract(TINY).prepare(jnp.zeros((4, 2, 5, 6, 36)), text, image)
+
+
+def test_missing_and_needless_image_tokens_are_refused():
+    latents, _, text, image = inputs(TINY)
+    with pytest.raises(InputError, match="not given"):
+        abstract(TINY).prepare(latents[..., 16:], text, None)
+    with pytest.raises(InputError, match="Leave them out"):
+        abstract(replace(TINY, image_dim=None)).prepare(latents[..., 16:], text, image)

@@ -1,0 +1,6 @@
+"""One short file for each model that can be trained, each a plan that reads from top to bottom."""
+
+from egosim_jax.train.recipes.debug import Debug
+from egosim_jax.train.recipes.real_tiny import RealTiny
+
+__all__ = ["Debug", "RealTiny"]
