@@ -1,7 +1,7 @@
 """How every command ends: with an exit code that a script can act on.
 
-    0 done    1 failed    2 bad usage or input    3 some items failed
-    70 hung   75 saved and to be resubmitted
+0 done    1 failed    2 bad usage or input    3 some items failed
+70 hung   75 saved and to be resubmitted
 """
 
 from __future__ import annotations

@@ -174,7 +174,9 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
         prior=networks.vae.encode(to_model(inputs.prior)),
         hands=networks.vae.encode(to_model(inputs.hands)),
         text=networks.text(inputs.ids, inputs.ids_mask),
-        image=None if networks.image is None else networks.image(inputs.pixels),
+        image=None
+        if networks.image is None or inputs.pixels is None
+        else networks.image(inputs.pixels),
     )
 
 
@@ -250,9 +252,12 @@ class Generator:
         """
         condition = self._encode(Inputs.of(triplets, self.config))
         latents = self._denoise(condition, self.noise(seeds))
-        finite = np.isfinite(np.asarray(latents)).all(axis=(1, 2, 3, 4))
-        if not finite.all():
-            bad = [t.video_id for t, fine in zip(triplets, finite, strict=True) if not fine]
+        bad = [
+            triplet.video_id
+            for triplet, latent in zip(triplets, np.asarray(latents), strict=True)
+            if not np.isfinite(latent).all()
+        ]
+        if bad:
             raise FloatingPointError(f"The latents of {bad} are not finite (NaN or infinity).")
         return self._clips(latents)
 

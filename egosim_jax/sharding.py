@@ -70,9 +70,7 @@ def state_sharding(mesh: Mesh, tree: Any) -> Any:
     return jax.tree.map(place, tree, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
 
 
-def _spec(
-    mesh: Mesh, shape: tuple[int, ...], axes: tuple[str | None, ...] | None
-) -> PartitionSpec:
+def _spec(mesh: Mesh, shape: tuple[int, ...], axes: tuple[str | None, ...] | None) -> PartitionSpec:
     used: set[str] = set()
     spec: list[str | None] = []
     for size, axis in zip(shape, axes or (None,) * len(shape), strict=True):

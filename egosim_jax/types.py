@@ -90,7 +90,7 @@ class Triplet:
     prior: UInt8[np.ndarray, "f h w 3"]
     """The scene rendered along the camera path, without hands."""
     mask: UInt8[np.ndarray, "f h w"]
-    """Where the render shows nothing: 255 not observed, 0 observed. Grey levels come from resizing."""
+    """Where the render shows nothing: 255 not observed, 0 observed, grey where it was resized."""
     hands: UInt8[np.ndarray, "f h w 3"]
     """The hand skeletons on black."""
     first_frame: UInt8[np.ndarray, "h w 3"]

@@ -29,6 +29,7 @@ from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 from egosim_jax.train.step import Batch, Metrics
 from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
 
+
 @dataclass(frozen=True, kw_only=True)
 class Autoencoding:
     """The task of training the video VAE on random pieces of clips."""
@@ -88,9 +89,7 @@ class _RandomPiece(grain.transforms.RandomMap):
     def __init__(self, task: Autoencoding):
         self.task = task
 
-    def random_map(
-        self, element: Mapping[str, np.ndarray], rng: np.random.Generator
-    ) -> dict[str, np.ndarray]:
+    def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
         """A piece at a random place of a random stream."""
         task, (rows, columns) = self.task, self.task.crop
         stream = str(rng.choice(COLOURS, p=task.weights))
@@ -113,9 +112,7 @@ def _psnr(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) 
     return (10 * jnp.log10(4.0 / jnp.maximum(error, 1e-10))).mean()
 
 
-def latent_statistics(
-    vae: WanVAE, videos: Iterable[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def latent_statistics(vae: WanVAE, videos: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of each latent channel over uint8 videos `f h w 3`."""
     graph, params = nnx.split(vae)
 

@@ -60,7 +60,7 @@ def cache(
 
 def _triplet(source: ShardReader, number: int, start: int, generator: Generator) -> Triplet:
     record = source[number]
-    arrays = decode_record(record.arrays, generator.config.video, start=start)
+    arrays: dict[str, Any] = decode_record(record.arrays, generator.config.video, start=start)
     return Triplet(
         video_id=str(record.metadata["video_id"]),
         prompt=str(record.metadata["prompt"]),

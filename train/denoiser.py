@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from egosim_jax.conditioning import assemble
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.diffusion.objective import Objective
+from egosim_jax.diffusion.schedule import VelocityFn
 from egosim_jax.generator import ModelConfig
 from egosim_jax.models.clip_vision import CLIPVision
 from egosim_jax.models.umt5 import UMT5
@@ -98,7 +99,7 @@ class _Arrays(grain.transforms.Map):
         return dict(element)
 
 
-def _velocity(networks: Denoiser, condition: Condition):  # noqa: ANN202
+def _velocity(networks: Denoiser, condition: Condition) -> VelocityFn:
     def velocity(x: Float[Array, "b f h w c"], t: Float[Array, " b"]) -> Float[Array, "b f h w c"]:
         return networks.dit(assemble(x, condition), t, condition.text, condition.image)
 

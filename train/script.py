@@ -129,7 +129,9 @@ def train(
         if step % training.log_every == 0 or step == last:
             numbers = _mean(pending)
             pending = {}
-            writer.write(step, {**numbers, "rate": float(rate(step - 1)), **clock.tick(step)})
+            writer.write(
+                step, {**numbers, "rate": float(np.asarray(rate(step - 1))), **clock.tick(step)}
+            )
         if validation is not None and (step % training.validate_every == 0 or step == last):
             writer.write(step, _validate(validate, state, validation, task, training, placed))
         if step % training.save_every == 0 or step == last:

@@ -32,5 +32,5 @@ class TrainState:
     def apply(self, gradients: nnx.State, optimizer: optax.GradientTransformation) -> TrainState:
         """The state after one more update."""
         updates, moments = optimizer.update(gradients, self.moments, self.params)
-        params = optax.apply_updates(self.params, updates)
+        params: Any = optax.apply_updates(self.params, updates)
         return TrainState(step=self.step + 1, params=params, moments=moments)

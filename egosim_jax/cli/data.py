@@ -13,8 +13,7 @@ from egosim_jax.command import DONE, PARTIAL
 from egosim_jax.types import InputError, VideoSpec
 
 if TYPE_CHECKING:
-    from egosim_jax.data.metadata import ClipFiles
-    from egosim_jax.data.shards import Record, ShardReader
+    from egosim_jax.data.shards import ShardReader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,42 +46,105 @@ class Pack:
     def run(self) -> int:
         """Check and pack clip after clip."""
         from egosim_jax.data.metadata import read_metadata, select
-        from egosim_jax.data.shards import ShardWriter, sha256
+        from egosim_jax.data.pack import pack
+        from egosim_jax.data.shards import sha256
 
         if self.shard_megabytes < 1:
             raise InputError(f"--shard-megabytes must be at least 1, not {self.shard_megabytes}.")
         items = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
-        spec = self._spec()
-        failed = 0
-        with ShardWriter(
-            self.out,
-            kind="frames" if spec else "videos",
-            spec=spec,
+        progress = pack(
+            items,
+            out=self.out,
+            spec=self._spec(),
             provenance={"metadata": self.metadata.name, "sha256": sha256(self.metadata)},
             shard_bytes=self.shard_megabytes * 2**20,
             overwrite=self.overwrite,
-        ) as writer:
-            for files in track(items, "packing", total=len(items)):
-                try:
-                    record = self._record(files, spec)
-                    writer.add(record.arrays, record.metadata)
-                except InputError as error:
-                    failed += 1
-                    print(f"left out: {error}", file=sys.stderr)
-            if failed == len(items):
-                raise InputError(f"None of the {failed} clips could be packed.")
+        )
+        problems = [problem for problem in track(progress, "packing", total=len(items)) if problem]
+        for problem in problems:
+            print(f"left out: {problem}", file=sys.stderr)
         print(self.out)
-        return PARTIAL if failed else DONE
+        return PARTIAL if problems else DONE
 
     def _spec(self) -> VideoSpec | None:
         if self.size is None:
             return None
         return VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1])
 
-    def _record(self, files: ClipFiles, spec: VideoSpec | None) -> Record:
-        from egosim_jax.data.pack import decoded_record, encoded_record
 
-        return decoded_record(files, spec) if spec else encoded_record(files)
+@dataclass(frozen=True, kw_only=True)
+class Encode:
+    """Encode shards of clips once, so that training reads latents and embeddings.
+
+    Every window of a clip becomes a record. Prints the folder.
+    """
+
+    config: str
+    """Name of the model."""
+    weights: Path
+    """Folder of weights, of which the autoencoder and frozen encoders are used."""
+    shards: Path
+    """Folder of shards of videos or frames, with their truth."""
+    out: Path
+    """Folder of the latents shards."""
+    stride: int = 1
+    """Frames between the windows of a clip."""
+    batch_size: int = 1
+    """Windows encoded together."""
+    overwrite: bool = False
+    """Replace the shards that the folder holds."""
+
+    def run(self) -> int:
+        """Encode batch after batch."""
+        from egosim_jax import configs
+        from egosim_jax.data.shards import ShardReader
+        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.io.weights import hashes
+        from egosim_jax.train.cache import cache
+
+        for name, value in (("stride", self.stride), ("batch-size", self.batch_size)):
+            if value < 1:
+                raise InputError(f"--{name} must be at least 1, not {value}.")
+        config, source = configs.get(self.config), ShardReader(self.shards)
+        progress = cache(
+            Generator(config, Networks.load(config, self.weights)),
+            source=source,
+            out=self.out,
+            stride=self.stride,
+            batch_size=self.batch_size,
+            provenance={"config": config.name, "weights": hashes(self.weights)},
+            overwrite=self.overwrite,
+        )
+        for _ in track(progress, "encoding", total=len(source)):
+            pass
+        print(self.out)
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Draw sample clips in EgoSim's format, with their truth, by seed. Prints the metadata file."""
+
+    out: Path
+    """Folder of the clips."""
+    clips: int = 1
+    """How many; every fourth belongs to the test split."""
+    seed: int = 0
+    """Seed of the first clip; the others have the next ones."""
+    frames: int = 61
+    """Frames of a clip, 4k+1."""
+    height: int = 192
+    """Rows in pixels, a multiple of 16."""
+    width: int = 320
+    """Columns in pixels, a multiple of 16."""
+
+    def run(self) -> int:
+        """Draw clip after clip."""
+        from egosim_jax.testing.sample import write_sample
+
+        spec = VideoSpec(frames=self.frames, height=self.height, width=self.width)
+        print(write_sample(self.out, spec=spec, clips=self.clips, seed=self.seed))
+        return DONE
 
 
 @dataclass(frozen=True, kw_only=True)

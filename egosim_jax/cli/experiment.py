@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +12,7 @@ from egosim_jax.cli.generate import RESULTS, Generate
 from egosim_jax.command import DONE
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from egosim_jax.data.metadata import ClipFiles
-    from egosim_jax.train.script import Training
 
 SHEET_FRAMES = (4, 10, 16)
 """Frames of each clip on the contact sheet."""

@@ -111,10 +111,11 @@ class Generate:
 
     def _open(self, config: ModelConfig) -> None:
         from egosim_jax.io.run import open_folder
+        from egosim_jax.io.weights import hashes
 
         run = {
             "model": config,
-            "weights": None if self.weights is None else _hashes(self.weights),
+            "weights": None if self.weights is None else hashes(self.weights),
             "seed": self.seed,
             "policy": self._policy,
         }
@@ -128,18 +129,14 @@ class Generate:
 
         sound, bad = [], []
         for item in items:
-            problems = check_clip(
-                item.files, config.video, start=item.start, policy=self._policy
-            )
+            problems = check_clip(item.files, config.video, start=item.start, policy=self._policy)
             if problems:
                 bad.append((item, "\n".join(problems)))
             else:
                 sound.append(item)
         return sound, bad
 
-    def _generate(
-        self, items: Sequence[_Item], config: ModelConfig
-    ) -> list[tuple[_Item, str]]:
+    def _generate(self, items: Sequence[_Item], config: ModelConfig) -> list[tuple[_Item, str]]:
         """Generate batch after batch; the items that failed."""
         generator = self._generator(config)
         then = time.monotonic()
@@ -165,11 +162,12 @@ class Generate:
 
     def _generator(self, config: ModelConfig) -> Generator:
         from egosim_jax.generator import Generator, Networks
+        from egosim_jax.io.weights import hashes
 
         if self.weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(config, Networks.random(config, seed=self.seed))
-        for name, digest in _hashes(self.weights).items():
+        for name, digest in hashes(self.weights).items():
             print(f"{config.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
         return Generator(config, Networks.load(config, self.weights))
 
@@ -271,16 +269,3 @@ def _batches(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
 def _seed(seed: int, name: str) -> int:
     """A seed of its own for each clip, so that its noise depends on neither order nor batch."""
     return int.from_bytes(hashlib.sha256(f"{seed} {name}".encode()).digest()[:4], "big")
-
-
-def _hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of each weights file."""
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder of weights. (--weights)")
-    files = sorted(folder.glob("*.safetensors"))
-    return {file.stem: _digest(file) for file in files}
-
-
-def _digest(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

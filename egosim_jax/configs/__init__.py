@@ -23,6 +23,7 @@ def get(name: str) -> ModelConfig:
     if name not in names():
         near = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)
         raise InputError(
-            f"There is no config {name!r}. Nearest: {near[0]}. All: {', '.join(names())}. (--config)"
+            f"There is no config {name!r}. Nearest: {near[0]}. All: {', '.join(names())}. "
+            "(--config)"
         )
     return importlib.import_module(f"{__name__}.{name}").CONFIG

@@ -2,12 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
 from egosim_jax.data.clips import check_clip, load_triplet
 from egosim_jax.data.metadata import ClipFiles
-from egosim_jax.data.shards import Record
+from egosim_jax.data.shards import Record, ShardWriter
 from egosim_jax.types import InputError, VideoSpec
+
+
+def pack(
+    items: Sequence[ClipFiles],
+    *,
+    out: Path,
+    spec: VideoSpec | None,
+    provenance: Mapping[str, Any],
+    shard_bytes: int = 256 * 2**20,
+    overwrite: bool = False,
+) -> Iterator[str | None]:
+    """Write the shards of some clips: decoded at `spec`, or their own files without one.
+
+    Yields, after each clip, what kept it out, or None. Raises `InputError` if none could be packed.
+    """
+    failed = 0
+    with ShardWriter(
+        out,
+        kind="frames" if spec else "videos",
+        spec=spec,
+        provenance=provenance,
+        shard_bytes=shard_bytes,
+        overwrite=overwrite,
+    ) as writer:
+        for files in items:
+            problem = None
+            try:
+                record = decoded_record(files, spec) if spec else encoded_record(files)
+                writer.add(record.arrays, record.metadata)
+            except InputError as error:
+                failed, problem = failed + 1, str(error)
+            yield problem
+        if failed == len(items):
+            raise InputError(f"None of the {failed} clips could be packed.")
 
 
 def clip_metadata(files: ClipFiles) -> dict[str, object]:

@@ -25,11 +25,13 @@ class Checkpoints:
     def __init__(self, folder: Path, *, keep: int = 2):
         logging.getLogger("absl").setLevel(logging.WARNING)
         self.folder = folder.absolute()
-        policies = ocp.training.preservation_policies
+        preserve = ocp.training.preservation_policies.LatestN(keep)
+        always = ocp.training.save_decision_policies.FixedIntervalPolicy(1)
+        # Orbax declares protocols that its own policies and pathlib do not meet to the letter.
         self._checkpointer = ocp.training.Checkpointer(
-            self.folder,
-            preservation_policy=policies.LatestN(keep),
-            save_decision_policy=ocp.training.save_decision_policies.FixedIntervalPolicy(1),
+            self.folder,  # pyright: ignore[reportArgumentType]
+            preservation_policy=preserve,  # pyright: ignore[reportArgumentType]
+            save_decision_policy=always,  # pyright: ignore[reportArgumentType]
             cleanup_tmp_directories=True,
         )
 
@@ -53,7 +55,13 @@ class Checkpoints:
         if step is None:
             raise InputError(f"There is no checkpoint in {self.folder}.")
         self._check_shapes(step, state)
-        loaded = self._checkpointer.load_checkpointables(step, {STATE: state, DATA: data})
+        try:
+            loaded = self._checkpointer.load_checkpointables(step, {STATE: state, DATA: data})
+        except Exception as error:
+            # Orbax wraps what the data iterator says about a position of other data.
+            if isinstance(error.__cause__, InputError):
+                raise error.__cause__ from error
+            raise
         return loaded[STATE]
 
     def _check_shapes(self, step: int, state: Any) -> None:

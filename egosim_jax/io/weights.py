@@ -9,11 +9,13 @@ reported in one list.
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from einops import EinopsError, rearrange
@@ -175,7 +177,7 @@ def _regex(pattern: str) -> re.Pattern[str]:
 
 def fill(
     module: nnx.Module,
-    tensors: Mapping[str, np.ndarray],
+    tensors: Mapping[str, Any],
     *,
     dtype: np.dtype | str | None = None,
     source: str = "the checkpoint",
@@ -204,6 +206,17 @@ def fill(
         tensor = jnp.asarray(tensors[".".join(map(str, path))])
         leaf.set_value(tensor.astype(dtype) if dtype is not None else tensor)
     nnx.update(module, state)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file of a weights folder, by network."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder of weights. (--weights)")
+    found = {}
+    for path in sorted(folder.glob("*.safetensors")):
+        with path.open("rb") as file:
+            found[path.stem] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
 
 
 def save(path: Path, module: nnx.Module) -> None:

@@ -22,6 +22,10 @@ from jaxtyping import Array, Float
 Kernel = Literal["xla", "cudnn"]
 """`xla` runs anywhere, one head at a time, so that the scores of a single head are in memory;
 `cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only)."""
+SELF_ATTENTION = "self_attention"
+"""The name, for checkpoint policies, of what the `xla` kernel's backward pass needs."""
+CUDNN_FORWARD = "dot_product_attention_fwd_wrapper"
+"""The primitive whose results are the output and the log-sum-exp of jax's cuDNN kernel."""
 
 
 def attention(
@@ -91,15 +95,13 @@ def _matmul(pattern: str, a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.einsum(pattern, a, b, preferred_element_type=jnp.float32)
 
 
-SELF_ATTENTION = "self_attention"
-
-
 def keep_attention(primitive: Any, *operands: Any, **parameters: Any) -> bool:
     """Say which values a checkpointed block keeps: what self-attention returns, nothing else.
 
-    The kernels' backward passes need the output and the log-sum-exp; keeping both spares the
-    recomputation of the scores. Cross-attention, which has few keys, is recomputed.
+    This is a policy of `jax.checkpoint`. The kernels' backward passes need the output and the
+    log-sum-exp; keeping both spares a second forward pass of the kernel. Cross-attention, which
+    has few keys, is recomputed.
     """
-    if primitive.name == "dot_product_attention_fwd_wrapper":
+    if primitive.name == CUDNN_FORWARD:
         return operands[0].shape == operands[1].shape
     return primitive.name == "name" and parameters["name"] == SELF_ATTENTION

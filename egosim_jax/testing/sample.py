@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from egosim_jax.io.video import write_video
@@ -85,7 +85,8 @@ def write_sample(folder: Path, *, spec: VideoSpec, clips: int = 1, seed: int = 0
         home = folder / clip.video_id
         home.mkdir(parents=True, exist_ok=True)
         mask = np.repeat(clip.mask[..., None], 3, axis=-1)
-        write_video(home / "video.mp4", clip.truth, spec.fps)
+        if clip.truth is not None:
+            write_video(home / "video.mp4", clip.truth, spec.fps)
         write_video(home / "ego_prior_video.mp4", clip.prior, spec.fps)
         write_video(home / "hand_keypoint_video.mp4", clip.hands, spec.fps)
         write_video(home / "pc_mask_video.mp4", mask, spec.fps)

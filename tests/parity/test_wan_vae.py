@@ -15,6 +15,8 @@ from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 CONFIG = WanVAEConfig(dim=8)
 TOLERANCE = 1e-5
 """Relative L2 in float32: the order of sums over up to 864 terms in some 40 convolutions."""
+QUICK = {"xla_backend_optimization_level": 0}
+"""Compiler options: the arrays are so small that compiling is what takes time."""
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,8 @@ def test_encoding_gives_the_moments_of_diffusers(ours, theirs, frames):
         posterior = theirs.encode(torch.tensor(video).permute(0, 4, 1, 2, 3)).latent_dist
     mean, logvar = (x.permute(0, 2, 3, 4, 1).numpy() for x in (posterior.mean, posterior.logvar))
     with jax.default_matmul_precision("highest"):
-        have = jax.jit(lambda x: (ours.encode(x), *ours.moments(x)))(video)
+        both = jax.jit(lambda x: (ours.encode(x), *ours.moments(x)), compiler_options=QUICK)
+        have = both(video)
     latents = (mean - np.array(CONFIG.latent_mean)) / np.array(CONFIG.latent_std)
     for part, want in zip(have, (latents, mean, logvar), strict=True):
         assert relative_error(part, want) <= TOLERANCE
@@ -62,7 +65,7 @@ def test_decoding_gives_the_video_of_diffusers(ours, theirs, frames):
     with torch.no_grad():
         video = theirs.decode(torch.tensor(hidden).float().permute(0, 4, 1, 2, 3)).sample
     with jax.default_matmul_precision("highest"):
-        have = jax.jit(ours.decode)(jnp.array(latents))
+        have = jax.jit(ours.decode, compiler_options=QUICK)(jnp.array(latents))
     assert relative_error(have, video.permute(0, 2, 3, 4, 1).numpy()) <= TOLERANCE
 
 

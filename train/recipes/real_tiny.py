@@ -49,9 +49,7 @@ class RealTiny:
         default_factory=lambda: Training(
             steps=3000,
             batch_size=2,
-            optimizer=OptimizerConfig(
-                rule="muon", learning_rate=4e-3, warmup=50, decay="cosine"
-            ),
+            optimizer=OptimizerConfig(rule="muon", learning_rate=4e-3, warmup=50, decay="cosine"),
             log_every=25,
             save_every=250,
             validate_every=250,
@@ -62,9 +60,7 @@ class RealTiny:
         default_factory=lambda: Training(
             steps=4000,
             batch_size=4,
-            optimizer=OptimizerConfig(
-                rule="muon", learning_rate=2e-3, warmup=50, decay="cosine"
-            ),
+            optimizer=OptimizerConfig(rule="muon", learning_rate=2e-3, warmup=50, decay="cosine"),
             log_every=25,
             save_every=250,
             validate_every=500,
@@ -94,7 +90,10 @@ class RealTiny:
         if not (out / "manifest.json").exists():
             items = select(read_metadata(self.metadata), where=f"split={split}")
             spec = dataclasses.replace(config.video, frames=CLIP_FRAMES)
-            _tell(f"packing {split}", pack(items, out=out, spec=spec))
+            provenance = {"metadata": str(self.metadata)}
+            progress = pack(items, out=out, spec=spec, provenance=provenance)
+            for problem in _tell(f"packing {split}", progress):
+                print(f"left out: {problem}", file=sys.stderr)
         return out
 
     def _autoencoder(self, config: ModelConfig, frames: dict[str, Path]) -> WanVAE:
@@ -139,9 +138,7 @@ class RealTiny:
             _tell(f"encoding {split}", progress)
         return out
 
-    def _denoiser(
-        self, config: ModelConfig, vae: WanVAE, latents: dict[str, Path]
-    ) -> Networks:
+    def _denoiser(self, config: ModelConfig, vae: WanVAE, latents: dict[str, Path]) -> Networks:
         """Train the denoiser, and put the four networks together."""
         from egosim_jax.generator import Networks
 
@@ -159,8 +156,9 @@ class RealTiny:
         return networks
 
 
-def _tell(what: str, progress: Iterable[object]) -> None:
-    """Work through, with a line at the beginning and the end."""
+def _tell(what: str, progress: Iterable[object]) -> list[object]:
+    """Work through, with a line at the beginning and the end; whatever was not None."""
     print(f"{what} ...", file=sys.stderr, flush=True)
-    count = sum(1 for _ in progress)
-    print(f"{what}: {count} done", file=sys.stderr, flush=True)
+    answers = list(progress)
+    print(f"{what}: done", file=sys.stderr, flush=True)
+    return [answer for answer in answers if answer is not None]

@@ -15,6 +15,8 @@ from egosim_jax.types import InputError
 SIZES = dict(dim=4, z_dim=2, res_blocks=1, latent_mean=(0.3, -0.2), latent_std=(0.5, 2.0))
 REORDERED = 1e-5
 """Relative L2 between programs that add the same float32 numbers in another order."""
+QUICK = {"xla_backend_optimization_level": 0}
+"""Compiler options: the arrays are so small that compiling is what takes time."""
 
 
 def make(dtype="float32"):
@@ -41,7 +43,9 @@ def vae():
 def compiled(method, dtype="float32"):
     """A method of `make()` as one program of weights and input."""
     graph, _ = nnx.split(make(dtype))
-    return jax.jit(lambda state, x: getattr(nnx.merge(graph, state), method)(x))
+    return jax.jit(
+        lambda state, x: getattr(nnx.merge(graph, state), method)(x), compiler_options=QUICK
+    )
 
 
 def call(vae, method, x):
@@ -118,14 +122,13 @@ def test_standardised_latents_decode_to_the_same_video(vae):
 def test_reconstruction_trains_every_weight(vae):
     graph, state = nnx.split(vae)
 
-    @jax.jit
-    @jax.grad
-    def gradient(state, video):
+    def loss(state, video):
         vae = nnx.merge(graph, state)
         mean, logvar = vae.moments(video)
         return jnp.square(vae.decode_whole(mean) - video).mean() + jnp.exp(logvar).mean()
 
-    for path, leaf in nnx.to_flat_state(gradient(state, video_of(5))):
+    gradient = jax.jit(jax.grad(loss), compiler_options=QUICK)(state, video_of(5))
+    for path, leaf in nnx.to_flat_state(gradient):
         assert jnp.isfinite(leaf[...]).all(), path
         assert leaf[...].any(), path
 
