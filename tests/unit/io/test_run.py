@@ -1,0 +1,56 @@
+"""Run folders: what they record, and whose they are."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from egosim_jax.io.run import open_folder, write_json
+from egosim_jax.types import InputError, VideoSpec
+
+
+@dataclass(frozen=True)
+class Config:
+    seed: int
+    video: VideoSpec
+
+
+def config(seed: int = 0) -> Config:
+    return Config(seed=seed, video=VideoSpec(frames=5, height=32, width=48))
+
+
+def test_a_new_folder_records_config_and_environment(tmp_path):
+    open_folder(tmp_path / "run", config())
+    recorded = json.loads((tmp_path / "run/config.json").read_text("utf-8"))
+    assert recorded["video"] == {"type": "VideoSpec", "frames": 5, "height": 32, "width": 48,
+                                 "fps": 16}  # fmt: skip
+    environment = json.loads((tmp_path / "run/environment.json").read_text("utf-8"))
+    assert environment["packages"]["jax"]
+
+
+def test_the_same_config_continues_the_folder(tmp_path):
+    open_folder(tmp_path, config())
+    open_folder(tmp_path, config())
+
+
+def test_another_config_is_refused_naming_the_field_and_both_values(tmp_path):
+    open_folder(tmp_path, config())
+    with pytest.raises(InputError, match="seed: the folder has 0, this run has 1"):
+        open_folder(tmp_path, config(seed=1))
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="--out"):
+        open_folder(tmp_path / "file" / "run", config())
+
+
+def test_a_value_that_cannot_be_written_leaves_the_old_file(tmp_path: Path):
+    path = tmp_path / "value.json"
+    write_json(path, {"a": 1})
+    circular: list = []
+    circular.append(circular)
+    with pytest.raises(RecursionError):
+        write_json(path, circular)
+    assert json.loads(path.read_text("utf-8")) == {"a": 1}
