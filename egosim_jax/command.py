@@ -6,9 +6,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from egosim_jax.types import InputError
@@ -33,6 +36,7 @@ def main(commands: Any, *, program: str, description: str, args: Sequence[str] |
     """
     import tyro
 
+    _keep_compiled_programs()
     command: Command = tyro.cli(
         commands,
         prog=program,
@@ -41,6 +45,15 @@ def main(commands: Any, *, program: str, description: str, args: Sequence[str] |
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     return guarded(command.run)
+
+
+def _keep_compiled_programs() -> None:
+    """Let jax keep what it compiles in a folder that only its user can read and write."""
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = home / "egosim_jax" / "compiled"
+    with contextlib.suppress(OSError):  # without it everything works, but compiles each time
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
 
 
 def guarded(run: Callable[[], int]) -> int:

@@ -30,6 +30,7 @@ from egosim_jax.diffusion.schedule import FlowSchedule
 from egosim_jax.diffusion.solver import Euler, UniPC, integrate
 from egosim_jax.io import weights
 from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
+from egosim_jax.models.layers import initialise
 from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
@@ -105,8 +106,8 @@ class Networks(nnx.Module):
     def random(cls, config: ModelConfig, *, seed: int) -> Networks:
         """Untrained networks, made in one compiled program."""
         graph = nnx.graphdef(nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))))
-        make = jax.jit(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
-        return nnx.merge(graph, make())
+        params = initialise(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
+        return nnx.merge(graph, params)
 
     def save(self, folder: Path) -> None:
         """Write a weights folder."""

@@ -25,6 +25,7 @@ from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.run import open_folder
 from egosim_jax.logging import Console, JsonLines, Writers
+from egosim_jax.models.layers import initialise
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.optimizer import OptimizerConfig, learning_rate, make_optimizer
 from egosim_jax.train.state import TrainState
@@ -103,7 +104,7 @@ def train(
 
     checkpoints = Checkpoints(out / "checkpoints")
     if checkpoints.latest is None:
-        state = jax.jit(create, out_shardings=sharding)()
+        state = initialise(create, out_shardings=sharding)
     else:
         state = checkpoints.restore(_placed(abstract, sharding), batches)
     start = int(state.step)

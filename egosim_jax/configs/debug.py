@@ -12,7 +12,7 @@ CONFIG = dataclasses.replace(
     name="debug",
     video=VideoSpec(frames=9, height=64, width=96, fps=16),
     dit=WanDiTConfig(dim=48, ffn_dim=96, heads=2, layers=2, text_dim=64, image_dim=32),
-    vae=dataclasses.replace(REAL_TINY.vae, dim=8),
+    vae=dataclasses.replace(REAL_TINY.vae, dim_mult=(1, 1, 2, 2)),
     image=CLIPVisionConfig(image_size=28, dim=32, layers=2, heads=2, ffn_dim=64),
     steps=4,
 )

@@ -96,6 +96,18 @@ class RMSNorm(nnx.Module):
         return x * self.scale[...].astype(jnp.float32)
 
 
+def initialise(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
+    """Run `make` as one program, straight into its shardings.
+
+    Drawing hundreds of random arrays is a long program that runs once, so that on a CPU, where
+    optimising it would take longer than training a tiny model, it is compiled as it is.
+    """
+    program = jax.jit(make, out_shardings=out_shardings).lower()
+    on_cpu = jax.default_backend() == "cpu"
+    options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+    return program.compile(compiler_options=options if on_cpu else None)()
+
+
 def stack(make: Callable[[nnx.Rngs], Block], layers: int, *, rngs: nnx.Rngs) -> Block:
     """Build `layers` equal blocks as one whose parameters have a leading `layers` axis."""
     split = nnx.split_rngs(splits=layers)

@@ -47,11 +47,11 @@ class RealTiny:
     """Frames between the windows of a clip that the denoiser is trained on."""
     vae: Training = field(
         default_factory=lambda: Training(
-            steps=3000,
+            steps=2000,
             batch_size=2,
-            optimizer=OptimizerConfig(rule="muon", learning_rate=4e-3, warmup=50, decay="cosine"),
+            optimizer=OptimizerConfig(rule="muon", learning_rate=5e-3, warmup=50, decay="cosine"),
             log_every=25,
-            save_every=250,
+            save_every=500,
             validate_every=250,
         )
     )

@@ -1,0 +1,110 @@
+"""The commands, from sample clips to a table, as a user runs them."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from egosim_jax.cli.__main__ import main
+from egosim_jax.io.video import probe_video
+from egosim_jax.testing.sample import write_sample
+from egosim_jax.types import VideoSpec
+
+SPEC = VideoSpec(frames=9, height=64, width=96)
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sample(tmp_path_factory.mktemp("clips"), spec=SPEC, clips=2)
+
+
+@pytest.fixture(scope="module")
+def generated(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both clips, of which one has lost its mask: it fails, the other is made."""
+    broken = tmp_path_factory.mktemp("broken")
+    shutil.copytree(clips.parent, broken, dirs_exist_ok=True)
+    (broken / "sample_1" / "pc_mask_video.mp4").unlink()
+    out = tmp_path_factory.mktemp("out") / "run"
+    assert main(generate(broken / "metadata.csv", out)) == 3
+    return out
+
+
+def generate(metadata: Path, out: Path, *more: str) -> list[str]:
+    fixed = ["--config", "debug", "--metadata", str(metadata), "--out", str(out)]
+    return ["generate", *fixed, *more]
+
+
+def results(out: Path) -> dict[str, dict]:
+    lines = (out / "results.jsonl").read_text("utf-8").splitlines()
+    return {line["video_id"]: line for line in map(json.loads, lines)}
+
+
+def test_one_bad_clip_is_reported_and_the_others_are_made(generated):
+    assert results(generated)["sample_1"]["status"] == "failed"
+    assert "pc_mask_video.mp4" in results(generated)["sample_1"]["error"]
+    assert results(generated)["sample_0"]["status"] == "done"
+    assert not (generated / "sample_1.mp4").exists()
+
+
+def test_a_clip_and_its_comparison_have_the_models_size(generated):
+    clip = probe_video(generated / "sample_0.mp4")
+    assert (clip.frames, clip.height, clip.width) == (9, 64, 96)
+    assert probe_video(generated / "sample_0_cmp.mp4").width == 4 * 96
+
+
+def test_results_carry_seed_prompt_and_further_columns(generated):
+    line = results(generated)["sample_0"]
+    assert line["split"] == "train"
+    assert "ball" in line["prompt"]
+    assert line["seed"] != results(generated)["sample_1"].get("seed")
+    assert json.loads((generated / "config.json").read_text("utf-8"))["model"]["name"] == "debug"
+
+
+def test_existing_clips_are_skipped_and_the_missing_one_is_made(generated, clips, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(generated, out)
+    before = (out / "sample_0.mp4").stat().st_mtime_ns
+    assert main(generate(clips, out, "--skip-existing")) == 0
+    assert (out / "sample_0.mp4").stat().st_mtime_ns == before
+    assert results(out)["sample_1"]["status"] == "done"
+
+
+def test_evaluate_reports_the_generated_clips_beside_the_baselines(generated, clips, capsys):
+    args = ["evaluate", "--generated", str(generated), "--metadata", str(clips)]
+    assert main(args) == 3  # one of the two clips was never generated
+    report = json.loads((generated / "report.json").read_text("utf-8"))
+    assert report["splits"]["train"].keys() >= {"generated", "prior", "prior_fit", "still"}
+    assert "PSNR" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--config", "debg"], "Nearest: debug"),
+        (["--config", "real_tiny"], "--weights"),
+        (["--metadata", "nowhere.csv"], "nowhere.csv"),
+        (["--where", "split=nowhere"], "split is one of: train"),
+        (["--video-id", "sample_7"], "No clip is called sample_7"),
+        (["--weights", "nowhere"], "--weights"),
+        (["--steps", "0"], "--steps must be at least 1"),
+        (["--limit", "0"], "--limit must be at least 1"),
+        (["--start", "4"], "fewer than the 13"),
+    ],
+)
+def test_bad_usage_is_one_message_before_anything_is_compiled(
+    clips, tmp_path, capsys, monkeypatch, change, message
+):
+    monkeypatch.setattr("egosim_jax.generator.Generator.compile", lambda *_: pytest.fail("it compiled"))
+    assert main(generate(clips, tmp_path / "out", *change)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_duplicate_id_is_refused(clips, tmp_path, capsys):
+    rows = list(csv.reader(clips.open(encoding="utf-8")))
+    twice = clips.with_name("twice.csv")
+    with twice.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([*rows, rows[-1]])
+    assert main(generate(twice, tmp_path / "out")) == 2
+    assert "sample_1" in capsys.readouterr().err

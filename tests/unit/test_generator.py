@@ -1,0 +1,154 @@
+"""The generator: batches, seeds, the cache, and what it refuses."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.diffusion.guidance import Guidance
+from egosim_jax.generator import (
+    Generator,
+    Inputs,
+    ModelConfig,
+    Networks,
+    Program,
+    denoise,
+    encode_condition,
+)
+from egosim_jax.testing.sample import make_sample
+from egosim_jax.types import InputError, Triplet, VideoSpec
+
+DEBUG = configs.get("debug")
+CONFIG = dataclasses.replace(DEBUG, video=VideoSpec(frames=5, height=32, width=48), steps=2)
+
+
+@pytest.fixture(scope="module")
+def networks() -> Networks:
+    """Random networks whose output head is not zero, as it is before training."""
+    made = Networks.random(CONFIG, seed=0)
+    head = made.dit.head.linear.kernel
+    head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)
+    return made
+
+
+@pytest.fixture(scope="module")
+def generator(networks: Networks) -> Generator:
+    return Generator(CONFIG, networks)
+
+
+@pytest.fixture(scope="module")
+def triplets() -> list[Triplet]:
+    return [make_sample(CONFIG.video, seed=seed) for seed in range(4)]
+
+
+def test_a_batch_of_four_equals_four_batches_of_one(networks, triplets):
+    """Relative L2 of the latents in float32: the sums of a batch run in another order."""
+
+    encode = Program(encode_condition, networks)
+    walk = Program(lambda dit, *args: denoise(dit, *args, CONFIG), networks.dit)
+
+    def latents(batch: list[Triplet], seeds: list[int]) -> np.ndarray:
+        noise = Generator(CONFIG, networks).noise(seeds)
+        return np.asarray(walk(encode(Inputs.of(batch, CONFIG)), noise))
+
+    together = latents(triplets, [3, 1, 4, 1])
+    alone = np.concatenate(
+        [latents([triplet], [seed]) for triplet, seed in zip(triplets, [3, 1, 4, 1], strict=True)]
+    )
+    error = np.linalg.norm(together - alone) / np.linalg.norm(alone)
+    assert error <= 1e-5
+
+
+def test_a_seed_gives_its_clip_again_and_another_seed_another(generator, triplets):
+    first, second, third = generator.generate([triplets[0]] * 3, [7, 7, 8])
+    np.testing.assert_array_equal(first.frames, second.frames)
+    assert not np.array_equal(first.frames, third.frames)
+    assert first.frames.shape == (5, 32, 48, 3)
+    assert first.fps == CONFIG.video.fps
+
+
+def test_each_condition_changes_the_latents(networks, triplets):
+    """Text, image, prior, hands and mask all reach the denoiser."""
+    condition = Program(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
+    noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.video.latent_shape, 16))
+    run = jax.jit(lambda condition: denoise(networks.dit, condition, noise, CONFIG))
+    full = run(condition)
+    for name in ("mask", "prior", "hands", "text", "image"):
+        other = dataclasses.replace(condition, **{name: 1.5 - getattr(condition, name)})
+        assert not np.allclose(run(other), full, atol=1e-4), name
+
+
+def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, triplets):
+    condition = Program(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
+    noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.video.latent_shape, 16))
+    one_step = dataclasses.replace(CONFIG, steps=1)
+
+    def run(condition, scale: float) -> np.ndarray:
+        config = dataclasses.replace(one_step, guidance=Guidance(scale=scale))
+        return np.asarray(denoise(networks.dit, condition, noise, config))
+
+    empty = dataclasses.replace(condition, text=jnp.zeros_like(condition.text))
+    with_text, without = run(condition, 1.0), run(empty, 1.0)
+    np.testing.assert_allclose(
+        run(condition, 2.0), without + 2 * (with_text - without), rtol=1e-4, atol=1e-4
+    )
+
+
+def test_the_cache_of_joint_encoders_holds_their_inputs(generator, triplets):
+    arrays = generator.cache(triplets[:1])[0]
+    assert {name: array.shape for name, array in arrays.items()} == {
+        "truth": (2, 4, 6, 16),
+        "prior": (2, 4, 6, 16),
+        "hands": (2, 4, 6, 16),
+        "mask": (2, 4, 6, 4),
+        "ids": (128,),
+        "ids_mask": (128,),
+        "pixels": (28, 28, 3),
+    }
+
+
+def test_the_cache_of_frozen_encoders_holds_their_embeddings(networks, triplets):
+    frozen = Generator(dataclasses.replace(CONFIG, encoders="frozen"), networks)
+    arrays = frozen.cache(triplets[:1])[0]
+    assert (arrays["text"].shape, arrays["image"].shape) == ((128, 64), (5, 32))
+    assert "ids" not in arrays
+
+
+def test_a_clip_without_truth_cannot_be_cached(generator, triplets):
+    blind = dataclasses.replace(triplets[0], truth=None)
+    with pytest.raises(InputError, match="sample_0: no truth"):
+        generator.cache([blind])
+
+
+def test_latents_that_are_not_finite_name_their_clips(networks, triplets):
+    graph, state = nnx.split(networks)
+    broken = nnx.merge(graph, jax.tree.map(jnp.copy, state))
+    broken.dit.head.linear.bias[...] = jnp.full_like(broken.dit.head.linear.bias[...], jnp.nan)
+    with pytest.raises(FloatingPointError, match="sample_0"):
+        Generator(CONFIG, broken).generate(triplets[:1], [0])
+
+
+def test_a_weights_folder_comes_back_bit_for_bit(networks, tmp_path: Path):
+    networks.save(tmp_path)
+    loaded = Networks.load(CONFIG, tmp_path)
+    for ours, theirs in zip(
+        jax.tree.leaves(nnx.state(loaded)), jax.tree.leaves(nnx.state(networks)), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_weights_of_another_model_are_refused(networks, tmp_path: Path):
+    networks.save(tmp_path)
+    wider = dataclasses.replace(CONFIG, dit=dataclasses.replace(CONFIG.dit, ffn_dim=100))
+    with pytest.raises(InputError, match=r"blocks\.mlp\.up\.kernel: have .*, want .*100"):
+        Networks.load(wider, tmp_path)
+
+
+def test_networks_that_do_not_fit_each_other_are_refused():
+    with pytest.raises(InputError, match=r"dit\.text_dim is 64 but text\.dim is 4096"):
+        ModelConfig(name="odd", video=CONFIG.video, dit=CONFIG.dit, vae=CONFIG.vae)
