@@ -1,1 +1,50 @@
-"""An egocentric world simulator in JAX."""
+"""An egocentric world simulator in JAX: the public names, each imported when it is first used.
+
+    config = egosim_jax.get_config("egosim_14b")
+    networks = egosim_jax.Networks.load(config, Path("weights/egosim_14b"))
+    clips = egosim_jax.Generator(config, networks).generate(triplets, seeds=[0])
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from egosim_jax.configs import get as get_config
+    from egosim_jax.data.clips import load_triplet
+    from egosim_jax.data.metadata import read_metadata
+    from egosim_jax.generator import Generator, ModelConfig, Networks
+    from egosim_jax.types import Clip, Condition, InputError, Triplet, VideoSpec
+
+__all__ = [
+    "Clip",
+    "Condition",
+    "Generator",
+    "InputError",
+    "ModelConfig",
+    "Networks",
+    "Triplet",
+    "VideoSpec",
+    "get_config",
+    "load_triplet",
+    "read_metadata",
+]
+
+_HOMES = {
+    "get_config": ("configs", "get"),
+    "load_triplet": ("data.clips", "load_triplet"),
+    "read_metadata": ("data.metadata", "read_metadata"),
+    **{name: ("generator", name) for name in ("Generator", "ModelConfig", "Networks")},
+    **{
+        name: ("types", name)
+        for name in ("Clip", "Condition", "InputError", "Triplet", "VideoSpec")
+    },
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _HOMES[name]
+    return getattr(importlib.import_module(f"{__name__}.{module}"), attribute)

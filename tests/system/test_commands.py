@@ -102,7 +102,7 @@ def test_bad_usage_is_one_message_before_anything_is_compiled(
 
 
 def test_a_duplicate_id_is_refused(clips, tmp_path, capsys):
-    rows = list(csv.reader(clips.open(encoding="utf-8")))
+    rows = list(csv.reader(clips.read_text("utf-8").splitlines()))
     twice = clips.with_name("twice.csv")
     with twice.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([*rows, rows[-1]])
