@@ -77,6 +77,7 @@ class Generate:
         if bad and not sound:
             return USAGE
         if sound:
+            _warn_of_long_prompts(sound, config)
             bad += self._generate(sound, config)
         print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self.out}", file=sys.stderr)
         return PARTIAL if bad else DONE
@@ -264,6 +265,18 @@ class _Item:
 def _batches(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
     for first in range(0, len(items), size):
         yield items[first : first + size]
+
+
+def _warn_of_long_prompts(items: Sequence[_Item], config: ModelConfig) -> None:
+    prompts = {item.files.video_id: item.files.prompt for item in items}
+    tokens = config.tokenizer.tokenize(list(prompts.values()))
+    if tokens.cut:
+        most = config.tokenizer.max_tokens
+        print(
+            f"warning: {tokens.cut} of {len(prompts)} prompts are longer than {most} tokens (the "
+            f"longest has {max(tokens.lengths)}) and are cut",
+            file=sys.stderr,
+        )
 
 
 def _seed(seed: int, name: str) -> int:

@@ -47,6 +47,8 @@ Cache = Any
 Input = Float[Array, "b f h w i"]
 Output = tuple[Float[Array, "b g y x o"], Cache]
 Layer = Callable[[Array, Cache], tuple[Array, Cache]]
+# Residual branches start small, not at zero: that gave 10.4 instead of 13.2 dB after 60 steps
+# (one seed, width 16).
 _small = nnx.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
 
 

@@ -96,8 +96,20 @@ def test_evaluate_reports_the_generated_clips_beside_the_baselines(generated, cl
 def test_bad_usage_is_one_message_before_anything_is_compiled(
     clips, tmp_path, capsys, monkeypatch, change, message
 ):
-    monkeypatch.setattr("egosim_jax.generator.Generator.compile", lambda *_: pytest.fail("it compiled"))
+    monkeypatch.setattr(
+        "egosim_jax.generator.Generator.compile", lambda *_: pytest.fail("it compiled")
+    )
     assert main(generate(clips, tmp_path / "out", *change)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_prompts_that_are_too_long_are_counted_and_cut(clips, tmp_path, capsys):
+    rows = list(csv.DictReader(clips.read_text("utf-8").splitlines()))
+    rows[1]["prompt"] = "take " * 100
+    long = clips.with_name("long.jsonl")
+    long.write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
+    assert main(generate(long, tmp_path / "out")) == 0
+    message = "1 of 2 prompts are longer than 128 tokens (the longest has 500) and are cut"
     assert message in capsys.readouterr().err
 
 

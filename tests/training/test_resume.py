@@ -1,6 +1,7 @@
 """Interrupted runs continue as if nothing had happened."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -60,6 +61,17 @@ def test_a_killed_run_repeats_the_losses_bit_for_bit(data, uninterrupted, tmp_pa
         jax.tree.leaves(nnx.state(resumed)), jax.tree.leaves(nnx.state(networks)), strict=True
     ):
         np.testing.assert_array_equal(np.asarray(ours), np.asarray(theirs))
+
+
+def test_two_devices_give_the_losses_of_one(data, uninterrupted, tmp_path):
+    """Relative, in float32: gradients are summed in another order, and every step feeds on it."""
+    out = tmp_path / "sharded"
+    command = [sys.executable, "-m", "tests.training.run_tiny", str(data), str(out), str(STEPS)]
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    subprocess.run(command, check=True, env=environment, stderr=subprocess.DEVNULL)
+    whole, sharded = losses(uninterrupted[0]), losses(out)
+    assert list(sharded) == list(whole)
+    np.testing.assert_allclose(list(sharded.values()), list(whole.values()), rtol=1e-4)
 
 
 def test_a_finished_run_trains_no_further(data, uninterrupted):

@@ -28,7 +28,9 @@ def test_types_know_no_jax():
 
 
 def test_help_imports_no_jax():
-    code = "from egosim_jax.cli.__main__ import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+    code = (
+        "from egosim_jax.cli.__main__ import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+    )
     assert "jax" not in modules_after(f"exec({code!r})")
 
 
