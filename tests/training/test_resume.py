@@ -17,6 +17,7 @@ from egosim_jax.train.script import train
 from egosim_jax.types import InputError
 from tests.training.run_tiny import TASK, training, write_latents
 
+ROOT = Path(__file__).parents[2]
 STEPS = 14
 KILL_AFTER = 6
 
@@ -42,7 +43,7 @@ def uninterrupted(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 def test_a_killed_run_repeats_the_losses_bit_for_bit(data, uninterrupted, tmp_path):
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "tests.training.run_tiny", str(data), str(out), str(STEPS)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
     metrics = out / "metrics.jsonl"
     deadline = time.monotonic() + 300
     while not (metrics.is_file() and len(metrics.read_text("utf-8").splitlines()) >= KILL_AFTER):
@@ -68,7 +69,7 @@ def test_two_devices_give_the_losses_of_one(data, uninterrupted, tmp_path):
     out = tmp_path / "sharded"
     command = [sys.executable, "-m", "tests.training.run_tiny", str(data), str(out), str(STEPS)]
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
-    subprocess.run(command, check=True, env=environment, stderr=subprocess.DEVNULL)
+    subprocess.run(command, check=True, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL)
     whole, sharded = losses(uninterrupted[0]), losses(out)
     assert list(sharded) == list(whole)
     np.testing.assert_allclose(list(sharded.values()), list(whole.values()), rtol=1e-4)
