@@ -54,7 +54,7 @@ class Weights:
             raise InputError(f"There is no {self.layout} layout of {self.network}. (--layout)")
         shape = getattr(config, self.network)
         ours = weights.translate(
-            self._read(), rules(shape), ignore=table.ignored(shape), source=str(self.source)
+            _read(self.source), rules(shape), ignore=table.ignored(shape), source=str(self.source)
         )
         weights.fill(parts[self.network], ours, source=str(self.source))
         target = self.out / f"{self.network}.safetensors"
@@ -63,22 +63,54 @@ class Weights:
         print(target)
         return command.DONE
 
-    def _read(self) -> dict[str, np.ndarray]:
-        from safetensors.numpy import load_file
 
-        files = sorted(self.source.glob("*.safetensors")) if self.source.is_dir() else [self.source]
-        if not files or not all(file.is_file() for file in files):
-            raise InputError(f"No safetensors at {self.source}. (--source)")
-        return {name: tensor for file in files for name, tensor in load_file(file).items()}
+@dataclass(frozen=True, kw_only=True)
+class Inspect:
+    """List the tensors of safetensors: name, shape and dtype, and how many weights in all."""
+
+    source: Path
+    """A .safetensors file, or a folder of them."""
+
+    def run(self) -> int:
+        """Read the headers alone."""
+        from math import prod
+
+        from safetensors import safe_open
+
+        weights = 0
+        for file in _files(self.source):
+            with safe_open(file, framework="numpy") as tensors:
+                for name in tensors.keys():  # noqa: SIM118  (not a mapping)
+                    tensor = tensors.get_slice(name)
+                    weights += prod(tensor.get_shape())
+                    print(f"{name}  {tensor.get_shape()}  {tensor.get_dtype()}")
+        print(f"{weights:,} weights", file=sys.stderr)
+        return command.DONE
 
 
-Commands = Annotated[Weights, tyro.conf.subcommand("weights")] | Annotated[None, tyro.conf.Suppress]
+def _files(source: Path) -> list[Path]:
+    files = sorted(source.glob("*.safetensors")) if source.is_dir() else [source]
+    if not files or not all(file.is_file() for file in files):
+        raise InputError(f"No safetensors at {source}. (--source)")
+    return files
+
+
+def _read(source: Path) -> dict[str, np.ndarray]:
+    from safetensors.numpy import load_file
+
+    return {name: tensor for file in _files(source) for name, tensor in load_file(file).items()}
+
+
+Commands = (
+    Annotated[Weights, tyro.conf.subcommand("weights")]
+    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run `egosim-convert`."""
     return command.main(
-        Annotated[Weights, tyro.conf.subcommand("weights")],
+        Commands,
         program="egosim-convert",
         description="Weights in and out.",
         args=args,
