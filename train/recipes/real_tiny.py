@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flax import nnx
+
 from egosim_jax.command import DONE
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.train.autoencoder import Autoencoding, latent_statistics
@@ -71,8 +73,10 @@ class RealTiny:
     def run(self) -> int:
         """Frames, autoencoder, latents, denoiser, weights."""
         from egosim_jax import configs
+        from egosim_jax.io.run import open_folder
 
         config = configs.get(self.config)
+        open_folder(self.out, self)
         frames = {split: self._pack(split, config) for split in ("train", "test")}
         vae = self._autoencoder(config, frames)
         latents = {split: self._encode(split, config, vae, frames) for split in frames}
@@ -99,13 +103,17 @@ class RealTiny:
     def _autoencoder(self, config: ModelConfig, frames: dict[str, Path]) -> WanVAE:
         """Train the VAE, then give its latents mean 0 and deviation 1."""
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.models.wan_vae import standardise_latents
+        from egosim_jax.io import weights
+        from egosim_jax.models.wan_vae import WanVAE, standardise_latents
 
-        task = Autoencoding(
-            vae=config.vae, video=dataclasses.replace(config.video, frames=9), crop=(64, 64)
-        )
+        path = self.out / "weights" / "vae.safetensors"
+        if path.exists():
+            vae = nnx.eval_shape(lambda: WanVAE(config.vae, rngs=nnx.Rngs(0)))
+            weights.load(path, vae)
+            return vae
+        piece = dataclasses.replace(config.video, frames=9)
         vae = train(
-            task,
+            Autoencoding(vae=config.vae, video=piece, crop=(64, 64)),
             self.vae,
             data=frames["train"],
             validation=frames["test"],
@@ -113,6 +121,7 @@ class RealTiny:
         )
         videos = (record.arrays["truth"] for record in ShardReader(frames["train"]))
         standardise_latents(vae, *latent_statistics(vae, videos))
+        weights.save(path, vae)
         return vae
 
     def _encode(
@@ -121,6 +130,7 @@ class RealTiny:
         """Cache the latents of every window of a split."""
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.generator import Generator, Networks
+        from egosim_jax.io.weights import hashes
         from egosim_jax.train.cache import cache
 
         out = self.out / "latents" / split
@@ -133,7 +143,7 @@ class RealTiny:
                 out=out,
                 stride=self.stride if split == "train" else CLIP_FRAMES - config.video.frames,
                 batch_size=8,
-                provenance={"config": config.name, "frames": str(frames[split])},
+                provenance={"config": config.name, "weights": hashes(self.out / "weights")},
             )
             _tell(f"encoding {split}", progress)
         return out

@@ -1,0 +1,77 @@
+"""From sample clips to trained weights to a generated clip, by the commands alone."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.train.__main__ import main as egosim_train
+
+STEPS = ["--vae.steps", "2", "--denoiser.steps", "2"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("train") / "run"
+    assert egosim_train(["debug", "--out", str(out), *STEPS]) == 0
+    return out
+
+
+def test_a_recipe_leaves_weights_of_every_network(run):
+    assert sorted(path.name for path in (run / "weights").iterdir()) == [
+        "dit.safetensors",
+        "image.safetensors",
+        "text.safetensors",
+        "vae.safetensors",
+    ]
+
+
+def test_every_window_of_a_training_clip_is_cached_with_its_start(run):
+    reader = ShardReader(run / "latents" / "train")
+    starts = {(record.metadata["video_id"], record.metadata["start"]) for record in reader}
+    clips = {"sample_0", "sample_1", "sample_2"}
+    assert starts == {(clip, start) for clip in clips for start in range(0, 53, 8)}
+
+
+def test_the_log_of_each_stage_has_its_losses(run):
+    for stage in ("vae", "denoiser"):
+        lines = (run / stage / "metrics.jsonl").read_text("utf-8").splitlines()
+        assert any("loss" in json.loads(line) for line in lines)
+
+
+def test_the_same_command_finds_everything_done(run):
+    before = (run / "weights" / "dit.safetensors").read_bytes()
+    assert egosim_train(["debug", "--out", str(run), *STEPS]) == 0
+    assert (run / "weights" / "dit.safetensors").read_bytes() == before
+
+
+def test_encode_makes_the_latents_of_the_recipe_again(run, tmp_path):
+    options = {
+        "config": "debug",
+        "weights": run / "weights",
+        "shards": run / "frames" / "test",
+        "out": tmp_path / "latents",
+        "stride": 52,
+        "batch-size": 8,
+    }
+    flags = [str(x) for name, value in options.items() for x in (f"--{name}", value)]
+    assert egosim(["data", "encode", *flags]) == 0
+    again, recipe = ShardReader(tmp_path / "latents"), ShardReader(run / "latents" / "test")
+    assert len(again) == len(recipe)
+    for ours, theirs in zip(again, recipe, strict=True):
+        assert all((ours.arrays[name] == theirs.arrays[name]).all() for name in theirs.arrays)
+
+
+def test_trained_weights_generate(run, tmp_path):
+    options = {
+        "config": "debug",
+        "weights": run / "weights",
+        "metadata": run / "clips" / "metadata.csv",
+        "where": "split=test",
+        "out": tmp_path / "out",
+    }
+    flags = [str(x) for name, value in options.items() for x in (f"--{name}", value)]
+    assert egosim(["generate", *flags]) == 0
+    assert (tmp_path / "out" / "sample_3.mp4").is_file()
