@@ -11,7 +11,7 @@ depends on its own seed only, so that a clip does not depend on the batch it was
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, no_type_check
 
@@ -78,6 +78,13 @@ class ModelConfig:
         for left, a, right, b in pairs:
             if a != b:
                 raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+
+    def at(self, folder: Path) -> ModelConfig:
+        """This config, with a tokenizer that has files looked up in a weights folder."""
+        if self.tokenizer.kind == "byt5":
+            return self
+        files = replace(self.tokenizer, kind=folder / self.tokenizer.kind)
+        return replace(self, tokenizer=files)
 
 
 class Networks(nnx.Module):

@@ -105,7 +105,7 @@ class Encode:
         for name, value in (("stride", self.stride), ("batch-size", self.batch_size)):
             if value < 1:
                 raise InputError(f"--{name} must be at least 1, not {value}.")
-        config, source = configs.get(self.config), ShardReader(self.shards)
+        config, source = configs.get(self.config).at(self.weights), ShardReader(self.shards)
         progress = cache(
             Generator(config, Networks.load(config, self.weights)),
             source=source,

@@ -106,7 +106,9 @@ class Generate:
         from egosim_jax import configs
 
         config = configs.get(self.config)
-        if self.weights is None and config.name != "debug":
+        if self.weights is not None:
+            config = config.at(self.weights)
+        elif config.name != "debug":
             raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
         return config if self.steps is None else dataclasses.replace(config, steps=self.steps)
 

@@ -85,7 +85,7 @@ def _backward(saved: tuple[Array, Array], dy: Array) -> tuple[Array, Array]:
     padded = jnp.pad(dy, ((0, 0), (past, past), (0, 0), (0, 0), (0, 0)))
     flipped = rearrange(kernel[::-1, ::-1, ::-1], "t h w i o -> t h w o i")
     dx = sum_of_images(padded, flipped)
-    if x.shape[2] * x.shape[3] >= LARGE_IMAGE and x.shape[-1] > FEW_CHANNELS:
+    if x.shape[2] * x.shape[3] >= LARGE_IMAGE:
         return dx, _kernel_gradient(x, padded, kernel)
     return dx, *jax.vjp(lambda kernel: sum_of_images(x, kernel), kernel)[1](dy)
 

@@ -149,6 +149,12 @@ def test_weights_of_another_model_are_refused(networks, tmp_path: Path):
         Networks.load(wider, tmp_path)
 
 
+def test_the_tokenizer_of_the_release_lies_in_its_weights_folder():
+    config = configs.get("egosim_14b").at(Path("weights"))
+    assert config.tokenizer.kind == Path("weights/google/umt5-xxl")
+    assert DEBUG.at(Path("weights")) is DEBUG
+
+
 def test_networks_that_do_not_fit_each_other_are_refused():
     with pytest.raises(InputError, match=r"dit\.text_dim is 64 but text\.dim is 4096"):
         ModelConfig(name="odd", video=CONFIG.video, dit=CONFIG.dit, vae=CONFIG.vae)
