@@ -70,13 +70,11 @@ def train(
     data: Path,
     validation: Path | None,
     out: Path,
-    until: int | None = None,
 ) -> Any:
     """Train `task` on the shards in `data`, resuming what `out` holds; the trained networks.
 
     `validation` names shards whose loss is measured at fixed times and with fixed noise. The run
-    folder holds config.json, environment.json, metrics.jsonl and checkpoints/. `until` stops early,
-    as an interruption would, so that a later call resumes.
+    folder holds config.json, environment.json, metrics.jsonl and checkpoints/.
     """
     open_folder(out, {"task": task, "training": training})
     mesh = make_mesh(training.mesh)
@@ -122,20 +120,20 @@ def train(
     rate = learning_rate(training.optimizer, training.steps)
     clock = _Clock(start, training.steps)
     pending: dict[int, Mapping[str, jax.Array]] = {}
-    last = training.steps if until is None else min(until, training.steps)
-    for step in range(start + 1, last + 1):
+    for step in range(start + 1, training.steps + 1):
+        last = step == training.steps
         batch = _to_devices(next(batches), placed)
         state, metrics = update(state, batch)
         pending[step] = metrics
-        if step % training.log_every == 0 or step == last:
+        if step % training.log_every == 0 or last:
             numbers = _mean(pending)
             pending = {}
             writer.write(
                 step, {**numbers, "rate": float(np.asarray(rate(step - 1))), **clock.tick(step)}
             )
-        if validation is not None and (step % training.validate_every == 0 or step == last):
+        if validation is not None and (step % training.validate_every == 0 or last):
             writer.write(step, _validate(validate, state, validation, task, training, placed))
-        if step % training.save_every == 0 or step == last:
+        if step % training.save_every == 0 or last:
             checkpoints.save(step, state, batches)
     checkpoints.close()
     return nnx.merge(graph, state.params)

@@ -111,9 +111,9 @@ class RealTiny:
             vae = nnx.eval_shape(lambda: WanVAE(config.vae, rngs=nnx.Rngs(0)))
             weights.load(path, vae)
             return vae
-        piece = dataclasses.replace(config.video, frames=9)
+        # Pieces as long as the model's clips: a VAE that has only seen shorter ones drifts later.
         vae = train(
-            Autoencoding(vae=config.vae, video=piece, crop=(64, 64)),
+            Autoencoding(vae=config.vae, video=config.video, crop=(48, 64)),
             self.vae,
             data=frames["train"],
             validation=frames["test"],
