@@ -26,7 +26,7 @@ from egosim_jax.conditioning.image import clip_pixels
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.conditioning.video import to_model, to_uint8
 from egosim_jax.diffusion.guidance import Guidance
-from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.diffusion.schedule import FlowSchedule, VelocityFn
 from egosim_jax.diffusion.solver import Euler, UniPC, integrate
 from egosim_jax.io import weights
 from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
@@ -193,14 +193,17 @@ def denoise(
 ) -> Float[Array, "b f h w 16"]:
     """Walk from noise to latents; the unconditional branch knows no text."""
     channels = condition_channels(condition)
-    context = dit.prepare(channels, condition.text, condition.image)
 
-    def unconditional(x: Array, t: Array) -> Array:
-        empty = dit.prepare(channels, jnp.zeros_like(condition.text), condition.image)
-        return dit.denoise(x, t, empty)
+    def branch(text: Array) -> VelocityFn:
+        context = dit.prepare(channels, text, condition.image)
+        return lambda x, t: dit.denoise(x, t, context)
 
+    text = jnp.asarray(condition.text)
+    conditional = branch(text)
+    guided = config.guidance.scale != 1
+    unconditional = branch(jnp.zeros_like(text)) if guided else conditional
     return integrate(
-        config.guidance.guide(lambda x, t: dit.denoise(x, t, context), unconditional),
+        config.guidance.guide(conditional, unconditional),
         noise,
         schedule=config.schedule,
         solver=config.solver,

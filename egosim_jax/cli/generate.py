@@ -116,13 +116,16 @@ class Generate:
         from egosim_jax.io.run import open_folder
         from egosim_jax.io.weights import hashes
 
+        digests = None if self.weights is None else hashes(self.weights)
         run = {
             "model": config,
-            "weights": None if self.weights is None else hashes(self.weights),
+            "weights": digests,
             "seed": self.seed,
             "policy": self._policy,
         }
         open_folder(self.out, run)
+        for name, digest in (digests or {}).items():
+            print(f"{config.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
 
     def _check(
         self, items: Sequence[_Item], config: ModelConfig
@@ -165,13 +168,10 @@ class Generate:
 
     def _generator(self, config: ModelConfig) -> Generator:
         from egosim_jax.generator import Generator, Networks
-        from egosim_jax.io.weights import hashes
 
         if self.weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(config, Networks.random(config, seed=self.seed))
-        for name, digest in hashes(self.weights).items():
-            print(f"{config.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
         return Generator(config, Networks.load(config, self.weights))
 
     def _load(

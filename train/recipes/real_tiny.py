@@ -2,8 +2,7 @@
 
     egosim-train real_tiny --metadata CLIPS/metadata.csv --out runs/real_tiny
 
-takes about an hour on 2 CPU cores for 19 training clips of 61 frames. Every stage resumes: run the
-same command again after an interruption.
+runs on a CPU. Every stage resumes: run the same command again after an interruption.
 """
 
 from __future__ import annotations
