@@ -12,7 +12,7 @@ import tyro
 from egosim_jax import command
 from egosim_jax.cli.data import Check, Encode, Pack, Sample, Stats
 from egosim_jax.cli.evaluate import Evaluate
-from egosim_jax.cli.experiment import RealTiny
+from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
 
 
@@ -37,7 +37,10 @@ class Data:
 class Experiment:
     """Repeat a documented experiment: training, generation and its table, by one command."""
 
-    command: Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
+    command: (
+        Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
+        | Annotated[Debug, tyro.conf.subcommand("debug")]
+    )
 
     def run(self) -> int:
         """Run the chosen experiment."""

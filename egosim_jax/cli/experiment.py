@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,18 +21,12 @@ SHEET_FRAMES = (4, 10, 16)
 
 @dataclass(frozen=True, kw_only=True)
 class RealTiny:
-    """Train `real_tiny` on the train split, generate both splits, compare, and draw a sheet.
-
-    Beside the clips as they are, generates each with the prior, mask and hands of another clip:
-    what that costs is what the model takes from them. Writes report.json and contact_sheet.png.
-    """
+    """Train `real_tiny` on the train split, generate both splits, compare, and draw a sheet."""
 
     metadata: Path
     """CSV or JSONL in EgoSim's columns, with video and split; clips of 61 frames."""
     out: Path
     """Folder of the run."""
-    config: str = "real_tiny"
-    """Name of the model."""
     start: tuple[int, ...] = (0, 22, 44)
     """First frames of the windows that are generated."""
     seed: int = 0
@@ -41,10 +36,70 @@ class RealTiny:
 
     def run(self) -> int:
         """Train, generate, compare, draw."""
-        from egosim_jax.io.run import write_json
         from egosim_jax.train.recipes import RealTiny as Recipe
 
-        Recipe(metadata=self.metadata, out=self.out, config=self.config).run()
+        Recipe(metadata=self.metadata, out=self.out).run()
+        return Comparison(
+            config="real_tiny",
+            metadata=self.metadata,
+            out=self.out,
+            start=self.start,
+            seed=self.seed,
+            batch_size=self.batch_size,
+        ).run()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Debug:
+    """The same with `debug` on sample clips, in a few minutes: to see that everything runs."""
+
+    out: Path
+    """Folder of the run."""
+    steps: int = 20
+    """Updates of the autoencoder, and as many of the denoiser."""
+    seed: int = 0
+    """Seed of the generated clips."""
+
+    def run(self) -> int:
+        """Train, generate, compare, draw."""
+        from egosim_jax.train.recipes import Debug as Recipe
+
+        plan = Recipe(out=self.out)
+        recipe = dataclasses.replace(
+            plan,
+            vae=dataclasses.replace(plan.vae, steps=self.steps),
+            denoiser=dataclasses.replace(plan.denoiser, steps=self.steps),
+        )
+        recipe.run()
+        return Comparison(
+            config="debug",
+            metadata=recipe.metadata,
+            out=self.out,
+            start=(0,),
+            seed=self.seed,
+            batch_size=2,
+        ).run()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What a trained model makes of both splits, in numbers and pictures.
+
+    Beside the clips as they are, generates each with the prior, mask and hands of another clip:
+    what that costs is what the model takes from them. Writes report.json and contact_sheet.png.
+    """
+
+    config: str
+    metadata: Path
+    out: Path
+    start: tuple[int, ...]
+    seed: int
+    batch_size: int
+
+    def run(self) -> int:
+        """Generate, compare, draw."""
+        from egosim_jax.io.run import write_json
+
         swapped = self._swap()
         reports = {
             name: self._report(name, metadata)

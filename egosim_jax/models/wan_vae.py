@@ -50,6 +50,7 @@ Layer = Callable[[Array, Cache], tuple[Array, Cache]]
 # Residual branches start small, not at zero: that gave 10.4 instead of 13.2 dB after 60 steps
 # (one seed, width 16).
 _small = nnx.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
+_noise = nnx.initializers.variance_scaling(0.09, "fan_in", "truncated_normal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +99,34 @@ class WanVAEConfig:
                     f"{name} has {len(getattr(self, name))} entries for {self.z_dim} latent "
                     "channels (z_dim): give one number per channel."
                 )
+
+
+def _copy(*taps: tuple[int, ...], times: int = 1) -> Initializer:
+    """Weights that hand each channel on as the mean over `taps`, with a little noise.
+
+    With them, residual branches that start small and `_offsets`, the untrained network is already
+    a pyramid of averages and its inverse, and training has only the detail to learn: 22.5 instead
+    of 16.9 dB after 200 and 100 steps (one seed, width 8).
+    """
+
+    def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32, **_: Any) -> Array:
+        same = jnp.tile(jnp.eye(shape[-2], shape[-1] // times, dtype=dtype), (1, times))
+        kernel = _noise(key, shape, dtype)
+        for tap in taps:
+            kernel = kernel.at[tap].add(same / len(taps))
+        return kernel
+
+    return init
+
+
+def _offsets(conv: Conv) -> None:
+    """Give the channels that do not carry colour the constants 1 and -1.
+
+    The norms divide by the length of all channels: without a constant among them, dark and bright
+    would look the same.
+    """
+    channel = jnp.arange(conv.bias.shape[0])
+    conv.bias[...] = jnp.where(channel < 3, 0.0, 1.0 - 2.0 * (channel % 2))
 
 
 class Conv(nnx.Module):
@@ -156,7 +185,9 @@ class ResidualBlock(nnx.Module):
         self.norm2 = _norm(out_dim)
         self.conv2 = Conv(cube, out_dim, out_dim, dtype=dtype, kernel_init=_small, rngs=rngs)
         self.shortcut = (
-            Linear(in_dim, out_dim, axes=(None, "mlp"), dtype=dtype, rngs=rngs)
+            Linear(
+                in_dim, out_dim, axes=(None, "mlp"), dtype=dtype, kernel_init=_copy(()), rngs=rngs
+            )
             if in_dim != out_dim
             else None
         )
@@ -191,8 +222,13 @@ class Downsample(nnx.Module):
     """Halve rows and columns and, if `temporal`, the frames after the first."""
 
     def __init__(self, dim: int, *, temporal: bool, dtype: str, rngs: nnx.Rngs):
-        self.space = Conv((3, 3), dim, dim, dtype=dtype, rngs=rngs)
-        self.time = Conv((3, 1, 1), dim, dim, dtype=dtype, rngs=rngs) if temporal else None
+        quad, pair = _copy((0, 0), (0, 1), (1, 0), (1, 1)), _copy((1, 0, 0), (2, 0, 0))
+        self.space = Conv((3, 3), dim, dim, dtype=dtype, kernel_init=quad, rngs=rngs)
+        self.time = (
+            Conv((3, 1, 1), dim, dim, dtype=dtype, kernel_init=pair, rngs=rngs)
+            if temporal
+            else None
+        )
 
     def __call__(self, x: Input, cache: Cache) -> Output:
         """Downsample; the cache is that of the temporal convolution."""
@@ -209,8 +245,13 @@ class Upsample(nnx.Module):
     """Double rows and columns, halve the channels and, if `temporal`, double the later frames."""
 
     def __init__(self, dim: int, *, temporal: bool, dtype: str, rngs: nnx.Rngs):
-        self.time = Conv((3, 1, 1), dim, 2 * dim, dtype=dtype, rngs=rngs) if temporal else None
-        self.space = Conv((3, 3), dim, dim // 2, dtype=dtype, rngs=rngs)
+        twice, once = _copy((2, 0, 0), times=2), _copy((1, 1))
+        self.time = (
+            Conv((3, 1, 1), dim, 2 * dim, dtype=dtype, kernel_init=twice, rngs=rngs)
+            if temporal
+            else None
+        )
+        self.space = Conv((3, 3), dim, dim // 2, dtype=dtype, kernel_init=once, rngs=rngs)
 
     def __call__(self, x: Input, cache: Cache) -> Output:
         """Upsample; the cache is that of the temporal convolution, which never sees frame 0."""
@@ -229,7 +270,9 @@ class Encoder(nnx.Module):
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
         dims = [config.dim * m for m in (1, *config.dim_mult)]
-        self.conv_in = Conv((3, 3, 3), 3, dims[0], dtype=dtype, rngs=rngs)
+        cube, now = (3, 3, 3), _copy((2, 1, 1))
+        self.conv_in = Conv(cube, 3, dims[0], dtype=dtype, kernel_init=now, rngs=rngs)
+        _offsets(self.conv_in)
         layers = []
         for level, (dim, out) in enumerate(pairwise(dims)):
             for block in range(config.res_blocks):
@@ -240,7 +283,8 @@ class Encoder(nnx.Module):
         self.levels = nnx.List(layers)
         self.middle = nnx.List(_middle(dims[-1], dtype=dtype, rngs=rngs))
         self.norm_out = _norm(dims[-1])
-        self.conv_out = Conv((3, 3, 3), dims[-1], 2 * config.z_dim, dtype=dtype, rngs=rngs)
+        moments = 2 * config.z_dim
+        self.conv_out = Conv(cube, dims[-1], moments, dtype=dtype, kernel_init=now, rngs=rngs)
 
     def __call__(self, x: Input, cache: Cache) -> Output:
         """Encode the frames that follow those of the cache."""
@@ -253,9 +297,11 @@ class Decoder(nnx.Module):
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
         mults = config.dim_mult[::-1]
-        self.conv_in = Conv((3, 3, 3), config.z_dim, config.dim * mults[0], dtype=dtype, rngs=rngs)
-        self.middle = nnx.List(_middle(config.dim * mults[0], dtype=dtype, rngs=rngs))
         layers, dim = [], config.dim * mults[0]
+        cube, now = (3, 3, 3), _copy((2, 1, 1))
+        self.conv_in = Conv(cube, config.z_dim, dim, dtype=dtype, kernel_init=now, rngs=rngs)
+        _offsets(self.conv_in)
+        self.middle = nnx.List(_middle(dim, dtype=dtype, rngs=rngs))
         for level, mult in enumerate(mults):
             out = config.dim * mult
             for _ in range(config.res_blocks + 1):
@@ -267,7 +313,7 @@ class Decoder(nnx.Module):
                 dim //= 2
         self.levels = nnx.List(layers)
         self.norm_out = _norm(dim)
-        self.conv_out = Conv((3, 3, 3), dim, 3, dtype=dtype, rngs=rngs)
+        self.conv_out = Conv(cube, dim, 3, dtype=dtype, kernel_init=now, rngs=rngs)
 
     def __call__(self, x: Input, cache: Cache) -> Output:
         """Decode the latent frames that follow those of the cache."""
@@ -306,8 +352,13 @@ class WanVAE(nnx.Module):
         z, dtype = config.z_dim, config.dtype
         axes = (None, "mlp")
         self.encoder = Encoder(config, rngs=rngs)
-        self.to_moments = Linear(2 * z, 2 * z, axes=axes, dtype=dtype, rngs=rngs)
-        self.from_latents = Linear(z, z, axes=axes, dtype=dtype, rngs=rngs)
+        same = _copy(())
+        self.to_moments = Linear(2 * z, 2 * z, axes=axes, dtype=dtype, kernel_init=same, rngs=rngs)
+        # Untrained, the samples are close to their means: noise as strong as the signal would
+        # first have to be unlearnt.
+        bias = cast(nnx.Param, self.to_moments.bias)
+        bias[...] = bias[...].at[z:].set(-5.0)
+        self.from_latents = Linear(z, z, axes=axes, dtype=dtype, kernel_init=same, rngs=rngs)
         self.decoder = Decoder(config, rngs=rngs)
 
     def moments(

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.data.shards import ShardReader
@@ -15,7 +16,7 @@ STEPS = ["--vae.steps", "2", "--denoiser.steps", "2"]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("train") / "run"
-    assert egosim_train(["debug", "--out", str(out), *STEPS]) == 0
+    assert egosim(["experiment", "debug", "--out", str(out), "--steps", "2"]) == 0
     return out
 
 
@@ -31,7 +32,7 @@ def test_a_recipe_leaves_weights_of_every_network(run):
 def test_every_window_of_a_training_clip_is_cached_with_its_start(run):
     reader = ShardReader(run / "latents" / "train")
     starts = {(record.metadata["video_id"], record.metadata["start"]) for record in reader}
-    clips = {"sample_0", "sample_1", "sample_2"}
+    clips = {f"sample_{number}" for number in (0, 1, 2, 4, 5, 6)}
     assert starts == {(clip, start) for clip in clips for start in range(0, 53, 8)}
 
 
@@ -41,7 +42,32 @@ def test_the_log_of_each_stage_has_its_losses(run):
         assert any("loss" in json.loads(line) for line in lines)
 
 
-def test_the_same_command_finds_everything_done(run):
+def test_an_experiment_reports_each_method_with_and_without_the_right_conditions(run):
+    report = json.loads((run / "report.json").read_text("utf-8"))
+    for name in ("generated", "swapped"):
+        assert set(report[name]["splits"]) == {"train", "test"}
+        for split in report[name]["splits"].values():
+            assert all(0 < method["psnr"] < 60 for method in split.values())
+    methods = set(report["generated"]["splits"]["test"])
+    assert {"generated", "prior", "prior_fit", "still", "vae"} <= methods
+
+
+def test_an_experiment_gives_each_clip_the_conditions_of_another(run):
+    lines = [json.loads(line) for line in (run / "swapped.jsonl").read_text("utf-8").splitlines()]
+    assert len(lines) == 8
+    for line in lines:
+        assert line["video_id"] in line["first_frame"]
+        assert line["video_id"] not in line["ego_prior_video"]
+        assert Path(line["ego_prior_video"]).parent == Path(line["hand_keypoint_video"]).parent
+
+
+def test_an_experiment_draws_a_row_for_each_clip(run):
+    with Image.open(run / "contact_sheet.png") as sheet:
+        assert sheet.height == 8 * (14 + 64)
+        assert sheet.width == 3 * 4 * 96
+
+
+def test_the_recipe_finds_everything_done(run):
     before = (run / "weights" / "dit.safetensors").read_bytes()
     assert egosim_train(["debug", "--out", str(run), *STEPS]) == 0
     assert (run / "weights" / "dit.safetensors").read_bytes() == before

@@ -32,12 +32,17 @@ class Debug:
 
     out: Path
     """Folder of the run."""
-    clips: int = 4
+    clips: int = 8
     """Sample clips to make; every fourth is for testing."""
     vae: Training = field(default_factory=lambda: _training(20))
     """Training of the autoencoder."""
     denoiser: Training = field(default_factory=lambda: _training(20))
     """Training of the denoiser and its encoders."""
+
+    @property
+    def metadata(self) -> Path:
+        """The sample clips."""
+        return self.out / "clips" / "metadata.csv"
 
     def run(self) -> int:
         """Make the clips, then do as `real_tiny` does."""
@@ -46,8 +51,9 @@ class Debug:
 
         video = configs.get("debug").video
         spec = type(video)(frames=CLIP_FRAMES, height=video.height, width=video.width)
+        write_sample(self.metadata.parent, spec=spec, clips=self.clips)
         return RealTiny(
-            metadata=write_sample(self.out / "clips", spec=spec, clips=self.clips),
+            metadata=self.metadata,
             out=self.out,
             config="debug",
             stride=8,

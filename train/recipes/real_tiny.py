@@ -50,7 +50,7 @@ class RealTiny:
         default_factory=lambda: Training(
             steps=2000,
             batch_size=2,
-            optimizer=OptimizerConfig(rule="muon", learning_rate=5e-3, warmup=50, decay="cosine"),
+            optimizer=OptimizerConfig(rule="muon", learning_rate=1e-3, warmup=20, decay="cosine"),
             log_every=25,
             save_every=500,
             validate_every=250,
@@ -59,7 +59,7 @@ class RealTiny:
     """Training of the autoencoder."""
     denoiser: Training = field(
         default_factory=lambda: Training(
-            steps=4000,
+            steps=2500,
             batch_size=4,
             optimizer=OptimizerConfig(rule="muon", learning_rate=2e-3, warmup=50, decay="cosine"),
             log_every=25,

@@ -171,3 +171,19 @@ def test_a_video_that_does_not_fit_the_strides_is_refused(vae, method, shape, wo
 def test_sizes_that_do_not_fit_each_other_are_refused(change, words):
     with pytest.raises(InputError, match=words):
         WanVAEConfig(**(SIZES | change))
+
+
+def test_an_untrained_vae_already_tells_dark_from_bright_everywhere_in_the_clip():
+    config = WanVAEConfig(
+        dim=8, z_dim=4, res_blocks=1, latent_mean=(0.0,) * 4, latent_std=(1.0,) * 4
+    )
+    grey = jnp.linspace(-1, 1, 9)
+    videos = jnp.broadcast_to(grey[:, None, None, None, None], (9, 5, 16, 16, 3))
+    decoded = jax.jit(
+        lambda rngs: (vae := WanVAE(config, rngs=rngs)).decode_whole(vae.moments(videos)[0]),
+        compiler_options=QUICK,
+    )
+    for seed in range(3):
+        values = np.asarray(decoded(nnx.Rngs(seed))).reshape(9, -1)
+        correlation = np.corrcoef(np.concatenate([grey[None], values.T]))[0, 1:]
+        assert np.median(correlation) > 0.8
