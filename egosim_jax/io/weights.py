@@ -226,7 +226,10 @@ def save(path: Path, module: nnx.Module) -> None:
     tensors = {name: leaf.get_value() for name, leaf in _leaves(module).items()}
     temporary = path.with_name(path.name + ".tmp")
     path.parent.mkdir(parents=True, exist_ok=True)
+    temporary.touch()
+    mode = temporary.stat().st_mode
     save_file(tensors, temporary)
+    temporary.chmod(mode)  # safetensors' own is for the owner alone
     temporary.replace(path)
 
 

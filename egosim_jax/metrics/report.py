@@ -59,14 +59,14 @@ def summarise(scores: Sequence[Score]) -> Summary:
 def summarise_splits(
     clips: Sequence[tuple[str, Mapping[str, Score]]],
 ) -> dict[str, dict[str, Summary]]:
-    """Split to method to summary, from each clip's split and scores by method."""
+    """Sorted splits, and of each method its summary, from every clip's split and scores."""
     gathered: dict[str, dict[str, list[Score]]] = {}
     for split, scores in clips:
         for method, value in scores.items():
             gathered.setdefault(split, {}).setdefault(method, []).append(value)
     return {
         split: {method: summarise(values) for method, values in methods.items()}
-        for split, methods in gathered.items()
+        for split, methods in sorted(gathered.items())
     }
 
 

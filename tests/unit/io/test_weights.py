@@ -1,5 +1,7 @@
 """Weights: our own format, and foreign names through a table, both ways."""
 
+import os
+
 import numpy as np
 import pytest
 from flax import nnx
@@ -94,3 +96,12 @@ def test_a_truncated_file_is_refused(tmp_path):
 def test_a_missing_file_names_the_option(tmp_path):
     with pytest.raises(InputError, match="--weights"):
         weights.load(tmp_path / "none.safetensors", skeleton())
+
+
+def test_weights_can_be_read_by_whoever_the_umask_allows(tmp_path):
+    umask = os.umask(0o022)
+    try:
+        weights.save(tmp_path / "a.safetensors", Net(rngs=nnx.Rngs(0)))
+    finally:
+        os.umask(umask)
+    assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o644
