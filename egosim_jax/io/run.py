@@ -75,8 +75,8 @@ def _commit() -> str | None:
 def open_folder(folder: Path, config: Any) -> None:
     """Make a run folder and record config and environment, or continue in one of equal config.
 
-    Raises `InputError` when the folder cannot be written or holds a run of another config, naming
-    the fields that differ.
+    A folder that was moved stays the same run: `out` may differ. Raises `InputError` when the
+    folder cannot be written or holds a run of another config, naming the fields that differ.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -87,7 +87,8 @@ def open_folder(folder: Path, config: Any) -> None:
         raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
     path, wanted = folder / "config.json", plain(config)
     if path.is_file():
-        differing = sorted(_differences(json.loads(path.read_text("utf-8")), wanted))
+        have = json.loads(path.read_text("utf-8"))
+        differing = sorted(_differences({**have, "out": None}, {**wanted, "out": None}))
         if differing:
             listing = "\n".join(f"  {line}" for line in differing)
             raise InputError(

@@ -34,6 +34,16 @@ def test_the_same_config_continues_the_folder(tmp_path):
     open_folder(tmp_path, config())
 
 
+def test_a_moved_folder_is_continued(tmp_path):
+    @dataclass(frozen=True)
+    class Job:
+        out: Path
+
+    open_folder(tmp_path / "here", Job(tmp_path / "here"))
+    (tmp_path / "here").rename(tmp_path / "there")
+    open_folder(tmp_path / "there", Job(tmp_path / "there"))
+
+
 def test_another_config_is_refused_naming_the_field_and_both_values(tmp_path):
     open_folder(tmp_path, config())
     with pytest.raises(InputError, match="seed: the folder has 0, this run has 1"):
