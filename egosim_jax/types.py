@@ -82,6 +82,21 @@ class VideoSpec:
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
+class Cameras:
+    """A camera's path: where it is at each frame, in OpenCV axes (x right, y down, z forward)."""
+
+    world_from_camera: Float[np.ndarray, "f 4 4"]
+    """Rigid, in metres."""
+    intrinsics_px: Float[np.ndarray, "3 3"]
+    """Focal lengths and principal point, with pixel centres at integer coordinates."""
+    height: int
+    """Rows of a picture."""
+    width: int
+    """Columns of a picture."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
 class Triplet:
     """One clip's conditions, already at the model's length and size, and the truth if known."""
 

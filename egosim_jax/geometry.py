@@ -1,0 +1,62 @@
+"""Rigid motions and the pinhole camera, for NumPy arrays and jax's alike.
+
+Cameras follow OpenCV: x right, y down, z forward, in metres, with pixel centres at integer
+coordinates. A matrix `a_from_b` takes coordinates in b to coordinates in a, so that
+`a_from_c = a_from_b @ b_from_c`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+
+def transform(a_from_b: Float[Any, "*#b 4 4"], points: Float[Any, "*#b n 3"]) -> Any:
+    """The points `*b n 3` of b, in a."""
+    return points @ a_from_b[..., :3, :3].swapaxes(-1, -2) + a_from_b[..., None, :3, 3]
+
+
+def invert(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
+    """`b_from_a` of a rigid motion."""
+    inverse = np.zeros_like(a_from_b)
+    rotation = a_from_b[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3:] = -rotation @ a_from_b[..., :3, 3:]
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def project(intrinsics_px: Float[Any, "3 3"], points: Float[Any, "*b n 3"]) -> tuple[Any, Any]:
+    """Columns and rows, each `*b n`, at which a camera sees points of its own coordinates.
+
+    Points at depth 0 come out infinite or NaN, those behind the camera mirrored: look at z first.
+    """
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    focal_x, focal_y = intrinsics_px[0, 0], intrinsics_px[1, 1]
+    return focal_x * x / z + intrinsics_px[0, 2], focal_y * y / z + intrinsics_px[1, 2]
+
+
+def pixel_rays(
+    intrinsics_px: Float[np.ndarray, "3 3"], *, height: int, width: int
+) -> Float[np.ndarray, "h w 3"]:
+    """The direction of each pixel in camera coordinates, with z = 1: times a depth, its point."""
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    x = (columns - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
+    y = (rows - intrinsics_px[1, 2]) / intrinsics_px[1, 1]
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def look_at(
+    eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], *, up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """`world_from_camera` of a camera at `eye` that has `target` in the middle and `up` above."""
+    forward = target - eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = eye
+    return pose

@@ -1,0 +1,171 @@
+"""The renderer in NumPy: what its JAX twin is checked against, and what needs no jax.
+
+A point at depth z that projects to (u, v) is a square of p x p pixels: those (i, j) with
+-p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. Among all that cover a pixel the nearest is seen, and
+of equally near ones the first. A joint is a sphere, a bone the tube between two joints; a pixel
+shows whichever its ray meets first, without shading.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from egosim_jax.geometry import invert, pixel_rays, project, transform
+from egosim_jax.rendering.skeleton import (
+    BONE_RADIUS_M,
+    FAR_M,
+    GAMMA,
+    JOINT_RADIUS_M,
+    NEAR_M,
+    SKELETONS,
+    Kind,
+)
+from egosim_jax.types import Cameras
+
+Coverage = Literal["double", "dilate"]
+
+
+def splat(
+    points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
+) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
+    """Depth in metres and number of the point that each pixel sees; infinite and -1 where none.
+
+    Points with a coordinate that is not finite, nearer than 1 cm or farther than 100 m are not
+    drawn.
+    """
+    shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
+    depth, index = np.full(shape, np.inf, np.float32), np.full(shape, -1)
+    (known,) = np.nonzero(np.isfinite(points_m).all(axis=1))
+    for frame, world_from_camera in enumerate(cameras.world_from_camera):
+        local = transform(invert(world_from_camera), points_m[known]).astype(np.float32)
+        drawable = (local[:, 2] >= NEAR_M) & (local[:, 2] <= FAR_M)
+        local, number = local[drawable], known[drawable].astype(np.uint64)
+        u, v = project(cameras.intrinsics_px.astype(np.float32), local)
+        column, row = np.ceil(u - point_px / 2), np.ceil(v - point_px / 2)
+        # One key for depth and number: the bits of positive floats sort as the floats do.
+        keys = local[:, 2].copy().view(np.uint32).astype(np.uint64) << 32 | number
+        best = np.full(shape[1:], np.iinfo(np.uint64).max)
+        for down in range(point_px):
+            for right in range(point_px):
+                y, x = row + down, column + right
+                inside = (y >= 0) & (y < shape[1]) & (x >= 0) & (x < shape[2])
+                cell = y[inside].astype(int) * shape[2] + x[inside].astype(int)
+                np.minimum.at(best.reshape(-1), cell, keys[inside])
+        drawn = best != np.iinfo(np.uint64).max
+        depth[frame][drawn] = (best[drawn] >> 32).astype(np.uint32).view(np.float32)
+        index[frame][drawn] = (best[drawn] & 0xFFFFFFFF).astype(int)
+    return depth, index
+
+
+def paint(
+    index: Int[np.ndarray, "f h w"], colours: UInt8[np.ndarray, "n 3"], *, gamma: bool
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """The picture of the points that are seen, black where there are none.
+
+    `gamma` applies the original renderer's colour curve, c -> c^(1/2.2).
+    """
+    colours = np.concatenate([GAMMA[colours] if gamma else colours, np.zeros((1, 3), np.uint8)])
+    return colours[index]
+
+
+def unobserved(
+    points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int, coverage: Coverage
+) -> UInt8[np.ndarray, "f h w"]:
+    """The mask: 255 where no point is seen.
+
+    `double` draws the points twice as large, as in training; `dilate` widens what is drawn by a
+    pixel all around, as the memory does.
+    """
+    if coverage == "double":
+        return np.where(splat(points_m, cameras, point_px=2 * point_px)[1] < 0, 255, 0).astype(
+            np.uint8
+        )
+    drawn = splat(points_m, cameras, point_px=point_px)[1] >= 0
+    _, height, width = drawn.shape
+    padded = np.pad(drawn, ((0, 0), (1, 1), (1, 1)))
+    wide = np.zeros_like(drawn)
+    for down in range(3):
+        for right in range(3):
+            wide |= padded[:, down : down + height, right : right + width]
+    return np.where(wide, 0, 255).astype(np.uint8)
+
+
+def draw_hands(
+    joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
+) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
+    """Picture and depth of n hands, black and infinite where there are none.
+
+    A hand with a joint that is not finite is missing from that frame. What lies nearer than 1 cm
+    or behind the camera is not drawn.
+    """
+    skeleton = SKELETONS[kind]
+    frames, height, width = len(joints_m), cameras.height, cameras.width
+    picture = np.zeros((frames, height, width, 3), np.uint8)
+    depth = np.full((frames, height, width), np.inf, np.float32)
+    rays = pixel_rays(cameras.intrinsics_px, height=height, width=width)
+    for frame, world_from_camera in enumerate(cameras.world_from_camera):
+        for hand in joints_m[frame]:
+            if not np.isfinite(hand).all():
+                continue
+            joints = transform(invert(world_from_camera), hand)
+            shapes = [
+                (j, j, JOINT_RADIUS_M, c) for j, c in zip(joints, skeleton.colours, strict=True)
+            ]
+            shapes += [
+                (joints[a], joints[b], BONE_RADIUS_M, skeleton.colours[b])
+                for a, b in skeleton.bones
+            ]
+            for start, end, radius, colour in shapes:
+                window = _window(start, end, radius, cameras)
+                met = _meet(rays[window], start, end, radius)
+                nearer = met < depth[frame][window]
+                depth[frame][window][nearer] = met[nearer]
+                picture[frame][window][nearer] = colour
+    return picture, depth
+
+
+def _window(
+    start: np.ndarray, end: np.ndarray, radius: float, cameras: Cameras
+) -> tuple[slice, slice]:
+    """Rows and columns that may show a shape: a box around the corners of the box around it."""
+    low, high = np.minimum(start, end) - radius, np.maximum(start, end) + radius
+    if (
+        low[2] < NEAR_M
+    ):  # too near to have corners in the picture; `_meet` leaves out what is behind
+        return slice(0, cameras.height), slice(0, cameras.width)
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+    u, v = project(cameras.intrinsics_px, corners)
+    return (
+        slice(max(0, int(np.floor(v.min()))), max(0, int(np.ceil(v.max())) + 1)),
+        slice(max(0, int(np.floor(u.min()))), max(0, int(np.ceil(u.max())) + 1)),
+    )
+
+
+def _meet(
+    rays: Float[np.ndarray, "h w 3"],
+    start: Float[np.ndarray, " 3"],
+    end: Float[np.ndarray, " 3"],
+    radius: float,
+) -> Float[np.ndarray, "h w"]:
+    """Depth at which rays with z = 1 enter a sphere (start = end) or a tube, else infinity.
+
+    With the part of ray d and of start s across the tube's axis, |t d - s| = r is a quadratic
+    equation in t.
+    """
+    along = end - start
+    length = np.linalg.norm(along)
+    axis = along / length if length > 0 else np.zeros(3)
+    across = rays - (rays @ axis)[..., None] * axis
+    offset = start - (start @ axis) * axis
+    a = (across**2).sum(axis=-1)
+    b = across @ offset
+    c = offset @ offset - radius**2
+    discriminant = b**2 - a * c
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = (b - np.sqrt(discriminant)) / a
+        place = (t[..., None] * rays - start) @ axis
+    hit = (t >= NEAR_M) & (place >= 0) & (place <= length)
+    return np.where(hit, t, np.inf)

@@ -1,0 +1,217 @@
+"""NumPy, JAX and a scalar loop written from the contract (Appendix B of the facts) agree."""
+
+import math
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import look_at
+from egosim_jax.rendering import jitted, reference
+from egosim_jax.types import Cameras
+
+DIFFERENT = 1e-3
+"""Share of pixels that may differ: points on a pixel's edge fall to either side in float32."""
+HEIGHT, WIDTH = 24, 40
+RAW = [(238, 130, 238), (255, 99, 71), (230, 245, 250), (173, 255, 47), (0, 152, 191)]
+MEASURED = [(247, 189, 247), (255, 167, 144), (244, 251, 253), (215, 255, 119), (0, 203, 224)]
+"""Thumb to little finger, and what the published videos show of them."""
+
+
+def make_cameras(frames=3):
+    up = np.array([0.0, 0.0, 1.0])
+    eyes = [np.array([0.1 * i, -1.0, 0.4]) for i in range(frames)]
+    return Cameras(
+        world_from_camera=np.stack(
+            [look_at(eye, np.array([0.0, 0.2, 0.1]), up=up) for eye in eyes]
+        ),
+        intrinsics_px=np.array([[33.0, 0, 19.3], [0, 31.0, 11.8], [0, 0, 1]]),
+        height=HEIGHT,
+        width=WIDTH,
+    )
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Points in front of, beside and behind the camera, some twice, some not finite."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1.5, -2.5, -1.0], [1.5, 1.5, 1.0], (600, 3))
+    points[50:90] = points[:40]
+    points[100] = np.nan
+    points[101] = np.inf
+    colours = rng.integers(0, 256, (600, 3), dtype=np.uint8)
+    return points.astype(np.float32), colours
+
+
+def splat_by_hand(points, cameras, size):
+    shape = (len(cameras.world_from_camera), HEIGHT, WIDTH)
+    depth, index = np.full(shape, np.inf), np.full(shape, -1)
+    fx, fy = cameras.intrinsics_px[0, 0], cameras.intrinsics_px[1, 1]
+    cx, cy = cameras.intrinsics_px[:2, 2]
+    for f, pose in enumerate(cameras.world_from_camera):
+        for n, point in enumerate(points):
+            if not all(math.isfinite(value) for value in point):
+                continue
+            x, y, z = (
+                sum(pose[r, c] * (point[r] - pose[r, 3]) for r in range(3)) for c in range(3)
+            )
+            if not 0.01 <= z <= 100:
+                continue
+            u, v = fx * x / z + cx, fy * y / z + cy
+            for j in range(HEIGHT):
+                for i in range(WIDTH):
+                    covers = -size / 2 <= i - u < size / 2 and -size / 2 <= j - v < size / 2
+                    if covers and z < depth[f, j, i]:
+                        depth[f, j, i], index[f, j, i] = z, n
+    return depth, index
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_the_three_splatters_agree(scene, size):
+    points, _ = scene
+    cameras = make_cameras()
+    depth, index = splat_by_hand(points, cameras, size)
+    for renderer in (reference, jitted):
+        got_depth, got_index = map(np.asarray, renderer.splat(points, cameras, point_px=size))
+        assert (got_index != index).mean() <= DIFFERENT
+        same = (got_index == index) & (index >= 0)
+        np.testing.assert_allclose(got_depth[same], depth[same], rtol=1e-5)
+        assert np.isinf(got_depth[got_index < 0]).all()
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_of_equally_near_points_the_first_is_seen(renderer):
+    points = np.array([[0, 0, 0], [0, 0, 0]], np.float32)
+    _, index = renderer.splat(points, make_cameras(1), point_px=2)
+    assert sorted(set(np.asarray(index).ravel())) == [-1, 0]
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_a_square_that_begins_outside_the_picture_still_shows(renderer):
+    cameras = Cameras(
+        world_from_camera=np.eye(4)[None],
+        intrinsics_px=np.array([[10.0, 0, 0], [0, 10.0, 0], [0, 0, 1]]),
+        height=HEIGHT,
+        width=WIDTH,
+    )
+    _, index = renderer.splat(np.array([[-0.1, -0.1, 1]], np.float32), cameras, point_px=4)
+    rows, columns = np.nonzero(np.asarray(index)[0] == 0)
+    assert set(rows) == set(columns) == {0}
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_a_scene_behind_the_camera_is_black_and_not_observed(renderer, scene):
+    points, colours = scene
+    behind = points - np.array([0, 10, 0], np.float32)
+    cameras = make_cameras()
+    _, index = renderer.splat(behind, cameras, point_px=2)
+    assert not np.asarray(renderer.paint(index, colours, gamma=True)).any()
+    mask = renderer.unobserved(behind, cameras, point_px=2, coverage="double")
+    assert (np.asarray(mask) == 255).all()
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_gamma_lifts_the_colours_of_points(renderer, scene):
+    points, colours = scene
+    _, index = renderer.splat(points, make_cameras(), point_px=2)
+    index = np.asarray(index)
+    lifted, plain = (
+        np.asarray(renderer.paint(index, colours, gamma=g)).astype(float) for g in (True, False)
+    )
+    assert np.abs(lifted - 255 * (plain / 255) ** (1 / 2.2)).max() <= 0.5 + 1e-9
+    seen = index >= 0
+    assert (plain[seen] == colours[index[seen]]).all()
+    assert not plain[~seen].any()
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_both_masks_against_the_picture(renderer, scene):
+    points, _ = scene
+    cameras = make_cameras()
+    _, twice = splat_by_hand(points, cameras, 4)
+    mask = np.asarray(renderer.unobserved(points, cameras, point_px=2, coverage="double"))
+    assert ((mask == 255) != (twice < 0)).mean() <= DIFFERENT
+    _, index = renderer.splat(points, cameras, point_px=2)
+    drawn = np.asarray(index) >= 0
+    mask = np.asarray(renderer.unobserved(points, cameras, point_px=2, coverage="dilate"))
+    for f, j, i in np.ndindex(drawn.shape):
+        around = drawn[f, max(0, j - 1) : j + 2, max(0, i - 1) : i + 2]
+        assert mask[f, j, i] == (0 if around.any() else 255)
+
+
+def make_hands(frames=3):
+    """Two hands: one in front, one that reaches past the camera; missing in the last frame."""
+    rng = np.random.default_rng(1)
+    hands = rng.normal(scale=0.12, size=(frames, 2, 21, 3)) + [0.0, 0.0, 0.1]
+    hands[:, 1] += [0.1, -0.9, 0.2]
+    hands[-1, 1, 3] = np.nan
+    return hands.astype(np.float32)
+
+
+def hands_by_hand(joints, cameras, kind):
+    """March along every pixel's ray; the first place inside a sphere or a tube."""
+    if kind == "human":
+        bones = [(0, 4 * f + 1) for f in range(5)]
+        bones += [(4 * f + k, 4 * f + k + 1) for f in range(5) for k in range(1, 4)]
+        lifted = [[round(255 * (c / 255) ** (1 / 2.2)) for c in colour] for colour in RAW]
+        assert np.abs(np.array(lifted) - MEASURED).max() <= 1
+        colours = [lifted[2], *(colour for colour in lifted for _ in range(4))]
+    else:
+        bones, colours = [(0, 1), (0, 2)], [RAW[2], RAW[0], RAW[1]]
+    fx, fy = cameras.intrinsics_px[0, 0], cameras.intrinsics_px[1, 1]
+    cx, cy = cameras.intrinsics_px[:2, 2]
+    picture = np.zeros((len(joints), HEIGHT, WIDTH, 3), np.uint8)
+    depth = np.full(picture.shape[:3], np.inf)
+    for f, pose in enumerate(cameras.world_from_camera):
+        shapes = []
+        for hand in joints[f]:
+            if np.isfinite(hand).all():
+                local = [pose[:3, :3].T @ (joint - pose[:3, 3]) for joint in hand.astype(float)]
+                shapes += [(p, p, 0.0055, c) for p, c in zip(local, colours, strict=True)]
+                shapes += [(local[a], local[b], 0.00275, colours[b]) for a, b in bones]
+        for j in range(HEIGHT):
+            for i in range(WIDTH):
+                ray = np.array([(i - cx) / fx, (j - cy) / fy, 1.0])
+                for start, end, radius, colour in shapes:
+                    t = first_inside(ray, start, end, radius)
+                    if 0.01 <= t < depth[f, j, i]:
+                        depth[f, j, i], picture[f, j, i] = t, colour
+    return picture, depth
+
+
+def first_inside(ray, start, end, radius):
+    """Where |part of (t ray - start) across the axis| = radius, by the cross product."""
+    axis = end - start
+    if not axis.any():
+        roots = np.roots([ray @ ray, -2 * ray @ start, start @ start - radius**2])
+        return min(roots.real) if np.isreal(roots).all() else math.inf
+    axis = axis / np.linalg.norm(axis)
+    m, n = np.cross(ray, axis), np.cross(start, axis)
+    roots = np.roots([m @ m, -2 * m @ n, n @ n - radius**2])
+    if not np.isreal(roots).all():
+        return math.inf
+    t = min(roots.real)
+    return t if 0 <= (t * ray - start) @ axis <= np.linalg.norm(end - start) else math.inf
+
+
+@pytest.mark.parametrize("kind", ["human", "robot"])
+def test_the_three_hand_renderers_agree(kind):
+    cameras = make_cameras(2)
+    hands = make_hands(2)[:, :, : 21 if kind == "human" else 3]
+    picture, depth = hands_by_hand(hands, cameras, kind)
+    assert picture.any(axis=(1, 2, 3)).all()
+    for renderer in (reference, jitted):
+        got, got_depth = map(np.asarray, renderer.draw_hands(hands, cameras, kind=kind))
+        assert (got != picture).any(axis=-1).mean() <= DIFFERENT
+        same = (got == picture).all(axis=-1) & np.isfinite(depth) & np.isfinite(got_depth)
+        np.testing.assert_allclose(got_depth[same], depth[same], rtol=1e-4)
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_a_hand_that_is_missing_or_behind_the_camera_is_not_drawn(renderer):
+    hands = make_hands(3)
+    hands[0, :, 0] = np.nan
+    hands[1] -= np.array([0, 20, 0], np.float32)
+    picture, depth = map(np.asarray, renderer.draw_hands(hands, make_cameras(3), kind="human"))
+    assert not picture[:2].any()
+    assert np.isinf(depth[:2]).all()
+    assert picture[2].any()
