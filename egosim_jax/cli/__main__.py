@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from egosim_jax import command
-from egosim_jax.cli.data import Check, Encode, Pack, Sample, Stats
+from egosim_jax.cli.data import Check, Encode, Make, Pack, Sample, Stats
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
@@ -22,6 +22,7 @@ class Data:
 
     command: (
         Annotated[Sample, tyro.conf.subcommand("sample")]
+        | Annotated[Make, tyro.conf.subcommand("make")]
         | Annotated[Pack, tyro.conf.subcommand("pack")]
         | Annotated[Encode, tyro.conf.subcommand("encode")]
         | Annotated[Check, tyro.conf.subcommand("check")]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from egosim_jax.cli.progress import track
 from egosim_jax.command import DONE, PARTIAL
@@ -144,6 +147,53 @@ class Sample:
 
         spec = VideoSpec(frames=self.frames, height=self.height, width=self.width)
         print(write_sample(self.out, spec=spec, clips=self.clips, seed=self.seed))
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Make:
+    """Make shards of clips of a procedural world, in parallel. Prints the folder.
+
+    The same command goes on where an interrupted one stopped.
+    """
+
+    world: Annotated[Literal["tabletop"], tyro.conf.Positional]
+    """Which world."""
+    out: Path
+    """Folder of the shards."""
+    scenes: int = 8
+    """How many scenes, of consecutive seeds."""
+    clips: int = 1
+    """Clips in a row in each scene, each from where the last one ended."""
+    seed: int = 0
+    """Seed of the first scene."""
+    kind: Literal["human", "robot"] = "human"
+    """Whose hands."""
+    frames: int = 17
+    """Frames of a clip, 4k+1."""
+    height: int = 96
+    """Rows in pixels, a multiple of 16."""
+    width: int = 160
+    """Columns in pixels, a multiple of 16."""
+    workers: int = os.cpu_count() or 1
+    """Processes."""
+
+    def run(self) -> int:
+        """Make scene after scene."""
+        from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+
+        if self.workers < 1:
+            raise InputError(f"--workers must be at least 1, not {self.workers}.")
+        plan = Plan(
+            seeds=tuple(range(self.seed, self.seed + self.scenes)),
+            clips=self.clips,
+            spec=VideoSpec(frames=self.frames, height=self.height, width=self.width),
+            kind=self.kind,
+        )
+        progress = make_shards(plan, out=self.out, workers=self.workers)
+        for _ in track(progress, "making", total=self.scenes):
+            pass
+        print(self.out)
         return DONE
 
 

@@ -1,0 +1,1 @@
+"""Procedural worlds, whose every frame is known exactly."""

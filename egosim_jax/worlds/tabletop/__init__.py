@@ -1,0 +1,191 @@
+"""The tabletop world: a table, a few things, and hands that do something with one of them.
+
+Everything is exact: the pictures are cast rays, and joints, poses, depth and ids come from the
+same numbers. A seed gives a sequence of clips; the first frame of each is the last of the one
+before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from egosim_jax.geometry import look_at, pixel_rays, transform
+from egosim_jax.rendering.reference import draw_hands, paint, splat, unobserved
+from egosim_jax.rendering.skeleton import Kind
+from egosim_jax.types import Cameras, Triplet, VideoSpec
+from egosim_jax.worlds.tabletop import actions
+from egosim_jax.worlds.tabletop.actions import Hand, Moment
+from egosim_jax.worlds.tabletop.raycast import Picture, Placed, Stage
+from egosim_jax.worlds.tabletop.scene import FIRST_HAND, Scene, make_scene
+
+FIELD_OF_VIEW = 64.0
+"""Degrees, across."""
+FINER, POINT_PX = 2, 2
+"""The scene's points: rays along each side of a pixel of the first frame, and their size."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class TabletopClip:
+    """One clip and all that is true of it."""
+
+    seed: int
+    number: int
+    """Of the clip in its sequence."""
+    kind: Kind
+    verb: str
+    target: str
+    """Name of the thing that is acted on."""
+    caption: str
+    cameras: Cameras
+    frames: UInt8[np.ndarray, "f h w 3"]
+    depth_m: Float32[np.ndarray, "f h w"]
+    ids: Int[np.ndarray, "f h w"]
+    joints_m: Float[np.ndarray, "f n j 3"]
+    world_from_body: Mapping[str, Float[np.ndarray, "f 4 4"]]
+    """Pose of every body; of an articulated one, that of its moving part."""
+    body_ids: Mapping[str, int]
+    """Id of the same in `ids`."""
+    first: Picture
+    """The first frame without hands."""
+    points_m: Float32[np.ndarray, "n 3"]
+    """The scene as its first frame shows it without hands, in the world."""
+    colours: UInt8[np.ndarray, "n 3"]
+    """Of the points."""
+
+
+def make_sequence(
+    seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human"
+) -> Iterator[TabletopClip]:
+    """The clips of a seed, each `spec.frames` long; robots have one gripper."""
+    rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
+    scene = make_scene(rng)
+    sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
+    eye = np.array([0.0, -0.06, 0.45]) + rng.normal(0, [0.025, 0.015, 0.02])
+    hands: tuple[Hand, ...] = ()
+    for number in range(clips):
+        intent = actions.choose(scene, rng)
+        if not hands:
+            hands = (actions.start_hand(scene, intent, kind, rng),)
+            if kind == "human" and rng.random() < 0.35:
+                hands = (*hands, actions.waiting_hand(hands[0].side, rng))
+        moments = actions.act(scene, hands, intent, kind, frames=spec.frames)
+        cameras = _cameras(number + np.linspace(0, 1, spec.frames), eye, sway, spec)
+        yield _clip(seed, number, kind, intent, moments, cameras)
+        scene, hands = moments[-1].scene, moments[-1].hands
+
+
+def _cameras(times: np.ndarray, eye: np.ndarray, sway: tuple[Any, Any], spec: VideoSpec) -> Cameras:
+    """A head that sways and looks about the middle of the table."""
+    phases, rates = sway
+    swing = np.sin(phases + 2 * np.pi * 0.45 * rates * times[:, None])
+    eyes = eye + swing[:, :3] * [0.04, 0.02, 0.02]
+    targets = np.array([0.0, 0.25, 0.02]) + swing[:, 3:] * [0.04, 0.025, 0.01]
+    up = np.array([0.0, 0.0, 1.0])
+    poses = [look_at(a, b, up=up) for a, b in zip(eyes, targets, strict=True)]
+    focal = spec.width / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2))
+    middle = (spec.width - 1) / 2, (spec.height - 1) / 2
+    return Cameras(
+        world_from_camera=np.stack(poses),
+        intrinsics_px=np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]),
+        height=spec.height,
+        width=spec.width,
+    )
+
+
+def _clip(
+    seed: int,
+    number: int,
+    kind: Kind,
+    intent: actions.Intent,
+    moments: list[Moment],
+    cameras: Cameras,
+) -> TabletopClip:
+    pictures, joints = [], []
+    for moment, pose in zip(moments, cameras.world_from_camera, strict=True):
+        placed = moment.scene.placed()
+        here = []
+        for index, hand in enumerate(moment.hands):
+            keypoints, parts = actions.parts_of(hand, kind)
+            here.append(keypoints)
+            placed += [
+                Placed(part=part, world_from_part=np.eye(4), number=FIRST_HAND + 2 * index + k)
+                for k, part in enumerate(parts)
+            ]
+        joints.append(here)
+        pictures.append(_look(Stage(placed), pose, cameras))
+    first, points, colours = _scene_points(moments[0].scene, cameras)
+    who = f"The {moments[0].hands[0].side} hand" if kind == "human" else "The gripper"
+    return TabletopClip(
+        seed=seed,
+        number=number,
+        kind=kind,
+        verb=intent.verb,
+        target=intent.name,
+        caption=f"{who} {intent.caption}",
+        cameras=cameras,
+        frames=np.stack([picture.colours for picture in pictures]),
+        depth_m=np.stack([picture.depth_m for picture in pictures]),
+        ids=np.stack([picture.ids for picture in pictures]),
+        joints_m=np.array(joints),
+        world_from_body=_poses(moments),
+        body_ids=_numbers(moments[0].scene),
+        first=first,
+        points_m=points,
+        colours=colours,
+    )
+
+
+def _look(stage: Stage, pose: np.ndarray, cameras: Cameras) -> Picture:
+    return stage.look(pose, cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+
+
+def _poses(moments: list[Moment]) -> dict[str, np.ndarray]:
+    bodies = moments[0].scene.bodies
+    return {
+        body.name: np.stack([moment.scene.first_part_pose(body.name) for moment in moments])
+        for body in bodies
+    }
+
+
+def _numbers(scene: Scene) -> dict[str, int]:
+    return {body.name: scene.number(body.name) for body in scene.bodies}
+
+
+def _scene_points(
+    scene: Scene, cameras: Cameras
+) -> tuple[Picture, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """The first frame without hands, and the points of a finer picture of it in the world."""
+    stage, pose = Stage(scene.placed()), cameras.world_from_camera[0]
+    first = _look(stage, pose, cameras)
+    intrinsics = cameras.intrinsics_px.copy()
+    intrinsics[:2] *= FINER
+    intrinsics[:2, 2] += (FINER - 1) / 2
+    height, width = FINER * cameras.height, FINER * cameras.width
+    fine = stage.look(pose, intrinsics, height=height, width=width)
+    seen = np.isfinite(fine.depth_m)
+    rays = pixel_rays(intrinsics, height=height, width=width)
+    points = transform(pose, rays[seen] * fine.depth_m[seen][:, None])
+    return first, points.astype(np.float32), fine.colours[seen]
+
+
+def to_triplet(clip: TabletopClip) -> Triplet:
+    """The clip in EgoSim's format: prior and mask from the points, hands as skeletons."""
+    _, index = splat(clip.points_m, clip.cameras, point_px=POINT_PX)
+    hands, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
+    name = f"tabletop_{clip.kind}_{clip.seed}_{clip.number}"
+    return Triplet(
+        video_id=name,
+        prompt=clip.caption,
+        prior=paint(index, clip.colours, gamma=False),
+        mask=unobserved(clip.points_m, clip.cameras, point_px=POINT_PX, coverage="dilate"),
+        hands=hands,
+        first_frame=clip.first.colours,
+        truth=clip.frames,
+        extra={"verb": clip.verb, "target": clip.target, "kind": clip.kind},
+    )

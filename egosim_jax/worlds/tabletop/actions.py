@@ -1,0 +1,343 @@
+"""What the hands do in a clip: reach, grasp, act, release, retreat.
+
+A hand moves through keyframes, each a place of the point between its grasping tips, a turn about
+the vertical, a pitch downwards and a closure; between two keyframes everything follows the
+minimum-jerk curve 10 s^3 - 15 s^4 + 6 s^5. From the grasp to the release the thing moves rigidly
+with that point and that turn, so that the truth of its pose is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.rendering.skeleton import Kind
+from egosim_jax.worlds.tabletop.bodies import REACH_M, Body, Part
+from egosim_jax.worlds.tabletop.hands import Side, closure_for, flesh, joints_of, pinch
+from egosim_jax.worlds.tabletop.scene import Scene, moving_part
+
+Verb = Literal["carry", "lift", "turn", "stack", "open", "close"]
+FLAT: tuple[str, ...] = ("box", "cylinder", "lidded box", "drawer")
+"""Shapes on which something can be put."""
+REST_M = {"right": np.array([0.13, 0.12, 0.09]), "left": np.array([-0.13, 0.12, 0.09])}
+"""Where a hand's grasping point waits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """A hand at one moment."""
+
+    point_m: Float[np.ndarray, " 3"]
+    """Between the tips that grasp."""
+    yaw: float
+    """Turn about the vertical in radians; 0 points away from the wearer."""
+    pitch: float
+    """How far the fingers point down, in radians."""
+    closure: float
+    """From open (0) to closed (1)."""
+
+    def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
+        """Joints in the world, and the direction of the back of the hand."""
+        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+        cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
+        rotation = turn @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
+        local = joints_of(kind, self.closure, side)
+        return (local - pinch(local)[0]) @ rotation.T + self.point_m, rotation[:, 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hand:
+    """One hand of the wearer between two clips."""
+
+    side: Side
+    grip: Grip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intent:
+    """What is going to happen to which thing."""
+
+    verb: Verb
+    name: str
+    """The thing that is grasped."""
+    place_m: Float[np.ndarray, " 3"] | None = None
+    """Where its origin ends, for `carry` and `stack`."""
+    onto: str = ""
+    """On what, for `stack`."""
+    turn: float = 0.0
+    """By how much about the vertical, for `turn`."""
+    caption: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """Hands and scene at one frame."""
+
+    scene: Scene
+    hands: tuple[Hand, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Key:
+    time: float
+    grip: Grip
+    held: bool = False
+    opening: float = field(default=0.0)
+
+
+def smooth(share: float) -> float:
+    """The minimum-jerk curve from 0 to 1."""
+    s = min(max(share, 0.0), 1.0)
+    return s**3 * (10 - 15 * s + 6 * s * s)
+
+
+def choose(scene: Scene, rng: np.random.Generator) -> Intent:
+    """A random action that the scene allows."""
+    options: list[Intent] = []
+    for body in scene.bodies:
+        if body.articulated:
+            open_now = scene.openings[body.name] > 0.5
+            verb: Verb = "close" if open_now else "open"
+            part = "drawer of the" if body.shape == "drawer" else "lid of the"
+            said = f"{verb}s the {part} {body.name}."
+            options += [Intent(verb=verb, name=body.name, caption=said)] * 2
+        elif not _covered(scene, body):
+            options += _with_loose(scene, body, rng)
+    return options[int(rng.integers(len(options)))]
+
+
+def _with_loose(scene: Scene, body: Body, rng: np.random.Generator) -> list[Intent]:
+    name = body.name
+    options = [Intent(verb="lift", name=name, caption=f"lifts the {name} and puts it back.")]
+    angle = float(rng.choice([-1, 1]) * rng.uniform(np.radians(50), np.radians(80)))
+    if body.shape == "box":
+        way = "left" if angle > 0 else "right"
+        said = f"turns the {name} to the {way}."
+        options.append(Intent(verb="turn", name=name, turn=angle, caption=said))
+    place = scene.free_place(body, rng, away_m=0.12)
+    if place is not None:
+        here = body.world_from_body[:3, 3]
+        way = np.array([place[0] - here[0], place[1] - here[1]])
+        side = "right" if way[0] > 0 else "left"
+        depth = "to the back" if way[1] > 0 else "to the front"
+        words = f"to the {side}" if abs(way[0]) > abs(way[1]) else depth
+        said = f"picks up the {name} and puts it down {words}."
+        goal = np.array([place[0], place[1], 0.0])
+        options += [Intent(verb="carry", name=name, place_m=goal, caption=said)] * 2
+    below = [
+        other
+        for other in scene.bodies
+        if other.shape in FLAT
+        and other.name != name
+        and not _covered(scene, other)
+        and scene.openings.get(other.name, 0) < 0.5
+        and other.world_from_body[2, 3] < 0.01
+    ]
+    if below and body.world_from_body[2, 3] < 0.01:
+        other = below[int(rng.integers(len(below)))]
+        goal = other.world_from_body[:3, 3] + [0, 0, other.size_m[2]]
+        said = f"puts the {name} on the {other.name}."
+        options += [
+            Intent(verb="stack", name=name, place_m=goal, onto=other.name, caption=said)
+        ] * 2
+    return options
+
+
+def _covered(scene: Scene, body: Body) -> bool:
+    """Whether something stands on it."""
+    x, y, z = body.world_from_body[:3, 3]
+    return any(
+        other.world_from_body[2, 3] > z + 0.01
+        and np.hypot(*(other.world_from_body[:2, 3] - [x, y])) < max(body.size_m[:2])
+        for other in scene.bodies
+        if other.name != body.name
+    )
+
+
+def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generator) -> Hand:
+    """A hand on the side of the thing, waiting in the air before it."""
+    grasp = _grasp(scene, intent, kind, "right")
+    side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.06) > 0 else "left"
+    before = grasp.point_m + [0, -0.09, 0.07] + rng.normal(0, 0.015, 3)
+    share = rng.uniform(0.0, 0.5)
+    point = before + share * (REST_M[side] - before)
+    return Hand(side=side, grip=_relaxed(point, side, kind))
+
+
+def waiting_hand(other: Side, rng: np.random.Generator) -> Hand:
+    """The hand of the other side, at rest."""
+    side: Side = "left" if other == "right" else "right"
+    point = REST_M[side] + rng.normal(0, 0.012, 3) + [0.06 if side == "right" else -0.06, 0, -0.03]
+    return Hand(side=side, grip=_relaxed(point, side, "human"))
+
+
+def _relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
+    inward = 0.5 if side == "right" else -0.5
+    closure = 0.25 if kind == "human" else 0.0
+    return Grip(point_m=point, yaw=inward, pitch=np.radians(30), closure=closure)
+
+
+def _grasp(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
+    """The hand when it has just taken hold."""
+    body = scene.body(intent.name)
+    inward = 0.5 if side == "right" else -0.5
+    if body.articulated:
+        _, y, z = body.size_m
+        handle = (
+            [0, -y / 2 - 0.016, z / 2] if body.shape == "drawer" else [0, -y / 2 - 0.007, z - 0.006]
+        )
+        local = moving_part(body, scene.openings[body.name]) @ [*handle, 1.0]
+        point = (body.world_from_body @ local)[:3]
+        return Grip(point_m=point, yaw=0.0, pitch=np.radians(40), closure=closure_for(kind, 0.016))
+    width, offset = body.size_m[0], np.zeros(3)
+    height = 0.62 * body.size_m[2]
+    if body.shape == "ring":  # by its near rim
+        width, offset = body.size_m[2], np.array([0, -(body.size_m[0] - body.size_m[2]) / 2, 0])
+    if body.shape == "cone":
+        height, width = 0.45 * body.size_m[2], 0.55 * width
+    point = body.world_from_body[:3, 3] + offset + [0, 0, height]
+    return Grip(point_m=point, yaw=inward, pitch=np.radians(52), closure=closure_for(kind, width))
+
+
+def act(
+    scene: Scene, hands: tuple[Hand, ...], intent: Intent, kind: Kind, *, frames: int
+) -> list[Moment]:
+    """Hands and scene at every frame of a clip; the first hand acts, the others wait.
+
+    The first moment is the one given, so that the last of one clip is the first of the next.
+    """
+    hand = hands[0]
+    keys = _keys(scene, hand, intent, kind)
+    grasp = next(key.grip for key in keys if key.held)
+    times = np.linspace(0, 1, frames)
+    moments = []
+    for time in times:
+        grip, held_grip, opening = _between(keys, float(time))
+        now = scene
+        if held_grip is not None:
+            body = scene.body(intent.name)
+            if body.articulated:
+                now = scene.with_opening(intent.name, opening)
+            else:
+                now = scene.with_pose(intent.name, _carried(body.world_from_body, grasp, held_grip))
+        acting = Hand(side=hand.side, grip=grip)
+        moments.append(Moment(scene=now, hands=(acting, *hands[1:])))
+    return moments
+
+
+def _carried(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
+    """Where a body is when the hand that took it at `grasp` is at `grip`."""
+    angle = grip.yaw - grasp.yaw
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3] = turn @ world_from_body[:3, :3]
+    pose[:3, 3] = turn @ (world_from_body[:3, 3] - grasp.point_m) + grip.point_m
+    return pose
+
+
+def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
+    """The keyframes of a clip."""
+    start, grasp = hand.grip, _grasp(scene, intent, kind, hand.side)
+    opened = closure_for(kind, 0.085) if kind == "robot" else 0.12
+    body = scene.body(intent.name)
+    above = _moved(grasp, [0, -0.02, 0.03], closure=opened)
+    reach = 0.16 + 0.25 * min(1.0, float(np.linalg.norm(start.point_m - grasp.point_m)) / 0.4)
+    begin, end = reach + 0.12, 0.80
+    first = scene.openings.get(intent.name, 0.0)
+    keys = [
+        _Key(time=0.0, grip=start, opening=first),
+        _Key(time=reach, grip=above, opening=first),
+        _Key(time=begin - 0.05, grip=_moved(grasp, [0, 0, 0], closure=opened), opening=first),
+        _Key(time=begin, grip=grasp, held=True, opening=first),
+    ]
+    if body.articulated:
+        last = 1.0 - first
+        for share in (0.25, 0.5, 0.75, 1.0):
+            opening = first + smooth(share) * (last - first)
+            moved = _grasp(scene.with_opening(intent.name, opening), intent, kind, hand.side)
+            time = begin + share * (end - begin)
+            keys.append(_Key(time=time, grip=moved, held=True, opening=opening))
+        final = keys[-1].grip
+    elif intent.verb == "lift":
+        final = grasp
+        for share, height in ((0.3, 0.09), (0.5, 0.10), (0.7, 0.09), (1.0, 0.0)):
+            time = begin + share * (end - begin)
+            keys.append(_Key(time=time, grip=_moved(grasp, [0, 0, height]), held=True))
+    elif intent.verb == "turn":
+        final = Grip(
+            point_m=grasp.point_m, yaw=grasp.yaw + intent.turn, pitch=grasp.pitch,
+            closure=grasp.closure,
+        )  # fmt: skip
+        keys.append(_Key(time=end, grip=final, held=True))
+    else:
+        way = intent.place_m - body.world_from_body[:3, 3]
+        final = _moved(grasp, way)
+        clear = max(0.05, 0.35 * float(np.linalg.norm(way[:2]))) + max(0.0, way[2])
+        rise, sink = [*(0.2 * way[:2]), clear * 0.8], [*(0.8 * way[:2]), clear]
+        keys += [
+            _Key(time=begin + 0.3 * (end - begin), grip=_moved(grasp, rise), held=True),
+            _Key(time=begin + 0.72 * (end - begin), grip=_moved(grasp, sink), held=True),
+            _Key(time=end, grip=final, held=True),
+        ]
+    last_opening = keys[-1].opening
+    away = _moved(final, [0, -0.015, 0.02], closure=opened)
+    rest = _relaxed(_retreat(final.point_m), hand.side, kind)
+    keys += [
+        _Key(time=end + 0.06, grip=away, opening=last_opening),
+        _Key(time=1.0, grip=rest, opening=last_opening),
+    ]
+    return keys
+
+
+def _retreat(point_m: np.ndarray) -> np.ndarray:
+    """Up and towards the wearer, but not out of reach."""
+    x, y, z = point_m + [0, -0.09, 0.07]
+    low_x, high_x, low_y, high_y = REACH_M
+    return np.array([np.clip(x, low_x, high_x), np.clip(y, low_y - 0.08, high_y), z])
+
+
+def _moved(grip: Grip, by: object, *, closure: float | None = None) -> Grip:
+    return Grip(
+        point_m=grip.point_m + np.asarray(by, float),
+        yaw=grip.yaw,
+        pitch=grip.pitch,
+        closure=grip.closure if closure is None else closure,
+    )
+
+
+def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
+    """The hand at a time; the grip that fixes where the thing is, once it has been taken."""
+    held = [key for key in keys if key.held]
+    begin, end = held[0].time, held[-1].time
+    if begin < time < end:  # from standing to standing, without a stop at the keyframes between
+        time = begin + smooth((time - begin) / (end - begin)) * (end - begin)
+    index = max(i for i, key in enumerate(keys) if key.time <= time + 1e-9)
+    if index == len(keys) - 1:
+        grip, opening = keys[-1].grip, keys[-1].opening
+    else:
+        before, after = keys[index], keys[index + 1]
+        share = (time - before.time) / (after.time - before.time)
+        s = share if before.held and after.held else smooth(share)
+        grip = Grip(
+            point_m=before.grip.point_m + s * (after.grip.point_m - before.grip.point_m),
+            yaw=before.grip.yaw + s * (after.grip.yaw - before.grip.yaw),
+            pitch=before.grip.pitch + s * (after.grip.pitch - before.grip.pitch),
+            closure=before.grip.closure + s * (after.grip.closure - before.grip.closure),
+        )
+        opening = before.opening + s * (after.opening - before.opening)
+    if time < begin:
+        return grip, None, opening
+    return grip, grip if time <= end else held[-1].grip, opening
+
+
+def parts_of(hand: Hand, kind: Kind) -> tuple[Float[np.ndarray, "j 3"], tuple[Part, ...]]:
+    """Joints and flesh of a hand in the world; the forearm comes from the wearer's elbow."""
+    joints, back = hand.grip.pose(kind, hand.side)
+    outward = 0.24 if hand.side == "right" else -0.24
+    elbow = np.array([0.5 * joints[0][0] + outward, -0.20, 0.5 * joints[0][2]])
+    return joints, flesh(joints, elbow, kind, back)

@@ -1,0 +1,96 @@
+"""Shards of tabletop clips, made in parallel, one file a scene until all are there."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from egosim_jax.data.shards import MANIFEST, Record, ShardWriter, from_bytes, to_bytes
+from egosim_jax.io.run import open_folder
+from egosim_jax.rendering.skeleton import Kind
+from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Which clips are made; equal plans make equal shards."""
+
+    seeds: tuple[int, ...]
+    """One scene each."""
+    clips: int
+    """In a row in each scene."""
+    spec: VideoSpec
+    kind: Kind
+
+    def __post_init__(self) -> None:
+        """Check that there is something to make."""
+        if not self.seeds or self.clips < 1:
+            raise InputError(
+                f"{len(self.seeds)} scenes of {self.clips} clips are nothing: give at least one "
+                "of each. (--scenes, --clips)"
+            )
+
+
+def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
+    """Write the shards of a plan; yields each seed when its scene is done.
+
+    Finished scenes lie in `out`/parts, so that an interrupted run goes on where it stopped.
+    """
+    parts = out / "parts"
+    open_folder(out, plan)
+    if (out / MANIFEST).exists():
+        yield from plan.seeds
+        return
+    parts.mkdir(exist_ok=True)
+    missing = [seed for seed in plan.seeds if not _part(parts, seed, plan.clips - 1).exists()]
+    yield from (seed for seed in plan.seeds if seed not in missing)
+    context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
+        for job in as_completed(jobs):
+            job.result()
+            yield jobs[job]
+    _gather(plan, parts, out)
+
+
+def _make(plan: Plan, seed: int, parts: Path) -> None:
+    sequence = make_sequence(seed, spec=plan.spec, clips=plan.clips, kind=plan.kind)
+    for number, clip in enumerate(sequence):
+        triplet = to_triplet(clip)
+        arrays = {
+            "prior": triplet.prior,
+            "hands": triplet.hands,
+            "mask": triplet.mask,
+            "first_frame": triplet.first_frame,
+            "truth": clip.frames,
+        }
+        metadata = {
+            "video_id": triplet.video_id,
+            "prompt": triplet.prompt,
+            "extra": dict(triplet.extra),
+        }
+        path = _part(parts, seed, number)
+        temporary = path.with_suffix(".tmp")
+        temporary.write_bytes(to_bytes(Record(arrays=arrays, metadata=metadata)))
+        temporary.replace(path)
+
+
+def _part(parts: Path, seed: int, number: int) -> Path:
+    return parts / f"{seed}_{number}.record"
+
+
+def _gather(plan: Plan, parts: Path, out: Path) -> None:
+    """Put the parts into shards, in the order of the plan, and remove them."""
+    paths: Sequence[Path] = [_part(parts, s, n) for s in plan.seeds for n in range(plan.clips)]
+    provenance = {"world": "tabletop", "kind": plan.kind, "seeds": list(plan.seeds)}
+    with ShardWriter(out, kind="frames", spec=plan.spec, provenance=provenance) as writer:
+        for path in paths:
+            record = from_bytes(path.read_bytes(), name=path.name)
+            writer.add(record.arrays, record.metadata)
+    for path in paths:
+        path.unlink()
+    parts.rmdir()

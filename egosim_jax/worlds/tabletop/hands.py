@@ -1,0 +1,168 @@
+"""The wearer's hands: their joints by forward kinematics, and the flesh around them.
+
+A right hand's own space has the wrist at the origin, the fingers along y, the back of the hand
+along z and the thumb on the side of -x; a left hand is its mirror image in x. A gripper's has its
+wrist at the origin and its two fingers along y, opening along x.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.rendering.skeleton import SKELETONS, Kind
+from egosim_jax.worlds.tabletop.bodies import Paint, Part, join, mesh
+
+Side = Literal["left", "right"]
+
+KNUCKLES_M = np.array([[-0.026, 0.090, 0.0], [-0.004, 0.094, 0.002], [0.017, 0.088, 0.0],
+                       [0.036, 0.078, -0.004]])  # fmt: skip
+"""Of index, middle, ring and little finger."""
+PHALANGES_M = np.array([[0.042, 0.025, 0.021], [0.046, 0.029, 0.022], [0.042, 0.027, 0.022],
+                        [0.033, 0.020, 0.019]])  # fmt: skip
+SPREAD = np.radians([8.0, 1.0, -6.0, -14.0])
+"""How far the open fingers point towards the thumb."""
+THUMB_M = (np.array([-0.028, 0.026, -0.014]), (0.040, 0.031, 0.025))
+"""First joint of the thumb, and the lengths after it."""
+GRIPPER_M = (0.12, 0.10)
+"""Length of a gripper's fingers, and between its open tips."""
+SKIN, SLEEVE, STEEL = (214, 160, 130), (72, 88, 112), (150, 152, 158)
+
+
+def human_joints(closure: float, side: Side) -> Float[np.ndarray, "21 3"]:
+    """The 21 keypoints in the hand's own space, from open (0) to a fist (1)."""
+    joints = [np.zeros(3)]
+    base, lengths = THUMB_M
+    aside, across = np.array([-0.62, 0.66, -0.42]), np.array([0.10, 0.72, -0.69])
+    direction = aside + min(1.0, 1.4 * closure) * (across - aside)
+    ends = [base]
+    for number, length in enumerate(lengths):
+        turned = direction + number * closure * np.array([0.25, 0.0, -0.10])
+        ends.append(ends[-1] + length * turned / np.linalg.norm(turned))
+    joints += ends
+    for knuckle, phalanges, spread in zip(KNUCKLES_M, PHALANGES_M, SPREAD, strict=True):
+        angles = np.cumsum(np.radians([8, 10, 6]) + closure * np.radians([68, 84, 52]))
+        ends = [knuckle]
+        away = spread * (1 - closure)
+        for angle, length in zip(angles, phalanges, strict=True):
+            flat = np.cos(angle)
+            step = np.array([-np.sin(away) * flat, np.cos(away) * flat, -np.sin(angle)])
+            ends.append(ends[-1] + length * step)
+        joints += ends
+    mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
+    return np.array(joints) * mirror
+
+
+def gripper_joints(closure: float) -> Float[np.ndarray, "3 3"]:
+    """Wrist and the tips of the two fingers, from open (0) to closed (1)."""
+    length, opening = GRIPPER_M
+    half = opening / 2 * (1 - closure)
+    return np.array([[0, 0, 0], [-half, length, 0], [half, length, 0]])
+
+
+def joints_of(kind: Kind, closure: float, side: Side) -> Float[np.ndarray, "j 3"]:
+    """Joints in the hand's own space."""
+    return human_joints(closure, side) if kind == "human" else gripper_joints(closure)
+
+
+def pinch(joints: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """The point between the tips that grasp, and how far apart they are."""
+    if len(joints) == 3:
+        thumb, fingers = joints[1], joints[2]
+    else:
+        thumb, fingers = joints[4], (joints[8] + joints[12]) / 2
+    return (thumb + fingers) / 2, float(np.linalg.norm(thumb - fingers))
+
+
+def closure_for(kind: Kind, width_m: float) -> float:
+    """How far a hand closes until its tips are `width_m` apart, by bisection."""
+    low, high = 0.0, 1.0 if kind == "robot" else 0.8
+    for _ in range(30):
+        middle = (low + high) / 2
+        gap = pinch(joints_of(kind, middle, "right"))[1]
+        low, high = (middle, high) if gap > width_m else (low, middle)
+    return (low + high) / 2
+
+
+def flesh(
+    joints_m: Float[np.ndarray, "j 3"],
+    elbow_m: Float[np.ndarray, " 3"],
+    kind: Kind,
+    back: Float[np.ndarray, " 3"],
+) -> tuple[Part, ...]:
+    """Skin and sleeve, or steel, around joints in the world; `back` is the back of the hand."""
+    if kind == "robot":
+        wrist, left, right = joints_m
+        across = right - left
+        across = across / max(np.linalg.norm(across), 1e-9)
+        along = (left + right) / 2 - wrist
+        along = along / np.linalg.norm(along)
+        knuckle = wrist + 0.045 * along
+        fingers = [
+            _limb(knuckle + across * ((tip - knuckle) @ across), tip, 0.008, 0.008)
+            for tip in (left, right)
+        ]
+        palm = _limb(knuckle - 0.055 * across, knuckle + 0.055 * across, 0.014, 0.014)
+        arm = join(
+            _limb(wrist - 0.02 * along, knuckle, 0.024, 0.024), _limb(wrist, elbow_m, 0.024, 0.03)
+        )
+        steel = Paint(colour=STEEL, second=STEEL, pattern="plain", scale_m=0.1)
+        dark = Paint(colour=(62, 62, 66), second=STEEL, pattern="plain", scale_m=0.1)
+        return (
+            _part("gripper", join(*fingers), dark),
+            _part("wrist", join(palm, arm), steel),
+        )
+    radii = np.array([0.026, 0.016, 0.0125, 0.0115, 0.0095] + [0.0105, 0.0095, 0.0085, 0.0075] * 4)
+    pieces = [
+        _limb(joints_m[a], joints_m[b], float(radii[a]), float(radii[b]))
+        for a, b in SKELETONS["human"].bones
+        if a
+    ]
+    wrist, knuckles = joints_m[0], joints_m[[5, 9, 13, 17]]
+    # The palm: thick strands from the wrist to each knuckle and across them.
+    inward = -0.004 * back
+    pieces += [_limb(wrist + inward, knuckle + inward, 0.021, 0.0135) for knuckle in knuckles]
+    pieces += [_limb(a + inward, b + inward, 0.012, 0.012) for a, b in pairwise(knuckles)]
+    pieces += [_limb(wrist + inward, joints_m[1], 0.021, 0.016)]
+    pieces += [_limb(joints_m[1], knuckles[0] + inward, 0.014, 0.012)]
+    towards = (elbow_m - wrist) / np.linalg.norm(elbow_m - wrist)
+    cuff = wrist + 0.07 * towards
+    pieces += [_limb(wrist, cuff, 0.023, 0.025)]
+    skin = Paint(colour=SKIN, second=SKIN, pattern="plain", scale_m=0.1)
+    sleeve = Paint(colour=SLEEVE, second=(58, 72, 92), pattern="plain", scale_m=0.1)
+    return (
+        _part("hand", join(*pieces), skin),
+        _part("forearm", _limb(cuff, elbow_m, 0.034, 0.045), sleeve),
+    )
+
+
+def _part(name: str, shape: tuple[np.ndarray, np.ndarray], paint: Paint) -> Part:
+    return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=paint, smooth=True)
+
+
+def _limb(
+    start: np.ndarray, end: np.ndarray, first: float, last: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A round strand between two points, from one radius to the other, with round ends."""
+    ball, faces = _unit_ball()
+    along = end - start
+    length = np.linalg.norm(along)
+    axis = along / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+    helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = np.cross(helper, axis)
+    x = x / np.linalg.norm(x)
+    turned = ball @ np.stack([x, np.cross(axis, x), axis])
+    upper = ball[:, 2:] > 1e-6
+    return np.where(upper, end + turned * last, start + turned * first), faces
+
+
+_BALLS: list[tuple[np.ndarray, np.ndarray]] = []
+
+
+def _unit_ball() -> tuple[np.ndarray, np.ndarray]:
+    if not _BALLS:
+        _BALLS.append(mesh("sphere", radius=1.0, resolution=8))
+    return _BALLS[0]

@@ -1,0 +1,172 @@
+"""A table with things on it: where everything is, and what may be done with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.worlds.tabletop.bodies import (
+    COLOURS,
+    LOOSE,
+    REACH_M,
+    TABLE_SIZE_M,
+    Body,
+    Paint,
+    Part,
+    Pattern,
+    box,
+    make_drawer,
+    make_lidded_box,
+    make_loose,
+)
+from egosim_jax.worlds.tabletop.raycast import Placed
+
+TABLE, FLOOR, WALL, FIRST_BODY, FIRST_HAND = 1, 2, 3, 10, 100
+"""Ids in the pictures. Body i has 10 + 2 i, its case, if it has one, 11 + 2 i; hand i has
+100 + 2 i and its forearm 101 + 2 i."""
+DRAWER_M, LID_DEGREES = 0.075, 100.0
+"""How far a drawer slides, and a lid turns, when it is open."""
+GAP_M = 0.035
+"""Least free space between two things on the table."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Where everything is at one moment."""
+
+    bodies: tuple[Body, ...]
+    room: tuple[Placed, ...]
+    openings: Mapping[str, float]
+    """How far each articulated body is open, by name: 0 closed, 1 open."""
+
+    def body(self, name: str) -> Body:
+        """The body of that name."""
+        return next(body for body in self.bodies if body.name == name)
+
+    def with_pose(self, name: str, world_from_body: Float[np.ndarray, "4 4"]) -> Scene:
+        """The scene with one body elsewhere."""
+        bodies = (
+            replace(body, world_from_body=world_from_body) if body.name == name else body
+            for body in self.bodies
+        )
+        return replace(self, bodies=tuple(bodies))
+
+    def with_opening(self, name: str, opening: float) -> Scene:
+        """The scene with one body opened so far."""
+        return replace(self, openings={**self.openings, name: opening})
+
+    def number(self, name: str) -> int:
+        """The id in the pictures of a body, or of its moving part."""
+        return FIRST_BODY + 2 * [body.name for body in self.bodies].index(name)
+
+    def first_part_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
+        """Where a body is or, if it is articulated, its moving part."""
+        body = self.body(name)
+        if not body.articulated:
+            return body.world_from_body
+        return body.world_from_body @ moving_part(body, self.openings[name])
+
+    def placed(self) -> list[Placed]:
+        """Every part where it is, without hands."""
+        items = list(self.room)
+        for body in self.bodies:
+            poses = [self.first_part_pose(body.name), body.world_from_body]
+            for index, part in enumerate(body.parts):
+                number = self.number(body.name) + index
+                items.append(Placed(part=part, world_from_part=poses[index], number=number))
+        return items
+
+    def free_place(
+        self, body: Body, rng: np.random.Generator, *, away_m: float = 0.0
+    ) -> Float[np.ndarray, " 2"] | None:
+        """A random x and y where the body fits, at least `away_m` from where it is, if any."""
+        here = body.world_from_body[:2, 3]
+        for _ in range(200):
+            place = rng.uniform([REACH_M[0], REACH_M[2]], [REACH_M[1], REACH_M[3]])
+            if np.linalg.norm(place - here) < away_m:
+                continue
+            if all(
+                np.linalg.norm(place - other.world_from_body[:2, 3])
+                > footprint(body) + footprint(other) + GAP_M
+                for other in self.bodies
+                if other.name != body.name
+            ):
+                return place
+        return None
+
+
+def footprint(body: Body) -> float:
+    """Radius in metres of the circle on the table that a body needs; open drawers included."""
+    reach = DRAWER_M + 0.03 if body.shape == "drawer" else 0.0
+    return float(np.hypot(body.size_m[0], body.size_m[1]) / 2 + reach / 2)
+
+
+def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
+    """`body_from_part` of a drawer or a lid."""
+    pose = np.eye(4)
+    if body.shape == "drawer":
+        pose[1, 3] = -DRAWER_M * opening
+        return pose
+    angle = np.radians(LID_DEGREES) * opening
+    hinge = np.array([0.0, body.size_m[1] / 2, body.size_m[2] - 0.012])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    pose[:3, :3] = [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
+    pose[:3, 3] = hinge - pose[:3, :3] @ hinge
+    return pose
+
+
+def make_scene(rng: np.random.Generator) -> Scene:
+    """A random scene of three to six things of different colours, at most one to be opened."""
+    scene = Scene(bodies=(), room=_room(rng), openings={})
+    names = list(rng.permutation(list(COLOURS)))
+    count = int(rng.integers(3, 7))
+    candidates: list[Body] = []
+    if rng.random() < 0.5:
+        make = make_drawer if rng.random() < 0.5 else make_lidded_box
+        candidates.append(make(str(names.pop())))
+    while len(candidates) < count:
+        candidates.append(make_loose(LOOSE[rng.integers(len(LOOSE))], str(names.pop()), rng))
+    for body in candidates:
+        place = scene.free_place(body, rng)
+        if place is None:
+            continue
+        pose = np.eye(4)
+        if not body.articulated:
+            turn = rng.uniform(-np.pi, np.pi)
+            pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        pose[:2, 3] = place
+        scene = replace(
+            scene,
+            bodies=(*scene.bodies, replace(body, world_from_body=pose)),
+            openings={**scene.openings, **({body.name: 0.0} if body.articulated else {})},
+        )
+    return scene
+
+
+def _room(rng: np.random.Generator) -> tuple[Placed, ...]:
+    """Table, floor and three walls."""
+    x, y, z = TABLE_SIZE_M
+    wood = rng.uniform([120, 85, 55], [195, 160, 125]) + rng.uniform(-12, 12)
+    walls, floors = rng.uniform(130, 215, 3), rng.uniform(70, 130, 3)
+    pieces: list[tuple[str, tuple, np.ndarray, Pattern, float, int]] = [
+        ("table", box((-x / 2, 0, -z), (x / 2, y, 0)), wood, "grain", 0.06, TABLE),
+        ("floor", box((-2.5, -1.5, -0.76), (2.5, 2.5, -0.74)), floors, "checks", 0.30, FLOOR),
+        ("far wall", box((-2.5, 1.6, -0.75), (2.5, 1.62, 1.8)), walls, "stripes", 0.24, WALL),
+        ("left wall", box((-2.0, -1.5, -0.75), (-1.98, 1.6, 1.8)), walls, "plain", 0.24, WALL),
+        ("right wall", box((1.98, -1.5, -0.75), (2.0, 1.6, 1.8)), walls, "plain", 0.24, WALL),
+    ]
+    placed = []
+    for name, (vertices, triangles), colour, pattern, scale, number in pieces:
+        first, second = np.clip(colour, 0, 255), np.clip(colour * 0.86, 0, 255)
+        paint = Paint(colour=_rgb(first), second=_rgb(second), pattern=pattern, scale_m=scale)
+        part = Part(name=name, vertices_m=vertices, triangles=triangles, paint=paint)
+        placed.append(Placed(part=part, world_from_part=np.eye(4), number=number))
+    return tuple(placed)
+
+
+def _rgb(colour: np.ndarray) -> tuple[int, int, int]:
+    red, green, blue = (int(value) for value in colour)
+    return red, green, blue

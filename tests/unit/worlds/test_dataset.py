@@ -1,0 +1,38 @@
+"""Shards of the tabletop world: complete, in order, and the same however they were made."""
+
+import pytest
+
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+
+SPEC = VideoSpec(frames=5, height=32, width=48)
+PLAN = Plan(seeds=(3, 4), clips=2, spec=SPEC, kind="human")
+
+
+def test_an_interrupted_run_goes_on_and_gives_the_same_shards(tmp_path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert sorted(make_shards(PLAN, out=whole, workers=2)) == [3, 4]
+    progress = make_shards(PLAN, out=broken, workers=1)
+    next(progress)
+    progress.close()
+    assert not (broken / "manifest.json").exists()
+    assert sorted(make_shards(PLAN, out=broken, workers=1)) == [3, 4]
+    first, second = ShardReader(whole), ShardReader(broken)
+    assert first.manifest.fingerprint == second.manifest.fingerprint
+    names = [record.metadata["video_id"] for record in first]
+    assert names == [f"tabletop_human_{seed}_{number}" for seed in (3, 4) for number in (0, 1)]
+    assert not (broken / "parts").exists()
+
+
+def test_a_finished_folder_is_left_alone(tmp_path):
+    plan = Plan(seeds=(5,), clips=1, spec=SPEC, kind="robot")
+    list(make_shards(plan, out=tmp_path, workers=1))
+    before = (tmp_path / "manifest.json").stat().st_mtime_ns
+    assert list(make_shards(plan, out=tmp_path, workers=1)) == [5]
+    assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
+
+
+def test_nothing_to_make_is_refused():
+    with pytest.raises(InputError, match="--scenes"):
+        Plan(seeds=(), clips=1, spec=SPEC, kind="human")

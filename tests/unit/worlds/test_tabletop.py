@@ -1,0 +1,203 @@
+"""The tabletop world is exact: what the pictures show is where the numbers say."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import invert, pixel_rays, project, transform
+from egosim_jax.types import VideoSpec
+from egosim_jax.worlds.tabletop import actions, make_sequence, to_triplet
+from egosim_jax.worlds.tabletop.bodies import box, make_loose, split_edges
+from egosim_jax.worlds.tabletop.hands import closure_for, joints_of, pinch
+from egosim_jax.worlds.tabletop.raycast import Placed, Stage
+from egosim_jax.worlds.tabletop.scene import FIRST_BODY, TABLE, Scene, make_scene
+
+SPEC = VideoSpec(frames=5, height=48, width=80)
+
+
+@pytest.fixture(scope="module")
+def clips():
+    return list(make_sequence(3, spec=SPEC, clips=2))
+
+
+def points_of(clip, frame):
+    """The world point at every pixel, from the depth."""
+    cameras = clip.cameras
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    local = rays * clip.depth_m[frame][..., None]
+    return transform(cameras.world_from_camera[frame], local.reshape(-1, 3)).reshape(local.shape)
+
+
+def test_the_table_lies_in_its_plane(clips):
+    for clip in clips:
+        for frame in range(SPEC.frames):
+            points = points_of(clip, frame)[clip.ids[frame] == TABLE]
+            assert len(points) > 500
+            assert np.abs(points[:, 2]).max() < 1e-4
+
+
+def test_depth_and_ids_of_a_box_against_its_slabs():
+    rng = np.random.default_rng(0)
+    body = make_loose("box", "red", rng)
+    pose = np.eye(4)
+    turn = 0.7
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = [0.02, 0.3, 0]
+    stage = Stage([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
+    camera = np.eye(4)
+    camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    camera[:3, 3] = [0, -0.1, 0.05]
+    intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
+    picture = stage.look(camera, intrinsics, height=48, width=80)
+    rays = pixel_rays(intrinsics, height=48, width=80).reshape(-1, 3)
+    body_from_camera = invert(pose) @ camera
+    start = body_from_camera[:3, 3]
+    way = rays @ body_from_camera[:3, :3].T
+    x, y, z = body.size_m
+    with np.errstate(divide="ignore"):
+        a = (np.array([-x / 2, -y / 2, 0]) - start) / way
+        b = (np.array([x / 2, y / 2, z]) - start) / way
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    hit = (enter <= leave) & (enter > 0)
+    assert hit.sum() > 50
+    assert ((picture.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
+    both = hit & np.isfinite(picture.depth_m.ravel())
+    np.testing.assert_allclose(picture.depth_m.ravel()[both], enter[both], rtol=1e-5)
+
+
+def test_a_ball_is_seen_where_its_pose_projects():
+    rng = np.random.default_rng(0)
+    body = make_loose("ball", "red", rng)
+    pose = np.eye(4)
+    pose[:3, 3] = [0.02, 0.3, 0]
+    stage = Stage([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
+    camera = np.eye(4)
+    camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    camera[:3, 3] = [0.02, -0.1, body.size_m[2] / 2]
+    intrinsics = np.array([[160.0, 0, 79.5], [0, 160.0, 47.5], [0, 0, 1]])
+    picture = stage.look(camera, intrinsics, height=96, width=160)
+    rows, columns = np.nonzero(picture.ids == FIRST_BODY)
+    centre = pose @ [0, 0, body.size_m[2] / 2, 1]
+    u, v = project(intrinsics, transform(invert(camera), centre[None, :3]))
+    assert abs(columns.mean() - u[0]) < 0.5
+    assert abs(rows.mean() - v[0]) < 0.5
+
+
+def test_visible_fingertips_are_seen_where_their_keypoints_project(clips):
+    found = 0
+    for clip in clips:
+        for frame in range(SPEC.frames):
+            camera = invert(clip.cameras.world_from_camera[frame])
+            for hand, joints in enumerate(clip.joints_m[frame]):
+                local = transform(camera, joints)
+                u, v = project(clip.cameras.intrinsics_px, local)
+                for column, row, z in zip(np.round(u), np.round(v), local[:, 2], strict=True):
+                    if not (0 <= column < SPEC.width and 0 <= row < SPEC.height):
+                        continue
+                    here = int(row), int(column)
+                    if clip.ids[frame][here] == 100 + 2 * hand:
+                        gap = z - clip.depth_m[frame][here]
+                        assert -0.03 < gap < 0.2
+                        found += 0 <= gap < 0.03
+    assert found > 30
+
+
+def test_the_last_frame_of_a_clip_is_the_first_of_the_next(clips):
+    first, second = clips
+    assert (first.frames[-1] == second.frames[0]).all()
+    assert (first.ids[-1] == second.ids[0]).all()
+    assert (first.joints_m[-1] == second.joints_m[0]).all()
+    for name, poses in first.world_from_body.items():
+        assert (poses[-1] == second.world_from_body[name][0]).all()
+
+
+def test_the_same_seed_makes_the_same_clip(clips):
+    again = next(make_sequence(3, spec=SPEC))
+    assert (again.frames == clips[0].frames).all()
+    assert again.caption == clips[0].caption
+    assert (next(make_sequence(4, spec=SPEC)).frames != clips[0].frames).any()
+
+
+def test_only_the_target_moves(clips):
+    for clip in clips:
+        for name, poses in clip.world_from_body.items():
+            moved = np.abs(poses - poses[0]).max() > 1e-6
+            assert moved == (name == clip.target)
+
+
+def test_a_prior_shows_the_first_frame_where_it_is_observed(clips):
+    triplet = to_triplet(clips[0])
+    seen = triplet.mask[0] == 0
+    assert seen.mean() > 0.95
+    difference = triplet.prior[0][seen].astype(float) - clips[0].first.colours[seen]
+    assert np.abs(difference).mean() < 6
+    assert not triplet.prior[-1][triplet.mask[-1] == 255].any()
+
+
+@pytest.mark.parametrize("kind", ["human", "robot"])
+@pytest.mark.parametrize("width", [0.02, 0.05, 0.07])
+def test_a_hand_closes_until_its_tips_are_as_far_apart_as_asked(kind, width):
+    closure = closure_for(kind, width)
+    assert pinch(joints_of(kind, closure, "right"))[1] == pytest.approx(width, abs=1e-4)
+
+
+def test_a_left_hand_is_the_mirror_image_of_a_right_one():
+    right, left = joints_of("human", 0.3, "right"), joints_of("human", 0.3, "left")
+    np.testing.assert_allclose(right * [-1, 1, 1], left)
+
+
+def act_on(verb, kind="human"):
+    """The first action of that kind among the seeds, and its moments."""
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        scene = make_scene(rng)
+        intent = actions.choose(scene, rng)
+        if intent.verb == verb:
+            hand = actions.start_hand(scene, intent, kind, rng)
+            return scene, intent, actions.act(scene, (hand,), intent, kind, frames=33)
+    raise AssertionError(f"no scene in which to {verb}")
+
+
+@pytest.mark.parametrize("kind", ["human", "robot"])
+@pytest.mark.parametrize("verb", ["carry", "lift", "turn", "stack", "open"])
+def test_a_thing_moves_smoothly_and_ends_where_it_is_meant_to(verb, kind):
+    _, intent, moments = act_on(verb, kind)
+    poses = np.stack([moment.scene.first_part_pose(intent.name) for moment in moments])
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps.max() < 0.06
+    start, end = poses[0], poses[-1]
+    if intent.place_m is not None:
+        np.testing.assert_allclose(end[:3, 3], intent.place_m, atol=1e-6)
+    elif verb == "lift":
+        np.testing.assert_allclose(end, start, atol=1e-6)
+        assert poses[:, 2, 3].max() > 0.08
+    elif verb == "turn":
+        angle = np.arctan2(*(start[:3, :3].T @ end[:3, :3])[[1, 0], 0])
+        assert angle == pytest.approx(intent.turn)
+    else:
+        assert moments[-1].scene.openings[intent.name] == pytest.approx(1)
+
+
+def test_what_was_opened_can_be_closed():
+    scene, intent, moments = act_on("open")
+    opened = moments[-1].scene
+    close = actions.Intent(verb="close", name=intent.name)
+    last = actions.act(opened, moments[-1].hands, close, "human", frames=9)[-1]
+    assert last.scene.openings[intent.name] == pytest.approx(0)
+    assert scene.openings[intent.name] == 0
+
+
+def test_things_do_not_stand_in_each_other():
+    for seed in range(20):
+        scene: Scene = make_scene(np.random.default_rng(seed))
+        assert 3 <= len(scene.bodies) <= 6
+        places = [body.world_from_body[:2, 3] for body in scene.bodies]
+        widths = [body.size_m[0] / 2 for body in scene.bodies]
+        for a in range(len(places)):
+            for b in range(a):
+                assert np.linalg.norm(places[a] - places[b]) > widths[a] + widths[b]
+
+
+def test_sharp_edges_are_split_and_flat_ones_are_not():
+    vertices, triangles = split_edges(*box((0, 0, 0), (1, 1, 1)))
+    assert len(vertices) == 24
+    assert len(triangles) == 12
