@@ -48,6 +48,23 @@ def pixel_rays(
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
+def finer(intrinsics_px: Float[np.ndarray, "3 3"], times: int) -> Float[np.ndarray, "3 3"]:
+    """The same camera with each pixel split into `times` x `times`.
+
+    The centres of pixel i's parts lie around `times` i + (`times` - 1) / 2.
+    """
+    split = intrinsics_px.copy()
+    split[:2] *= times
+    split[:2, 2] += (times - 1) / 2
+    return split
+
+
+def turned(radians: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about z, from x towards y."""
+    cosine, sine = np.cos(radians), np.sin(radians)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
 def look_at(
     eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], *, up: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:

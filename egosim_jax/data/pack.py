@@ -11,7 +11,7 @@ import numpy as np
 from egosim_jax.data.clips import check_clip, load_triplet
 from egosim_jax.data.metadata import ClipFiles
 from egosim_jax.data.shards import Record, ShardWriter
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, Triplet, VideoSpec
 
 
 def pack(
@@ -48,9 +48,9 @@ def pack(
             raise InputError(f"None of the {failed} clips could be packed.")
 
 
-def clip_metadata(files: ClipFiles) -> dict[str, object]:
+def clip_metadata(clip: ClipFiles | Triplet) -> dict[str, object]:
     """What a record says about its clip."""
-    return {"video_id": files.video_id, "prompt": files.prompt, "extra": dict(files.extra)}
+    return {"video_id": clip.video_id, "prompt": clip.prompt, "extra": dict(clip.extra)}
 
 
 def encoded_record(files: ClipFiles) -> Record:
@@ -75,7 +75,11 @@ def encoded_record(files: ClipFiles) -> Record:
 
 def decoded_record(files: ClipFiles, spec: VideoSpec) -> Record:
     """A clip's first `spec.frames` frames at the size of `spec`, after the strict checks."""
-    triplet = load_triplet(files, spec)
+    return triplet_record(load_triplet(files, spec))
+
+
+def triplet_record(triplet: Triplet) -> Record:
+    """A triplet's frames and what is known of its clip."""
     arrays = {
         "prior": triplet.prior,
         "hands": triplet.hands,
@@ -84,4 +88,4 @@ def decoded_record(files: ClipFiles, spec: VideoSpec) -> Record:
     }
     if triplet.truth is not None:
         arrays["truth"] = triplet.truth
-    return Record(arrays=arrays, metadata=clip_metadata(files))
+    return Record(arrays=arrays, metadata=clip_metadata(triplet))

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
-from egosim_jax.rendering.reference import Coverage
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
     FAR_M,
@@ -107,21 +106,16 @@ def paint(
     return jnp.where(index[..., None] < 0, jnp.uint8(0), colours[index])
 
 
+@partial(jax.jit, static_argnames="dilate")
 def unobserved(
-    points_m: Float[Array | np.ndarray, "n 3"],
-    cameras: Cameras,
-    *,
-    point_px: int,
-    coverage: Coverage,
+    index: Int[Array | np.ndarray, "f h w"], *, dilate: bool = False
 ) -> UInt8[Array, "f h w"]:
-    """The mask: 255 where no point is seen, drawn twice as large or widened by a pixel."""
-    if coverage == "double":
-        _, index = splat(points_m, cameras, point_px=2 * point_px)
-        return jnp.where(index < 0, 255, 0).astype(jnp.uint8)
-    _, index = splat(points_m, cameras, point_px=point_px)
-    drawn = jax.lax.reduce_window(
-        index >= 0, False, jax.lax.bitwise_or, (1, 3, 3), (1, 1, 1), "SAME"
-    )
+    """The mask: 255 where no point is seen; what is drawn may be widened by a pixel."""
+    drawn = jnp.asarray(index) >= 0
+    if dilate:
+        drawn = jax.lax.reduce_window(
+            drawn, False, jax.lax.bitwise_or, (1, 3, 3), (1, 1, 1), "SAME"
+        )
     return jnp.where(drawn, 0, 255).astype(jnp.uint8)
 
 

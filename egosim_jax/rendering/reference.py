@@ -8,8 +8,6 @@ shows whichever its ray meets first, without shading.
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
@@ -24,8 +22,6 @@ from egosim_jax.rendering.skeleton import (
     Kind,
 )
 from egosim_jax.types import Cameras
-
-Coverage = Literal["double", "dilate"]
 
 
 def splat(
@@ -72,18 +68,16 @@ def paint(
 
 
 def unobserved(
-    points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int, coverage: Coverage
+    index: Int[np.ndarray, "f h w"], *, dilate: bool = False
 ) -> UInt8[np.ndarray, "f h w"]:
     """The mask: 255 where no point is seen.
 
-    `double` draws the points twice as large, as in training; `dilate` widens what is drawn by a
-    pixel all around, as the memory does.
+    Training draws the points twice as large for it than for the picture; the memory draws them
+    alike and widens what is drawn by a pixel all around: `dilate`.
     """
-    if coverage == "double":
-        return np.where(splat(points_m, cameras, point_px=2 * point_px)[1] < 0, 255, 0).astype(
-            np.uint8
-        )
-    drawn = splat(points_m, cameras, point_px=point_px)[1] >= 0
+    drawn = index >= 0
+    if not dilate:
+        return np.where(drawn, 0, 255).astype(np.uint8)
     _, height, width = drawn.shape
     padded = np.pad(drawn, ((0, 0), (1, 1), (1, 1)))
     wide = np.zeros_like(drawn)

@@ -14,7 +14,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import look_at, pixel_rays, transform
+from egosim_jax.geometry import finer, look_at, pixel_rays, transform
 from egosim_jax.rendering.reference import draw_hands, paint, splat, unobserved
 from egosim_jax.rendering.skeleton import Kind
 from egosim_jax.types import Cameras, Triplet, VideoSpec
@@ -163,9 +163,7 @@ def _scene_points(
     """The first frame without hands, and the points of a finer picture of it in the world."""
     stage, pose = Stage(scene.placed()), cameras.world_from_camera[0]
     first = _look(stage, pose, cameras)
-    intrinsics = cameras.intrinsics_px.copy()
-    intrinsics[:2] *= FINER
-    intrinsics[:2, 2] += (FINER - 1) / 2
+    intrinsics = finer(cameras.intrinsics_px, FINER)
     height, width = FINER * cameras.height, FINER * cameras.width
     fine = stage.look(pose, intrinsics, height=height, width=width)
     seen = np.isfinite(fine.depth_m)
@@ -183,7 +181,7 @@ def to_triplet(clip: TabletopClip) -> Triplet:
         video_id=name,
         prompt=clip.caption,
         prior=paint(index, clip.colours, gamma=False),
-        mask=unobserved(clip.points_m, clip.cameras, point_px=POINT_PX, coverage="dilate"),
+        mask=unobserved(index, dilate=True),
         hands=hands,
         first_frame=clip.first.colours,
         truth=clip.frames,

@@ -8,12 +8,13 @@ with that point and that turn, so that the truth of its pose is exact.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.geometry import turned
 from egosim_jax.rendering.skeleton import Kind
 from egosim_jax.worlds.tabletop.bodies import REACH_M, Body, Part
 from egosim_jax.worlds.tabletop.hands import Side, closure_for, flesh, joints_of, pinch
@@ -41,10 +42,8 @@ class Grip:
 
     def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Joints in the world, and the direction of the back of the hand."""
-        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
-        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
         cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
-        rotation = turn @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
+        rotation = turned(self.yaw) @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
         local = joints_of(kind, self.closure, side)
         return (local - pinch(local)[0]) @ rotation.T + self.point_m, rotation[:, 2]
 
@@ -66,8 +65,6 @@ class Intent:
     """The thing that is grasped."""
     place_m: Float[np.ndarray, " 3"] | None = None
     """Where its origin ends, for `carry` and `stack`."""
-    onto: str = ""
-    """On what, for `stack`."""
     turn: float = 0.0
     """By how much about the vertical, for `turn`."""
     caption: str = ""
@@ -86,7 +83,7 @@ class _Key:
     time: float
     grip: Grip
     held: bool = False
-    opening: float = field(default=0.0)
+    opening: float = 0.0
 
 
 def smooth(share: float) -> float:
@@ -141,9 +138,7 @@ def _with_loose(scene: Scene, body: Body, rng: np.random.Generator) -> list[Inte
         other = below[int(rng.integers(len(below)))]
         goal = other.world_from_body[:3, 3] + [0, 0, other.size_m[2]]
         said = f"puts the {name} on the {other.name}."
-        options += [
-            Intent(verb="stack", name=name, place_m=goal, onto=other.name, caption=said)
-        ] * 2
+        options += [Intent(verb="stack", name=name, place_m=goal, caption=said)] * 2
     return options
 
 
@@ -231,9 +226,7 @@ def act(
 
 def _carried(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
     """Where a body is when the hand that took it at `grasp` is at `grip`."""
-    angle = grip.yaw - grasp.yaw
-    cosine, sine = np.cos(angle), np.sin(angle)
-    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    turn = turned(grip.yaw - grasp.yaw)
     pose = np.eye(4)
     pose[:3, :3] = turn @ world_from_body[:3, :3]
     pose[:3, 3] = turn @ (world_from_body[:3, 3] - grasp.point_m) + grip.point_m

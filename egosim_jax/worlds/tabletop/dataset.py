@@ -8,7 +8,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from egosim_jax.data.shards import MANIFEST, Record, ShardWriter, from_bytes, to_bytes
+from egosim_jax.data.pack import triplet_record
+from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
 from egosim_jax.io.run import open_folder
 from egosim_jax.rendering.skeleton import Kind
 from egosim_jax.types import InputError, VideoSpec
@@ -60,22 +61,9 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
 def _make(plan: Plan, seed: int, parts: Path) -> None:
     sequence = make_sequence(seed, spec=plan.spec, clips=plan.clips, kind=plan.kind)
     for number, clip in enumerate(sequence):
-        triplet = to_triplet(clip)
-        arrays = {
-            "prior": triplet.prior,
-            "hands": triplet.hands,
-            "mask": triplet.mask,
-            "first_frame": triplet.first_frame,
-            "truth": clip.frames,
-        }
-        metadata = {
-            "video_id": triplet.video_id,
-            "prompt": triplet.prompt,
-            "extra": dict(triplet.extra),
-        }
         path = _part(parts, seed, number)
         temporary = path.with_suffix(".tmp")
-        temporary.write_bytes(to_bytes(Record(arrays=arrays, metadata=metadata)))
+        temporary.write_bytes(to_bytes(triplet_record(to_triplet(clip))))
         temporary.replace(path)
 
 

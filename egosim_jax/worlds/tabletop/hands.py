@@ -7,6 +7,7 @@ wrist at the origin and its two fingers along y, opening along x.
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 from typing import Literal
 
@@ -159,10 +160,6 @@ def _limb(
     return np.where(upper, end + turned * last, start + turned * first), faces
 
 
-_BALLS: list[tuple[np.ndarray, np.ndarray]] = []
-
-
+@cache
 def _unit_ball() -> tuple[np.ndarray, np.ndarray]:
-    if not _BALLS:
-        _BALLS.append(mesh("sphere", radius=1.0, resolution=8))
-    return _BALLS[0]
+    return mesh("sphere", radius=1.0, resolution=8)

@@ -14,7 +14,7 @@ import numpy as np
 from einops import rearrange, reduce
 from jaxtyping import Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import pixel_rays
+from egosim_jax.geometry import finer, pixel_rays
 from egosim_jax.worlds.tabletop.bodies import Part
 
 SUN = np.array([-0.42, -0.35, 0.84])
@@ -86,11 +86,8 @@ class Stage:
     def _colours(
         self, pose: np.ndarray, intrinsics_px: np.ndarray, height: int, width: int
     ) -> UInt8[np.ndarray, "h w 3"]:
-        # The centre of the s x s finer pixels of pixel i is s i + (s - 1) / 2.
-        finer = intrinsics_px.copy()
-        finer[:2] *= RAYS
-        finer[:2, 2] += (RAYS - 1) / 2
-        rays = pixel_rays(finer, height=RAYS * height, width=RAYS * width)
+        split = finer(intrinsics_px, RAYS)
+        rays = pixel_rays(split, height=RAYS * height, width=RAYS * width)
         rays = rearrange(rays, "h w c -> (h w) c")
         hits = self._cast(pose, rays)
         light = np.empty((len(rays), 3))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.geometry import turned
 from egosim_jax.worlds.tabletop.bodies import (
     COLOURS,
     LOOSE,
@@ -135,8 +136,7 @@ def make_scene(rng: np.random.Generator) -> Scene:
             continue
         pose = np.eye(4)
         if not body.articulated:
-            turn = rng.uniform(-np.pi, np.pi)
-            pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+            pose[:3, :3] = turned(rng.uniform(-np.pi, np.pi))
         pose[:2, 3] = place
         scene = replace(
             scene,

@@ -105,8 +105,7 @@ def test_a_scene_behind_the_camera_is_black_and_not_observed(renderer, scene):
     cameras = make_cameras()
     _, index = renderer.splat(behind, cameras, point_px=2)
     assert not np.asarray(renderer.paint(index, colours, gamma=True)).any()
-    mask = renderer.unobserved(behind, cameras, point_px=2, coverage="double")
-    assert (np.asarray(mask) == 255).all()
+    assert (np.asarray(renderer.unobserved(index)) == 255).all()
 
 
 @pytest.mark.parametrize("renderer", [reference, jitted])
@@ -128,11 +127,12 @@ def test_both_masks_against_the_picture(renderer, scene):
     points, _ = scene
     cameras = make_cameras()
     _, twice = splat_by_hand(points, cameras, 4)
-    mask = np.asarray(renderer.unobserved(points, cameras, point_px=2, coverage="double"))
+    _, large = renderer.splat(points, cameras, point_px=4)
+    mask = np.asarray(renderer.unobserved(large))
     assert ((mask == 255) != (twice < 0)).mean() <= DIFFERENT
     _, index = renderer.splat(points, cameras, point_px=2)
     drawn = np.asarray(index) >= 0
-    mask = np.asarray(renderer.unobserved(points, cameras, point_px=2, coverage="dilate"))
+    mask = np.asarray(renderer.unobserved(index, dilate=True))
     for f, j, i in np.ndindex(drawn.shape):
         around = drawn[f, max(0, j - 1) : j + 2, max(0, i - 1) : i + 2]
         assert mask[f, j, i] == (0 if around.any() else 255)
