@@ -22,6 +22,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from egosim_jax.conditioning import condition_channels, pack_mask
+from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.image import clip_pixels
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.conditioning.video import to_model, to_uint8
@@ -116,10 +117,10 @@ class Networks(nnx.Module):
         params = initialise(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
         return nnx.merge(graph, params)
 
-    def save(self, folder: Path) -> None:
-        """Write a weights folder."""
+    def save(self, folder: Path, *, dtype: str | None = None) -> None:
+        """Write a weights folder; `dtype` casts, by default weights keep their own."""
         for name, network in self.parts().items():
-            weights.save(folder / f"{name}.safetensors", network)
+            weights.save(folder / f"{name}.safetensors", network, dtype=dtype)
 
     def parts(self) -> dict[str, nnx.Module]:
         """The networks by name."""
@@ -256,12 +257,21 @@ class Generator:
         noise = jax.eval_shape(lambda: self.noise(range(batch)))
         self._decode.compile(self._denoise.compile(condition, noise))
 
-    def generate(self, triplets: Sequence[Triplet], seeds: Sequence[int]) -> list[Clip]:
+    def generate(
+        self,
+        triplets: Sequence[Triplet],
+        seeds: Sequence[int],
+        *,
+        without: Literal["prior", "mask", "hands", "text"] | None = None,
+    ) -> list[Clip]:
         """One clip for each triplet, from the noise of its seed.
 
-        Raises `FloatingPointError` naming the clips whose latents are not finite.
+        `without` hides one condition, as training does (`conditioning/dropout.py`). Raises
+        `FloatingPointError` naming the clips whose latents are not finite.
         """
         condition = self._encode(Inputs.of(triplets, self.config))
+        if without is not None:
+            condition = ConditionDropout(**{without: 1.0}).apply(condition, jax.random.key(0))
         latents = self._denoise(condition, self.noise(seeds))
         bad = [
             triplet.video_id

@@ -94,6 +94,25 @@ class Cameras:
     width: int
     """Columns of a picture."""
 
+    def __post_init__(self) -> None:
+        """Check that every pose is a rigid motion and that the camera has a picture."""
+        rotations = self.world_from_camera[:, :3, :3]
+        drift = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
+        rigid = np.isfinite(self.world_from_camera).all(axis=(1, 2)) & (drift < 1e-3)
+        rigid &= np.linalg.det(np.where(rigid[:, None, None], rotations, np.eye(3))) > 0
+        if not rigid.all():
+            frame = int(np.argmin(rigid))
+            raise InputError(
+                f"The camera of frame {frame} is no rigid motion: its matrix must be finite, "
+                f"with a rotation of determinant 1, and is\n{self.world_from_camera[frame]}"
+            )
+        focal = self.intrinsics_px[0, 0], self.intrinsics_px[1, 1]
+        if not (np.isfinite(self.intrinsics_px).all() and min(*focal, self.height, self.width) > 0):
+            raise InputError(
+                f"A camera with intrinsics\n{self.intrinsics_px}\nand {self.width}x{self.height} "
+                "pixels has no picture: all must be finite, focal lengths and sizes positive."
+            )
+
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)

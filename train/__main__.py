@@ -14,6 +14,7 @@ from egosim_jax.train import recipes
 Recipes = (
     Annotated[recipes.Debug, tyro.conf.subcommand("debug")]
     | Annotated[recipes.RealTiny, tyro.conf.subcommand("real_tiny")]
+    | Annotated[recipes.Tabletop, tyro.conf.subcommand("tabletop")]
 )
 
 

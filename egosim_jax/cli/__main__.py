@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from egosim_jax import command
+from egosim_jax.cli.ablation import Tabletop
 from egosim_jax.cli.data import Check, Encode, Make, Pack, Sample, Stats
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
@@ -39,7 +40,8 @@ class Experiment:
     """Repeat a documented experiment: training, generation and its table, by one command."""
 
     command: (
-        Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
+        Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
+        | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
         | Annotated[Debug, tyro.conf.subcommand("debug")]
     )
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from egosim_jax.cli.progress import track
 from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.progress import track
 from egosim_jax.types import InputError, VideoSpec
 
 if TYPE_CHECKING:
@@ -167,14 +167,16 @@ class Make:
     """Clips in a row in each scene, each from where the last one ended."""
     seed: int = 0
     """Seed of the first scene."""
-    kind: Literal["human", "robot"] = "human"
-    """Whose hands."""
+    kind: Literal["human", "robot", "mixed"] = "human"
+    """Whose hands; mixed: a robot's in the scenes whose seed is a multiple of four."""
     frames: int = 17
     """Frames of a clip, 4k+1."""
     height: int = 96
     """Rows in pixels, a multiple of 16."""
     width: int = 160
     """Columns in pixels, a multiple of 16."""
+    fps: int = 8
+    """Frames per second."""
     workers: int = os.cpu_count() or 1
     """Processes."""
 
@@ -187,7 +189,7 @@ class Make:
         plan = Plan(
             seeds=tuple(range(self.seed, self.seed + self.scenes)),
             clips=self.clips,
-            spec=VideoSpec(frames=self.frames, height=self.height, width=self.width),
+            spec=VideoSpec(frames=self.frames, height=self.height, width=self.width, fps=self.fps),
             kind=self.kind,
         )
         progress = make_shards(plan, out=self.out, workers=self.workers)

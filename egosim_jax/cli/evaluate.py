@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egosim_jax.cli.generate import RESULTS
-from egosim_jax.cli.progress import track
 from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.progress import track
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import RESULTS, Generate
+from egosim_jax.cli.sheet import Block, draw_sheet
 from egosim_jax.command import DONE
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ class Comparison:
             print(f"{split}: another clip's prior and hands cost {cost:.2f} dB")
         write_json(self.out / "report.json", reports)
         sheet = self.out / "contact_sheet.png"
-        draw_sheet(self.out / "generated", sheet)
+        draw_sheet(_blocks(self.out / "generated"), sheet, moments=SHEET_FRAMES)
         print(sheet)
         return DONE
 
@@ -162,23 +163,18 @@ def _row(clip: ClipFiles, other: ClipFiles) -> dict[str, str]:
     }
 
 
-def draw_sheet(folder: Path, out: Path) -> None:
-    """Three frames of each generated clip: prior, hands, generated and truth in every row."""
-    import numpy as np
-    from PIL import Image, ImageDraw
-
+def _blocks(folder: Path) -> list[Block]:
+    """The comparison video of each generated clip, by split and id."""
     from egosim_jax.io.video import read_video
 
     lines = [json.loads(line) for line in (folder / RESULTS).read_text("utf-8").splitlines()]
     shown = {line["source_id"]: line for line in reversed(lines) if line["status"] == "done"}
-    rows = []
-    for line in sorted(shown.values(), key=lambda line: (line.get("split", ""), line["video_id"])):
-        frames = read_video(folder / f"{line['video_id']}_cmp.mp4").frames
-        picture = np.concatenate([frames[min(i, len(frames) - 1)] for i in SHEET_FRAMES], axis=1)
-        header = Image.new("RGB", (picture.shape[1], 14), "white")
-        text = f"{line.get('split', '')}  {line['video_id']}  prior | hands | generated | truth"
-        ImageDraw.Draw(header).text((2, 1), text, fill="black")
-        rows += [np.asarray(header), picture]
-    temporary = out.with_suffix(".tmp.png")
-    Image.fromarray(np.concatenate(rows)).save(temporary)
-    temporary.replace(out)
+    ordered = sorted(shown.values(), key=lambda line: (line.get("split", ""), line["video_id"]))
+    title = "{}  {}  prior | hands | generated | truth"
+    return [
+        Block(
+            title.format(line.get("split", ""), line["video_id"]),
+            [read_video(folder / f"{line['video_id']}_cmp.mp4").frames],
+        )
+        for line in ordered
+    ]

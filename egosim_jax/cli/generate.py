@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from egosim_jax.cli.sheet import Block, draw_sheet
 from egosim_jax.command import DONE, PARTIAL, USAGE
 from egosim_jax.types import Clip, InputError, Triplet
 
@@ -22,37 +23,43 @@ if TYPE_CHECKING:
     from egosim_jax.generator import Generator, ModelConfig
 
 RESULTS = "results.jsonl"
+SHEET_CLIPS, SHEET_COLUMNS, SHEET_WIDTH = 6, 6, 240
+"""Of the contact sheet: clips, moments of each, and pixels of a picture's width."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Generate:
-    """Generate a clip for each row of a metadata file.
+    """Generate a clip for each row of a metadata file, or of a scene of the tabletop world.
 
-    Writes {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | truth), results.jsonl, config.json
-    and environment.json. Prints the path of each clip.
+    Writes {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | truth), contact_sheet.png (of the
+    first clips: prior, hands, generated), results.jsonl, config.json and environment.json. Prints
+    the path of each clip.
     """
 
     config: str
     """Name of the model."""
-    metadata: Path
+    metadata: Path | None = None
     """CSV or JSONL in EgoSim's columns: ego_prior_video, hand_keypoint_video, first_frame, prompt,
-    video_id, and video if the truth is known."""
-    out: Path
-    """Folder to write to."""
+    video_id, and video if the truth is known. Without: a scene of the tabletop world by seed,
+    written to OUT/scenes."""
+    robot: bool = False
+    """The hands of that scene are a robot's gripper."""
+    out: Path | None = None
+    """Folder to write to; runs/CONFIG_SEED if not given."""
     weights: Path | None = None
-    """Folder of weights; only `debug` runs without, on random ones."""
+    """Folder of weights; without, `tabletop` takes those it ships with and `debug` random ones."""
     video_id: tuple[str, ...] = ()
     """Take these clips alone."""
     where: str | None = None
     """Take rows whose column has this value, for instance split=test."""
     limit: int | None = None
-    """Take at most so many clips."""
+    """Take at most so many clips; without metadata: so many scenes, of consecutive seeds."""
     start: Annotated[tuple[int, ...], tyro.conf.arg(metavar="FRAME [FRAME ...]")] = (0,)
     """First frame of the window that is generated; several make several clips, {id}_{frame}."""
     steps: int | None = None
     """Denoising steps, if not the model's own."""
     seed: int = 0
-    """Each clip's noise comes from this seed and its id."""
+    """Each clip's noise comes from this seed and its id; without metadata, the scene does too."""
     batch_size: int = 1
     """Clips generated together."""
     lenient: bool = False
@@ -65,9 +72,12 @@ class Generate:
 
     def run(self) -> int:
         """Check everything, compile, generate."""
-        items = self._items()
+        self._check_counts()
         config = self._config()
+        items = None if self.metadata is None else self._items(self.metadata)
         self._open(config)
+        if items is None:
+            items = self._items(self._make_scenes(config))
         todo = [item for item in items if not (self.skip_existing and self._video(item).exists())]
         if len(todo) < len(items):
             print(f"{len(items) - len(todo)} clips are already there", file=sys.stderr)
@@ -79,17 +89,32 @@ class Generate:
         if sound:
             _warn_of_long_prompts(sound, config)
             bad += self._generate(sound, config)
-        print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self.out}", file=sys.stderr)
+            self._draw(items, config)
+        print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self._folder}", file=sys.stderr)
         return PARTIAL if bad else DONE
 
-    def _items(self) -> list[_Item]:
-        from egosim_jax.data.metadata import read_metadata, select
-
-        for name, value in (("steps", self.steps), ("batch-size", self.batch_size)):
+    def _check_counts(self) -> None:
+        counts = {"steps": self.steps, "batch-size": self.batch_size, "limit": self.limit}
+        for name, value in counts.items():
             if value is not None and value < 1:
                 raise InputError(f"--{name} must be at least 1, not {value}.")
+
+    def _make_scenes(self, config: ModelConfig) -> Path:
+        """Scenes of the tabletop world at the model's size, as files; their metadata."""
+        from egosim_jax.data.clips import write_clips
+        from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+
+        seeds = range(self.seed, self.seed + (self.limit or 1))
+        kind = "robot" if self.robot else "human"
+        clips = (next(make_sequence(seed, spec=config.video, kind=kind)) for seed in seeds)
+        triplets = (to_triplet(clip) for clip in clips)
+        return write_clips(self._folder / "scenes", triplets, fps=config.video.fps)
+
+    def _items(self, metadata: Path) -> list[_Item]:
+        from egosim_jax.data.metadata import read_metadata, select
+
         chosen = select(
-            read_metadata(self.metadata),
+            read_metadata(metadata),
             where=self.where,
             video_ids=self.video_id,
             limit=self.limit,
@@ -106,8 +131,8 @@ class Generate:
         from egosim_jax import configs
 
         config = configs.get(self.config)
-        if self.weights is not None:
-            config = config.at(self.weights)
+        if self._weights is not None:
+            config = config.at(self._weights)
         elif config.name != "debug":
             raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
         return config if self.steps is None else dataclasses.replace(config, steps=self.steps)
@@ -116,14 +141,14 @@ class Generate:
         from egosim_jax.io.run import open_folder
         from egosim_jax.io.weights import hashes
 
-        digests = None if self.weights is None else hashes(self.weights)
+        digests = None if self._weights is None else hashes(self._weights)
         run = {
             "model": config,
             "weights": digests,
             "seed": self.seed,
             "policy": self._policy,
         }
-        open_folder(self.out, run)
+        open_folder(self._folder, run)
         for name, digest in (digests or {}).items():
             print(f"{config.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
 
@@ -169,10 +194,10 @@ class Generate:
     def _generator(self, config: ModelConfig) -> Generator:
         from egosim_jax.generator import Generator, Networks
 
-        if self.weights is None:
+        if self._weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(config, Networks.random(config, seed=self.seed))
-        return Generator(config, Networks.load(config, self.weights))
+        return Generator(config, Networks.load(config, self._weights))
 
     def _load(
         self, batch: Sequence[_Item], config: ModelConfig
@@ -225,9 +250,9 @@ class Generate:
         if triplet.truth is not None:
             shown.append(triplet.truth)
         comparison = np.concatenate(shown, axis=2)
-        write_video(self.out / f"{item.output_id}_cmp.mp4", comparison, clip.fps)
+        write_video(self._folder / f"{item.output_id}_cmp.mp4", comparison, clip.fps)
         if ceiling is not None:
-            write_video(self.out / f"{item.output_id}_vae.mp4", ceiling.frames, clip.fps)
+            write_video(self._folder / f"{item.output_id}_vae.mp4", ceiling.frames, clip.fps)
         write_video(self._video(item), clip.frames, clip.fps)
 
     def _report(self, item: _Item, *, status: str, **values: Any) -> None:
@@ -244,11 +269,38 @@ class Generate:
             "prompt": item.files.prompt,
             **item.files.extra,
         }
-        with (self.out / RESULTS).open("a", encoding="utf-8") as file:
+        with (self._folder / RESULTS).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
     def _video(self, item: _Item) -> Path:
-        return self.out / f"{item.output_id}.mp4"
+        return self._folder / f"{item.output_id}.mp4"
+
+    def _draw(self, items: Sequence[_Item], config: ModelConfig) -> None:
+        """The contact sheet of the first clips that are there."""
+        import numpy as np
+
+        from egosim_jax.io.video import read_video
+
+        blocks = []
+        for item in [item for item in items if self._video(item).exists()][:SHEET_CLIPS]:
+            panels = read_video(self._folder / f"{item.output_id}_cmp.mp4").frames
+            panels = np.split(panels, panels.shape[2] // config.video.width, axis=2)
+            blocks.append(Block(f"{item.output_id}   prior, hands, generated", panels[:3]))
+        if blocks:
+            moments = np.linspace(0, config.video.frames - 1, SHEET_COLUMNS).round().astype(int)
+            sheet = self._folder / "contact_sheet.png"
+            draw_sheet(blocks, sheet, moments=moments.tolist(), width=SHEET_WIDTH)
+            print(sheet)
+
+    @property
+    def _folder(self) -> Path:
+        return self.out or Path("runs") / f"{self.config}_{self.seed}"
+
+    @property
+    def _weights(self) -> Path | None:
+        from egosim_jax import configs
+
+        return self.weights or configs.shipped_weights(self.config)
 
     @property
     def _policy(self) -> Any:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import difflib
 import importlib
 import pkgutil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
+
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""Folders of weights that come with the package, by config."""
 
 
 def names() -> list[str]:
@@ -27,3 +32,9 @@ def get(name: str) -> ModelConfig:
             "(--config)"
         )
     return importlib.import_module(f"{__name__}.{name}").CONFIG
+
+
+def shipped_weights(name: str) -> Path | None:
+    """The folder of the weights that come with the package, if the config has any."""
+    folder = SHIPPED / name
+    return folder if folder.is_dir() else None

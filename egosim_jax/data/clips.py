@@ -9,19 +9,61 @@ a clip longer than the model's gives the window that begins at `start`.
 
 from __future__ import annotations
 
+import csv
+import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
-from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.metadata import MASK_NAME, ClipFiles
 from egosim_jax.data.transforms import fit_length, resize_image, resize_mask, resize_video
-from egosim_jax.io.video import VideoInfo, probe_video, read_image, read_video
+from egosim_jax.io.run import write_text
+from egosim_jax.io.video import VideoInfo, probe_video, read_image, read_video, write_video
 from egosim_jax.types import InputError, Triplet, VideoSpec, check_frame_count
 
 Policy = Literal["strict", "lenient"]
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+
+
+def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
+    """Write triplets as files in EgoSim's layout; the path of their metadata.csv.
+
+    Each clip has a folder of its own; what `extra` holds becomes columns. All clips have a truth or
+    none, and the same columns.
+    """
+    rows: list[dict[str, str]] = []
+    for triplet in triplets:
+        name = triplet.video_id
+        videos = {
+            "ego_prior_video.mp4": triplet.prior,
+            "hand_keypoint_video.mp4": triplet.hands,
+            MASK_NAME: np.repeat(triplet.mask[..., None], 3, axis=-1),
+        }
+        row = {
+            "ego_prior_video": f"{name}/ego_prior_video.mp4",
+            "hand_keypoint_video": f"{name}/hand_keypoint_video.mp4",
+            "first_frame": f"{name}/first_frame.png",
+            "prompt": triplet.prompt,
+            "video_id": name,
+            **triplet.extra,
+        }
+        if triplet.truth is not None:
+            videos["video.mp4"] = triplet.truth
+            row = {"video": f"{name}/video.mp4", **row}
+        for file, frames in videos.items():
+            write_video(folder / name / file, frames, fps)
+        Image.fromarray(triplet.first_frame).save(folder / name / "first_frame.png")
+        rows.append(row)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(folder / "metadata.csv", table.getvalue())
+    return folder / "metadata.csv"
 
 
 def check_clip(

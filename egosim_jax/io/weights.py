@@ -219,11 +219,16 @@ def hashes(folder: Path) -> dict[str, str]:
     return found
 
 
-def save(path: Path, module: nnx.Module) -> None:
-    """Write a module's weights as safetensors: to a temporary name, then renamed."""
+def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
+    """Write a module's weights as safetensors: to a temporary name, then renamed.
+
+    `dtype` casts floating tensors; by default they keep their own.
+    """
     from safetensors.flax import save_file
 
     tensors = {name: leaf.get_value() for name, leaf in _leaves(module).items()}
+    if dtype is not None:
+        tensors = {name: tensor.astype(dtype) for name, tensor in tensors.items()}
     temporary = path.with_name(path.name + ".tmp")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary.touch()

@@ -7,15 +7,14 @@ uncovers; the mask is white in the holes; the hand video shows the 21-keypoint s
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
-from egosim_jax.io.video import write_video
+from egosim_jax.data.clips import write_clips
 from egosim_jax.types import Triplet, VideoSpec
 
 CHAINS = [[0, *range(first, first + 4)] for first in (1, 5, 9, 13, 17)]
@@ -24,7 +23,6 @@ PALETTE = [(247, 189, 247), (255, 167, 144), (244, 251, 253), (215, 255, 119), (
 """Colours of the fingers on EgoSim's skeletons, thumb first."""
 SKIN = (214, 160, 130)
 BALLS = {"red": (200, 50, 45), "blue": (40, 80, 200), "green": (40, 150, 70)}
-COLUMNS = ("video", "ego_prior_video", "hand_keypoint_video", "first_frame", "prompt", "video_id")
 
 
 @dataclass(frozen=True)
@@ -79,25 +77,13 @@ def make_sample(spec: VideoSpec, *, seed: int = 0) -> Triplet:
 
 def write_sample(folder: Path, *, spec: VideoSpec, clips: int = 1, seed: int = 0) -> Path:
     """Write clips of consecutive seeds as files; the path of their metadata.csv."""
-    rows = []
-    for number in range(seed, seed + clips):
-        clip = make_sample(spec, seed=number)
-        home = folder / clip.video_id
-        home.mkdir(parents=True, exist_ok=True)
-        mask = np.repeat(clip.mask[..., None], 3, axis=-1)
-        if clip.truth is not None:
-            write_video(home / "video.mp4", clip.truth, spec.fps)
-        write_video(home / "ego_prior_video.mp4", clip.prior, spec.fps)
-        write_video(home / "hand_keypoint_video.mp4", clip.hands, spec.fps)
-        write_video(home / "pc_mask_video.mp4", mask, spec.fps)
-        Image.fromarray(clip.first_frame).save(home / "first_frame.png")
-        files = ["video.mp4", "ego_prior_video.mp4", "hand_keypoint_video.mp4", "first_frame.png"]
-        paths = [f"{clip.video_id}/{name}" for name in files]
-        rows.append([*paths, clip.prompt, clip.video_id, "test" if number % 4 == 3 else "train"])
-    metadata = folder / "metadata.csv"
-    with metadata.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([[*COLUMNS, "split"], *rows])
-    return metadata
+
+    def split(number: int) -> dict[str, str]:
+        return {"split": "test" if number % 4 == 3 else "train"}
+
+    numbers = range(seed, seed + clips)
+    samples = (replace(make_sample(spec, seed=n), extra=split(n)) for n in numbers)
+    return write_clips(folder, samples, fps=spec.fps)
 
 
 def _table(rng: np.random.Generator, height: int, width: int) -> Image.Image:

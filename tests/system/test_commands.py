@@ -6,8 +6,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.generator import Networks
 from egosim_jax.io.video import probe_video
 from egosim_jax.testing.sample import write_sample
 from egosim_jax.types import VideoSpec
@@ -120,3 +123,34 @@ def test_a_duplicate_id_is_refused(clips, tmp_path, capsys):
         csv.writer(file).writerows([*rows, rows[-1]])
     assert main(generate(twice, tmp_path / "out")) == 2
     assert "sample_1" in capsys.readouterr().err
+
+
+def test_without_metadata_a_scene_is_drawn_by_seed(tmp_path):
+    out = tmp_path / "run"
+    args = ["generate", "--config", "debug", "--seed", "5", "--limit", "2", "--out", str(out)]
+    assert main([*args, "--robot"]) == 0
+    assert results(out).keys() == {"tabletop_robot_5_0", "tabletop_robot_6_0"}
+    assert "gripper" in results(out)["tabletop_robot_5_0"]["prompt"]
+    assert (out / "scenes" / "tabletop_robot_5_0" / "video.mp4").exists()
+    with Image.open(out / "contact_sheet.png") as sheet:
+        assert sheet.size == (6 * 240, 2 * (16 + 3 * 160))
+
+
+def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(tmp_path, capsys):
+    config = configs.get("debug")
+    Networks.random(config, seed=0).save(tmp_path / "weights")
+    out = tmp_path / "out"
+    fixed = ["--config", "debug", "--weights", str(tmp_path / "weights"), "--out", str(out)]
+    counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2"]
+    assert main(["experiment", "tabletop", *fixed, *counts]) == 0
+    tables = json.loads((out / "report.json").read_text("utf-8"))["tables"]
+    assert tables.keys() == {"human", "robot"}
+    human = tables["human"]
+    assert human.keys() >= {"full", "without prior", "without mask", "without hands"}
+    assert human["truth"]["psnr"]["mean"] == 100
+    assert human["truth"]["hand_iou"]["mean"] > 0.7
+    assert human["full"]["psnr"]["over_seeds"] > 0
+    assert human["prior copied"]["region_psnr"]["mean"] < 30
+    assert (out / "contact_sheet_human.png").exists()
+    assert (out / "contact_sheet_robot.png").exists()
+    assert "without hands" in capsys.readouterr().out

@@ -3,8 +3,10 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
+from safetensors.numpy import load_file
 
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.data.shards import ShardReader
@@ -101,3 +103,13 @@ def test_trained_weights_generate(run, tmp_path):
     flags = [str(x) for name, value in options.items() for x in (f"--{name}", value)]
     assert egosim(["generate", *flags]) == 0
     assert (tmp_path / "out" / "sample_3.mp4").is_file()
+
+
+def test_the_tabletop_recipe_makes_its_own_clips_and_half_wide_weights(tmp_path):
+    out = tmp_path / "run"
+    tiny = ["--config", "debug", "--scenes", "2", "--held-out", "2", *STEPS]
+    batches = ["--vae.batch-size", "2", "--denoiser.batch-size", "2"]
+    assert egosim_train(["tabletop", "--out", str(out), *tiny, *batches]) == 0
+    assert len(ShardReader(out / "frames" / "train")) == 4
+    for path in (out / "weights").iterdir():
+        assert {tensor.dtype for tensor in load_file(path).values()} == {np.dtype("float16")}

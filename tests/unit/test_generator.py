@@ -64,6 +64,20 @@ def test_a_batch_of_four_equals_four_batches_of_one(networks, triplets):
     assert error <= 1e-5
 
 
+@pytest.mark.parametrize("hidden", ["prior", "mask", "hands", "text"])
+def test_a_clip_without_a_condition_does_not_depend_on_it(generator, triplets, hidden):
+    """Swapping in another clip's condition changes the video only if it is not hidden."""
+    field = {"text": "prompt"}.get(hidden, hidden)
+    one, other = triplets[0], triplets[1]
+    swapped = dataclasses.replace(one, **{field: getattr(other, field)})
+    if hidden == "mask":
+        swapped = dataclasses.replace(one, mask=255 - one.mask)
+    shown = generator.generate([one, swapped], [7, 7])
+    assert not np.array_equal(shown[0].frames, shown[1].frames)
+    blind = generator.generate([one, swapped], [7, 7], without=hidden)
+    np.testing.assert_array_equal(blind[0].frames, blind[1].frames)
+
+
 def test_a_seed_gives_its_clip_again_and_another_seed_another(generator, triplets):
     first, second, third = generator.generate([triplets[0]] * 3, [7, 7, 8])
     np.testing.assert_array_equal(first.frames, second.frames)

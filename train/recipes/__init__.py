@@ -2,5 +2,6 @@
 
 from egosim_jax.train.recipes.debug import Debug
 from egosim_jax.train.recipes.real_tiny import RealTiny
+from egosim_jax.train.recipes.tabletop import Tabletop
 
-__all__ = ["Debug", "RealTiny"]
+__all__ = ["Debug", "RealTiny", "Tabletop"]

@@ -17,13 +17,13 @@ from jaxtyping import Float, Float32, Int, UInt8
 from egosim_jax.geometry import finer, look_at, pixel_rays, transform
 from egosim_jax.rendering.reference import draw_hands, paint, splat, unobserved
 from egosim_jax.rendering.skeleton import Kind
-from egosim_jax.types import Cameras, Triplet, VideoSpec
+from egosim_jax.types import Cameras, InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, Stage
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND, Scene, make_scene
 
-FIELD_OF_VIEW = 64.0
+FIELD_OF_VIEW = 66.0
 """Degrees, across."""
 FINER, POINT_PX = 2, 2
 """The scene's points: rays along each side of a pixel of the first frame, and their size."""
@@ -51,6 +51,8 @@ class TabletopClip:
     """Pose of every body; of an articulated one, that of its moving part."""
     body_ids: Mapping[str, int]
     """Id of the same in `ids`."""
+    paints: Mapping[int, tuple[int, int, int]]
+    """RGB of everything by its id in `ids`, in full light."""
     first: Picture
     """The first frame without hands."""
     points_m: Float32[np.ndarray, "n 3"]
@@ -62,11 +64,14 @@ class TabletopClip:
 def make_sequence(
     seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human"
 ) -> Iterator[TabletopClip]:
-    """The clips of a seed, each `spec.frames` long; robots have one gripper."""
+    """The clips of a seed, each `spec.frames` long; robots have one gripper.
+
+    Equal seeds give equal clips at equal sizes, and the same events at any.
+    """
     rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
     scene = make_scene(rng)
     sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
-    eye = np.array([0.0, -0.06, 0.45]) + rng.normal(0, [0.025, 0.015, 0.02])
+    eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
     hands: tuple[Hand, ...] = ()
     for number in range(clips):
         intent = actions.choose(scene, rng)
@@ -85,7 +90,7 @@ def _cameras(times: np.ndarray, eye: np.ndarray, sway: tuple[Any, Any], spec: Vi
     phases, rates = sway
     swing = np.sin(phases + 2 * np.pi * 0.45 * rates * times[:, None])
     eyes = eye + swing[:, :3] * [0.04, 0.02, 0.02]
-    targets = np.array([0.0, 0.25, 0.02]) + swing[:, 3:] * [0.04, 0.025, 0.01]
+    targets = np.array([0.0, 0.275, 0.03]) + swing[:, 3:] * [0.04, 0.025, 0.01]
     up = np.array([0.0, 0.0, 1.0])
     poses = [look_at(a, b, up=up) for a, b in zip(eyes, targets, strict=True)]
     focal = spec.width / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2))
@@ -106,7 +111,7 @@ def _clip(
     moments: list[Moment],
     cameras: Cameras,
 ) -> TabletopClip:
-    pictures, joints = [], []
+    pictures, joints, paints = [], [], {}
     for moment, pose in zip(moments, cameras.world_from_camera, strict=True):
         placed = moment.scene.placed()
         here = []
@@ -118,6 +123,7 @@ def _clip(
                 for k, part in enumerate(parts)
             ]
         joints.append(here)
+        paints |= {item.number: item.part.paint.colour for item in placed}
         pictures.append(_look(Stage(placed), pose, cameras))
     first, points, colours = _scene_points(moments[0].scene, cameras)
     who = f"The {moments[0].hands[0].side} hand" if kind == "human" else "The gripper"
@@ -135,6 +141,7 @@ def _clip(
         joints_m=np.array(joints),
         world_from_body=_poses(moments),
         body_ids=_numbers(moments[0].scene),
+        paints=paints,
         first=first,
         points_m=points,
         colours=colours,
@@ -173,8 +180,17 @@ def _scene_points(
 
 
 def to_triplet(clip: TabletopClip) -> Triplet:
-    """The clip in EgoSim's format: prior and mask from the points, hands as skeletons."""
+    """The clip in EgoSim's format: prior and mask from the points, hands as skeletons.
+
+    What leaves the view, hands and things, is simply not seen there. A first frame without any
+    point raises `InputError`.
+    """
     _, index = splat(clip.points_m, clip.cameras, point_px=POINT_PX)
+    if (index[0] < 0).all():
+        raise InputError(
+            f"None of the {len(clip.points_m)} points of the scene is seen in the first frame: the "
+            "camera must look at the scene, from 1 cm to 100 m away."
+        )
     hands, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
     name = f"tabletop_{clip.kind}_{clip.seed}_{clip.number}"
     return Triplet(

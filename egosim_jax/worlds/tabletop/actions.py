@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from egosim_jax.geometry import turned
 from egosim_jax.rendering.skeleton import Kind
-from egosim_jax.worlds.tabletop.bodies import REACH_M, Body, Part
+from egosim_jax.worlds.tabletop.bodies import Body, Part
 from egosim_jax.worlds.tabletop.hands import Side, closure_for, flesh, joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import Scene, moving_part
 
@@ -96,13 +96,15 @@ def choose(scene: Scene, rng: np.random.Generator) -> Intent:
     """A random action that the scene allows."""
     options: list[Intent] = []
     for body in scene.bodies:
+        if _covered(scene, body) and body.shape != "drawer":
+            continue
         if body.articulated:
             open_now = scene.openings[body.name] > 0.5
             verb: Verb = "close" if open_now else "open"
             part = "drawer of the" if body.shape == "drawer" else "lid of the"
             said = f"{verb}s the {part} {body.name}."
             options += [Intent(verb=verb, name=body.name, caption=said)] * 2
-        elif not _covered(scene, body):
+        else:
             options += _with_loose(scene, body, rng)
     return options[int(rng.integers(len(options)))]
 
@@ -156,7 +158,7 @@ def _covered(scene: Scene, body: Body) -> bool:
 def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generator) -> Hand:
     """A hand on the side of the thing, waiting in the air before it."""
     grasp = _grasp(scene, intent, kind, "right")
-    side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.06) > 0 else "left"
+    side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.04) > 0 else "left"
     before = grasp.point_m + [0, -0.09, 0.07] + rng.normal(0, 0.015, 3)
     share = rng.uniform(0.0, 0.5)
     point = before + share * (REST_M[side] - before)
@@ -239,13 +241,13 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
     opened = closure_for(kind, 0.085) if kind == "robot" else 0.12
     body = scene.body(intent.name)
     above = _moved(grasp, [0, -0.02, 0.03], closure=opened)
-    reach = 0.16 + 0.25 * min(1.0, float(np.linalg.norm(start.point_m - grasp.point_m)) / 0.4)
-    begin, end = reach + 0.12, 0.80
+    reach = 0.12 + 0.25 * min(1.0, float(np.linalg.norm(start.point_m - grasp.point_m)) / 0.4)
+    begin, end = reach + 0.10, 0.83
     first = scene.openings.get(intent.name, 0.0)
     keys = [
         _Key(time=0.0, grip=start, opening=first),
         _Key(time=reach, grip=above, opening=first),
-        _Key(time=begin - 0.05, grip=_moved(grasp, [0, 0, 0], closure=opened), opening=first),
+        _Key(time=begin - 0.04, grip=_moved(grasp, [0, 0, 0], closure=opened), opening=first),
         _Key(time=begin, grip=grasp, held=True, opening=first),
     ]
     if body.articulated:
@@ -279,19 +281,18 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
         ]
     last_opening = keys[-1].opening
     away = _moved(final, [0, -0.015, 0.02], closure=opened)
-    rest = _relaxed(_retreat(final.point_m), hand.side, kind)
+    rest = _relaxed(_retreat(final.point_m, hand.side), hand.side, kind)
     keys += [
-        _Key(time=end + 0.06, grip=away, opening=last_opening),
+        _Key(time=end + 0.05, grip=away, opening=last_opening),
         _Key(time=1.0, grip=rest, opening=last_opening),
     ]
     return keys
 
 
-def _retreat(point_m: np.ndarray) -> np.ndarray:
-    """Up and towards the wearer, but not out of reach."""
-    x, y, z = point_m + [0, -0.09, 0.07]
-    low_x, high_x, low_y, high_y = REACH_M
-    return np.array([np.clip(x, low_x, high_x), np.clip(y, low_y - 0.08, high_y), z])
+def _retreat(point_m: np.ndarray, side: Side) -> np.ndarray:
+    """Up and back towards where the hand rests, so that what it has left can be seen."""
+    up = point_m + [0, -0.06, 0.06]
+    return up + 0.45 * (REST_M[side] - up)
 
 
 def _moved(grip: Grip, by: object, *, closure: float | None = None) -> Grip:

@@ -7,10 +7,11 @@ near edge y = 0. A body's own origin lies in the middle of its underside.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from egosim_jax.types import InputError
 
@@ -26,8 +27,8 @@ COLOURS = {
     "purple": (126, 64, 160),
     "white": (226, 224, 216),
 }
-TABLE_SIZE_M = (1.3, 0.8, 0.03)
-REACH_M = (-0.20, 0.20, 0.15, 0.38)
+TABLE_SIZE_M = (1.3, 0.62, 0.03)
+REACH_M = (-0.20, 0.20, 0.15, 0.37)
 """Least and greatest x and y at which things are put: within sight and reach."""
 
 
@@ -49,19 +50,19 @@ class Paint:
 
     def at(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """RGB in [0, 1] at points of the body's space."""
+        first, second = np.array([self.colour, self.second], points_m.dtype) / 255
+        if self.pattern == "plain":
+            return np.broadcast_to(first, points_m.shape)
         x, y, z = (points_m / self.scale_m).T
         if self.pattern == "stripes":
-            share = 0.5 + 0.5 * np.sign(np.sin(2 * np.pi * z))
+            share = (np.floor(2 * z) % 2 == 0).astype(points_m.dtype)
         elif self.pattern == "checks":
             share = (np.floor(x + 1e-4) + np.floor(y + 1e-4) + np.floor(z + 1e-4)) % 2
-        elif self.pattern == "grain":
+        else:
             bend = (
                 np.sin(1.7 * x) + 0.5 * np.sin(4.1 * x + 2.0 * y) + 0.3 * np.sin(9.3 * x - 3.1 * y)
             )
             share = 0.5 + 0.5 * np.sin(2 * np.pi * y + bend)
-        else:
-            share = np.zeros(len(points_m))
-        first, second = np.array(self.colour) / 255, np.array(self.second) / 255
         return first + share[:, None] * (second - first)
 
 
@@ -75,6 +76,17 @@ class Part:
     paint: Paint
     smooth: bool = False
     """Whether the mesh stands for a round surface, shaded without facets."""
+
+    @cached_property
+    def vertex_normals(self) -> Float32[np.ndarray, "v 3"]:
+        """Of each vertex: the mean of its triangles' normals, by area."""
+        a, b, c = (self.vertices_m[self.triangles[:, k]] for k in range(3))
+        faces = np.cross(b - a, c - a)
+        normals = np.zeros_like(self.vertices_m)
+        for k in range(3):
+            np.add.at(normals, self.triangles[:, k], faces)
+        length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+        return (normals / length[:, None]).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,8 +215,8 @@ def darker(colour: tuple[int, int, int]) -> tuple[int, int, int]:
 
 def make_loose(shape: Shape, colour: str, rng: np.random.Generator) -> Body:
     """A thing to pick up, of random size, at the origin."""
-    width = float(rng.uniform(0.055, 0.072))
-    height = float(rng.uniform(0.055, 0.09))
+    width = float(rng.uniform(0.062, 0.078))
+    height = float(rng.uniform(0.06, 0.09))
     if shape == "ball":
         height = width
     if shape == "ring":

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
@@ -25,7 +27,14 @@ class Plan:
     clips: int
     """In a row in each scene."""
     spec: VideoSpec
-    kind: Kind
+    kind: Kind | Literal["mixed"]
+    """Whose hands; mixed: a robot's in the scenes whose seed is a multiple of four."""
+
+    def kind_of(self, seed: int) -> Kind:
+        """Whose hands act in a scene."""
+        if self.kind == "mixed":
+            return "human" if seed % 4 else "robot"
+        return self.kind
 
     def __post_init__(self) -> None:
         """Check that there is something to make."""
@@ -49,6 +58,8 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
     parts.mkdir(exist_ok=True)
     missing = [seed for seed in plan.seeds if not _part(parts, seed, plan.clips - 1).exists()]
     yield from (seed for seed in plan.seeds if seed not in missing)
+    # One thread a process: two that share the cores among threads take twice as long.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
@@ -59,7 +70,7 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
 
 
 def _make(plan: Plan, seed: int, parts: Path) -> None:
-    sequence = make_sequence(seed, spec=plan.spec, clips=plan.clips, kind=plan.kind)
+    sequence = make_sequence(seed, spec=plan.spec, clips=plan.clips, kind=plan.kind_of(seed))
     for number, clip in enumerate(sequence):
         path = _part(parts, seed, number)
         temporary = path.with_suffix(".tmp")

@@ -136,7 +136,7 @@ def flesh(
     sleeve = Paint(colour=SLEEVE, second=(58, 72, 92), pattern="plain", scale_m=0.1)
     return (
         _part("hand", join(*pieces), skin),
-        _part("forearm", _limb(cuff, elbow_m, 0.034, 0.045), sleeve),
+        _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), sleeve),
     )
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from einops import rearrange, reduce
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import finer, pixel_rays
+from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
 
 SUN = np.array([-0.42, -0.35, 0.84])
@@ -53,7 +54,6 @@ class Stage:
 
         self.placed = list(placed)
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self.normals = []
         for item in self.placed:
             pose, part = item.world_from_part, item.part
             vertices = part.vertices_m @ pose[:3, :3].T + pose[:3, 3]
@@ -61,7 +61,6 @@ class Stage:
                 o3d.core.Tensor(vertices.astype(np.float32)),
                 o3d.core.Tensor(part.triangles.astype(np.uint32)),
             )
-            self.normals.append(_normals(vertices, part) if part.smooth else None)
 
     def look(
         self,
@@ -71,9 +70,10 @@ class Stage:
         height: int,
         width: int,
     ) -> Picture:
-        """The picture from a camera."""
-        rays = pixel_rays(intrinsics_px, height=height, width=width)
-        middle = self._cast(world_from_camera, rearrange(rays, "h w c -> (h w) c"))
+        """The picture from a camera; one inside a thing raises `InputError`."""
+        self._refuse_inside(world_from_camera[:3, 3])
+        rays = _world_rays(world_from_camera, intrinsics_px, height=height, width=width)
+        middle = self._cast(world_from_camera, rays)
         depth, geometry = middle["t_hit"], middle["geometry_ids"]
         numbers = np.array([*(item.number for item in self.placed), 0])
         ids = numbers[np.where(np.isfinite(depth), geometry, len(self.placed)).astype(int)]
@@ -83,67 +83,77 @@ class Stage:
             ids=rearrange(ids, "(h w) -> h w", h=height),
         )
 
+    def _refuse_inside(self, eye_m: np.ndarray) -> None:
+        """A ray from inside a closed surface crosses it an odd number of times."""
+        import open3d as o3d
+
+        ray = np.concatenate([eye_m, [0, 0, 1]]).astype(np.float32)[None]
+        if self.scene.count_intersections(o3d.core.Tensor(ray), nthreads=1).item() % 2:
+            place = ", ".join(f"{value:.3f}" for value in eye_m)
+            raise InputError(
+                f"The camera at ({place}) m is inside a thing and would see its inner side. Move "
+                "the camera or the thing."
+            )
+
     def _colours(
         self, pose: np.ndarray, intrinsics_px: np.ndarray, height: int, width: int
     ) -> UInt8[np.ndarray, "h w 3"]:
         split = finer(intrinsics_px, RAYS)
-        rays = pixel_rays(split, height=RAYS * height, width=RAYS * width)
-        rays = rearrange(rays, "h w c -> (h w) c")
+        rays = _world_rays(pose, split, height=RAYS * height, width=RAYS * width)
         hits = self._cast(pose, rays)
-        light = np.empty((len(rays), 3))
-        light[:] = SKY
-        (found,) = np.nonzero(np.isfinite(hits["t_hit"]))
-        points = pose[:3, 3] + hits["t_hit"][found, None] * (rays[found] @ pose[:3, :3].T)
-        albedo, normals = self._surface(points, {name: hit[found] for name, hit in hits.items()})
-        facing = np.einsum("nc,nc->n", normals, rays[found] @ pose[:3, :3].T)
+        sky = ~np.isfinite(hits["t_hit"])
+        points = np.where(sky, 0, hits["t_hit"])[:, None] * rays + pose[:3, 3].astype(np.float32)
+        albedo, normals = self._surface(points, hits)
+        facing = np.einsum("nc,nc->n", normals, rays)
         normals = np.where(facing[:, None] > 0, -normals, normals)
-        sun = SUN / np.linalg.norm(SUN)
+        sun = (SUN / np.linalg.norm(SUN)).astype(np.float32)
         cosine = np.clip(normals @ sun, 0, None)
-        lit = ~self._shadowed(points + 1e-3 * normals, sun)
-        light[found] = albedo * (AMBIENT + SUNLIGHT * cosine * lit)[:, None]
+        lit = ~self._shadowed(points + np.float32(1e-3) * normals, sun)
+        light = albedo * (AMBIENT + SUNLIGHT * cosine * lit)[:, None]
+        light[sky] = SKY
         light = reduce(light, "(h y w x) c -> h w c", "mean", h=height, w=width, y=RAYS, x=RAYS)
         return np.round(255 * np.clip(light, 0, 1)).astype(np.uint8)
 
     def _surface(
-        self, points: np.ndarray, hits: dict[str, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Colour and normal at points that rays have met."""
-        albedo, normals = np.empty_like(points), hits["primitive_normals"].astype(np.float64)
-        for number, (item, smooth) in enumerate(zip(self.placed, self.normals, strict=True)):
+        self, points: Float32[np.ndarray, "n 3"], hits: dict[str, np.ndarray]
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+        """Colour and normal at points that rays have met; arbitrary where they met nothing."""
+        albedo, normals = np.zeros_like(points), hits["primitive_normals"]
+        for number, item in enumerate(self.placed):
             (here,) = np.nonzero(hits["geometry_ids"] == number)
             if not len(here):
                 continue
-            pose = item.world_from_part
-            albedo[here] = item.part.paint.at((points[here] - pose[:3, 3]) @ pose[:3, :3])
-            if smooth is not None:
-                corners = item.part.triangles[hits["primitive_ids"][here]]
-                u, v = hits["primitive_uvs"][here].T[..., None]
-                mixed = (1 - u - v) * smooth[corners[:, 0]]
-                mixed = mixed + u * smooth[corners[:, 1]] + v * smooth[corners[:, 2]]
-                normals[here] = mixed / np.maximum(np.linalg.norm(mixed, axis=1), 1e-9)[:, None]
+            pose, part = item.world_from_part.astype(np.float32), item.part
+            albedo[here] = part.paint.at((points[here] - pose[:3, 3]) @ pose[:3, :3])
+            if part.smooth:
+                corners = part.vertex_normals[part.triangles[hits["primitive_ids"][here]]]
+                u, v = hits["primitive_uvs"][here].T
+                mixed = np.einsum("nk,nkc->nc", np.stack([1 - u - v, u, v], axis=1), corners)
+                length = np.maximum(np.linalg.norm(mixed, axis=1), 1e-9)
+                normals[here] = mixed / length[:, None] @ pose[:3, :3].T
         return albedo, normals
 
-    def _shadowed(self, points: np.ndarray, sun: np.ndarray) -> np.ndarray:
+    def _shadowed(
+        self, points: Float32[np.ndarray, "n 3"], sun: Float32[np.ndarray, " 3"]
+    ) -> Bool[np.ndarray, " n"]:
         import open3d as o3d
 
         rays = np.concatenate([points, np.broadcast_to(sun, points.shape)], axis=1)
-        return self.scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32))).numpy()
+        return self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
 
-    def _cast(self, pose: np.ndarray, rays: np.ndarray) -> dict[str, np.ndarray]:
-        """What camera rays with z = 1 meet, so that distances along them are depths."""
+    def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+        """What rays meet from the camera; one thread, for clips are made in parallel."""
         import open3d as o3d
 
-        turned = rays @ pose[:3, :3].T
-        both = np.concatenate([np.broadcast_to(pose[:3, 3], turned.shape), turned], axis=1)
-        hits = self.scene.cast_rays(o3d.core.Tensor(both.astype(np.float32)))
+        eye = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
+        both = o3d.core.Tensor(np.concatenate([eye, rays], axis=1))
+        hits = self.scene.cast_rays(both, nthreads=1)
         return {name: tensor.numpy() for name, tensor in hits.items()}
 
 
-def _normals(vertices: np.ndarray, part: Part) -> np.ndarray:
-    """Of each vertex: the mean of its triangles' normals, by area."""
-    a, b, c = (vertices[part.triangles[:, k]] for k in range(3))
-    faces = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, part.triangles[:, k], faces)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+def _world_rays(
+    pose: np.ndarray, intrinsics_px: np.ndarray, *, height: int, width: int
+) -> Float32[np.ndarray, "n 3"]:
+    """Directions of camera rays with z = 1 in the world: distances along them are depths."""
+    rays = pixel_rays(intrinsics_px, height=height, width=width)
+    return rearrange(rays @ pose[:3, :3].T, "h w c -> (h w) c").astype(np.float32)

@@ -35,6 +35,15 @@ def foreign() -> dict[str, np.ndarray]:
     return {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
 
 
+def test_saved_weights_may_be_half_as_wide(tmp_path):
+    net, back = Net(rngs=nnx.Rngs(0)), skeleton()
+    weights.save(tmp_path / "net.safetensors", net, dtype="float16")
+    weights.load(tmp_path / "net.safetensors", back)
+    assert back.head.kernel[...].dtype == np.float16
+    np.testing.assert_allclose(back.head.kernel[...], net.head.kernel[...], rtol=1e-3)
+    assert net.head.kernel[...].dtype == np.float32
+
+
 def skeleton() -> Net:
     return nnx.eval_shape(lambda: Net(rngs=nnx.Rngs(0)))
 

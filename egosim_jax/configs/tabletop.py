@@ -1,0 +1,33 @@
+"""The model that ships: small enough for a laptop, trained on the tabletop world alone.
+
+Trained from scratch by `egosim-train tabletop`; its weights lie beside this package and its card
+in `weights/tabletop/README.md`.
+"""
+
+from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
+from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.generator import ModelConfig
+from egosim_jax.models.clip_vision import CLIPVisionConfig
+from egosim_jax.models.umt5 import UMT5Config
+from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.types import VideoSpec
+
+CONFIG = ModelConfig(
+    name="tabletop",
+    video=VideoSpec(frames=17, height=96, width=160, fps=8),
+    dit=WanDiTConfig(dim=256, ffn_dim=768, heads=4, layers=6, text_dim=64, image_dim=64),
+    vae=WanVAEConfig(
+        dim=8,
+        dim_mult=(1, 2, 6, 12),
+        res_blocks=1,
+        latent_mean=(0.0,) * 16,
+        latent_std=(1.0,) * 16,
+    ),
+    text=UMT5Config(vocab=BYT5_VOCAB, dim=64, ffn_dim=128, heads=2, head_dim=32, layers=2),
+    image=CLIPVisionConfig(image_size=56, dim=64, layers=3, heads=2, ffn_dim=128),
+    tokenizer=PromptTokenizer(kind="byt5", max_tokens=96),
+    encoders="joint",
+    schedule=FlowSchedule(shift=3.0),
+    steps=10,
+)

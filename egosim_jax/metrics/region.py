@@ -1,0 +1,81 @@
+"""Whether the right things are where they should be: silhouettes and places read off by colour.
+
+A thing of colour c that is lit by s shows s * c. In a world whose colours are known, each pixel
+therefore belongs to the thing whose ray {s * c : 0.45 <= s <= 1.15} comes nearest to its colour.
+The same rule reads the truth and the generated video; on the truth, where ids are known, it says
+how far it can be trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from egosim_jax.metrics.image import MAX_PSNR
+
+SHADES = (0.45, 1.15)
+"""Least and greatest light on a surface."""
+LEAST_SEEN_PX = 20
+"""Frames in which fewer pixels of a thing are visible say nothing about where it is."""
+NEAR = 0.12
+"""Share of the width around the median pixel of a thing in which its pixels count."""
+
+
+def label(
+    video: UInt8[np.ndarray, "f h w 3"], paints: Mapping[int, tuple[int, int, int]]
+) -> Int[np.ndarray, "f h w"]:
+    """The id of the paint, RGB by id, that each pixel's colour comes nearest to."""
+    numbers = np.array(list(paints))
+    colours = np.array([paints[number] for number in numbers], np.float32)
+    pixels = video.reshape(-1, 3).astype(np.float32)
+    shades = np.clip(pixels @ colours.T / np.square(colours).sum(axis=1), *SHADES)
+    # |x - s c|^2 = x.x - 2 s x.c + s^2 c.c, whose first term is the same for all paints
+    distance = shades**2 * np.square(colours).sum(axis=1) - 2 * shades * (pixels @ colours.T)
+    return numbers[distance.argmin(axis=1)].reshape(video.shape[:-1])
+
+
+def region_psnr(
+    video: UInt8[np.ndarray, "f h w 3"],
+    truth: UInt8[np.ndarray, "f h w 3"],
+    region: Bool[np.ndarray, "f h w"],
+) -> float:
+    """PSNR in dB over the pixels of a region in all frames together; NaN if there are none."""
+    if not region.any():
+        return float("nan")
+    error = np.square(video[region].astype(np.float64) - truth[region]).mean()
+    return float(min(MAX_PSNR, 10 * np.log10(255**2 / max(error, 1e-12))))
+
+
+def silhouette_iou(found: Bool[np.ndarray, "f h w"], truth: Bool[np.ndarray, "f h w"]) -> float:
+    """Intersection over union, averaged over the frames in which the truth has any; else NaN."""
+    shown = truth.any(axis=(1, 2))
+    both = (found & truth).sum(axis=(1, 2))[shown]
+    either = (found | truth).sum(axis=(1, 2))[shown]
+    return float((both / either).mean()) if shown.any() else float("nan")
+
+
+def centroid_errors(
+    found: Bool[np.ndarray, "f h w"], truth: Bool[np.ndarray, "f h w"]
+) -> Float[np.ndarray, " g"]:
+    """Distances in pixels between the centroids of two silhouettes.
+
+    One for each frame in which the truth is seen well; a thing that is not found at all counts as
+    a picture's width away.
+    """
+    width = truth.shape[2]
+    errors = []
+    for here, there in zip(found, truth, strict=True):
+        if there.sum() >= LEAST_SEEN_PX:
+            gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
+            errors.append(np.hypot(*gap))
+    return np.array(errors)
+
+
+def _centroid(silhouette: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
+    """Of the pixels around the median one: stray pixels of a like colour do not count."""
+    pixels = np.argwhere(silhouette)
+    gaps = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
+    near = gaps <= max(NEAR * silhouette.shape[1], gaps.min())
+    return pixels[near].mean(axis=0)

@@ -1,0 +1,65 @@
+"""Silhouettes and places by colour, against what is known."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.metrics.region import centroid_errors, label, region_psnr, silhouette_iou
+from egosim_jax.types import VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence
+from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+
+
+def discs(*centres, radius=4):
+    rows, columns = np.mgrid[:32, :48]
+    return np.stack([np.hypot(rows - y, columns - x) <= radius for y, x in centres])
+
+
+def test_a_pixel_belongs_to_the_paint_whose_ray_it_is_nearest_to():
+    paints = {3: (200, 40, 40), 7: (40, 40, 200), 9: (120, 120, 120)}
+    rng = np.random.default_rng(0)
+    video = rng.integers(0, 256, (1, 8, 8, 3), dtype=np.uint8)
+    got = label(video, paints)
+    for row, column in np.ndindex(8, 8):
+        pixel = video[0, row, column].astype(float)
+        distances = {}
+        for number, colour in paints.items():
+            colour = np.array(colour, float)
+            shade = min(max(pixel @ colour / (colour @ colour), 0.45), 1.15)
+            distances[number] = np.linalg.norm(pixel - shade * colour)
+        assert got[0, row, column] == min(distances, key=distances.get)
+
+
+def test_psnr_counts_the_pixels_of_the_region_alone():
+    rng = np.random.default_rng(0)
+    a, b = rng.integers(0, 256, (2, 3, 32, 48, 3), dtype=np.uint8)
+    region = discs((10, 10), (12, 12), (14, 14))
+    pairs = zip(a[region].ravel().tolist(), b[region].ravel().tolist(), strict=True)
+    error = np.mean([(x - y) ** 2 for x, y in pairs])
+    assert region_psnr(a, b, region) == pytest.approx(10 * np.log10(255**2 / error))
+    assert region_psnr(a, a, region) == 100
+    assert np.isnan(region_psnr(a, b, np.zeros_like(region)))
+
+
+def test_iou_of_silhouettes_over_the_frames_that_have_one():
+    truth = discs((10, 10), (10, 10))
+    found = np.stack([truth[0], discs((40, 90))[0]])
+    assert silhouette_iou(found, truth) == pytest.approx(0.5)
+    truth[1] = False
+    assert silhouette_iou(found, truth) == 1
+    assert np.isnan(silhouette_iou(found, np.zeros_like(truth)))
+
+
+def test_the_distance_of_centroids_leaves_stray_pixels_out():
+    truth = discs((10, 10), (10, 10), (10, 10), (40, 90))
+    found = discs((13, 14), (10, 10), (40, 90), (10, 10))
+    found[0] |= discs((28, 44), radius=1)[0]
+    np.testing.assert_allclose(centroid_errors(found, truth), [5, 0, 48])
+
+
+def test_the_measures_find_hands_and_things_in_the_truth_itself():
+    spec = VideoSpec(frames=5, height=96, width=160)
+    for seed in (100, 101, 102):
+        clip = next(make_sequence(seed, spec=spec))
+        seen, target = label(clip.frames, clip.paints), clip.body_ids[clip.target]
+        assert silhouette_iou(seen >= FIRST_HAND, clip.ids >= FIRST_HAND) > 0.85
+        assert centroid_errors(seen == target, clip.ids == target).max() < 2

@@ -1,0 +1,116 @@
+"""A small model from nothing: the autoencoder, then the denoiser with its encoders on its latents.
+
+Every stage lies in a folder of its own under the run's and resumes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flax import nnx
+
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.data.shards import MANIFEST, ShardReader
+from egosim_jax.diffusion.objective import Objective
+from egosim_jax.generator import Generator, ModelConfig, Networks
+from egosim_jax.io import weights
+from egosim_jax.models.wan_vae import WanVAE, standardise_latents
+from egosim_jax.progress import track
+from egosim_jax.train.autoencoder import Autoencoding, latent_statistics
+from egosim_jax.train.cache import cache, windows
+from egosim_jax.train.denoiser import Denoising
+from egosim_jax.train.script import Training, train
+
+BATCH = 8
+"""Clips that are encoded together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromScratch:
+    """The stages of a model that trains its own encoders."""
+
+    config: ModelConfig
+    """The model."""
+    frames: Mapping[str, Path]
+    """Folders of decoded clips: those to train on, `train`, and those to validate on, `test`."""
+    out: Path
+    """Folder of the run; the networks go to OUT/weights."""
+    vae: Training
+    """Training of the autoencoder."""
+    denoiser: Training
+    """Training of the denoiser and its encoders."""
+    crop: tuple[int, int] = (48, 64)
+    """Rows and columns of the pieces that the autoencoder is trained on."""
+    stride: int = 1
+    """Frames between the windows of a clip that the denoiser is trained on."""
+    dtype: str = "float32"
+    """Of the weights that are written."""
+    dropout: ConditionDropout = field(default_factory=ConditionDropout)
+    """How often each condition is hidden from the denoiser."""
+
+    def run(self) -> Path:
+        """Autoencoder, latents, denoiser; the folder of the weights."""
+        networks = Networks.random(self.config, seed=0)
+        networks.vae = self._autoencoder()
+        latents = {split: self._encode(split, networks) for split in self.frames}
+        trained = train(
+            Denoising(
+                model=self.config,
+                objective=Objective(schedule=self.config.schedule),
+                dropout=self.dropout,
+            ),
+            self.denoiser,
+            data=latents["train"],
+            validation=latents["test"],
+            out=self.out / "denoiser",
+        )
+        networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
+        networks.save(self.out / "weights", dtype=self.dtype)
+        return self.out / "weights"
+
+    def _autoencoder(self) -> WanVAE:
+        """The VAE, trained, with latents of mean 0 and deviation 1."""
+        path = self.out / "weights" / "vae.safetensors"
+        if not path.exists():
+            weights.save(path, self._train_autoencoder(), dtype=self.dtype)
+        # What was written is what encodes, in a run that was interrupted and in one that was not.
+        vae = nnx.eval_shape(lambda: WanVAE(self.config.vae, rngs=nnx.Rngs(0)))
+        weights.load(path, vae)
+        return vae
+
+    def _train_autoencoder(self) -> WanVAE:
+        # Pieces as long as the model's clips: a VAE that has only seen shorter ones drifts later.
+        vae = train(
+            Autoencoding(vae=self.config.vae, video=self.config.video, crop=self.crop),
+            self.vae,
+            data=self.frames["train"],
+            validation=self.frames["test"],
+            out=self.out / "vae",
+        )
+        videos = (record.arrays["truth"] for record in ShardReader(self.frames["train"]))
+        standardise_latents(vae, *latent_statistics(vae, videos))
+        return vae
+
+    def _encode(self, split: str, networks: Networks) -> Path:
+        """Cache the latents of every window of a split."""
+        out = self.out / "latents" / split
+        if not (out / MANIFEST).exists():
+            source = ShardReader(self.frames[split])
+            every = self.stride if split == "train" else self.config.video.frames
+            progress = cache(
+                Generator(self.config, networks),
+                source=source,
+                out=out,
+                stride=every,
+                batch_size=BATCH,
+                provenance={
+                    "config": self.config.name,
+                    "weights": weights.hashes(self.out / "weights"),
+                },
+            )
+            todo = len(windows(source, frames=self.config.video.frames, stride=every))
+            for _ in track(progress, f"encoding {split}, by {BATCH}", total=-(-todo // BATCH)):
+                pass
+        return out

@@ -1,0 +1,96 @@
+"""The model that ships: everything from scratch, on clips of the tabletop world.
+
+    egosim-train tabletop --out runs/tabletop
+
+makes the clips, trains the VAE, caches latents and trains the denoiser, on a CPU. Every stage
+resumes: run the same command again after an interruption.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from egosim_jax.command import DONE
+from egosim_jax.train.optimizer import OptimizerConfig
+from egosim_jax.train.script import Training
+
+FIRST_TRAINED = 1000
+"""Seed of the first scene that is trained on; those below are held out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tabletop:
+    """Train `tabletop` from scratch on scenes of the tabletop world, a quarter of them a robot's.
+
+    Writes OUT/weights, and beside it the shards, logs and checkpoints of each stage.
+    """
+
+    out: Path
+    """Folder of the run."""
+    config: str = "tabletop"
+    """Name of the model; it must train its own encoders."""
+    scenes: int = 1300
+    """Scenes to train on, two clips of each."""
+    held_out: int = 48
+    """Scenes to validate on, one clip of each."""
+    vae: Training = field(
+        default_factory=lambda: Training(
+            steps=4000,
+            batch_size=2,
+            optimizer=OptimizerConfig(rule="muon", learning_rate=1e-3, warmup=20, decay="cosine"),
+            log_every=25,
+            save_every=250,
+            validate_every=500,
+        )
+    )
+    """Training of the autoencoder."""
+    denoiser: Training = field(
+        default_factory=lambda: Training(
+            steps=10000,
+            batch_size=4,
+            optimizer=OptimizerConfig(rule="muon", learning_rate=2e-3, warmup=50, decay="cosine"),
+            log_every=25,
+            save_every=250,
+            validate_every=500,
+        )
+    )
+    """Training of the denoiser and its encoders."""
+
+    def run(self) -> int:
+        """Clips, autoencoder, latents, denoiser, weights."""
+        from egosim_jax import configs
+        from egosim_jax.conditioning.dropout import ConditionDropout
+        from egosim_jax.io.run import open_folder
+        from egosim_jax.train.from_scratch import FromScratch
+
+        open_folder(self.out, self)
+        stages = FromScratch(
+            config=configs.get(self.config),
+            frames={
+                "train": self._make("train", range(FIRST_TRAINED, FIRST_TRAINED + self.scenes), 2),
+                "test": self._make("test", range(self.held_out), 1),
+            },
+            out=self.out,
+            vae=self.vae,
+            denoiser=self.denoiser,
+            dtype="float16",
+            dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
+        )
+        print(stages.run())
+        return DONE
+
+    def _make(self, split: str, seeds: range, clips: int) -> Path:
+        """The clips of a split, decoded."""
+        from egosim_jax import configs
+        from egosim_jax.progress import track
+        from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+
+        spec = configs.get(self.config).video
+        plan = Plan(seeds=tuple(seeds), clips=clips, spec=spec, kind="mixed")
+        out = self.out / "frames" / split
+        scenes = make_shards(plan, out=out, workers=os.cpu_count() or 1)
+        for _ in track(scenes, f"making {split}", total=len(seeds)):
+            pass
+        return out
