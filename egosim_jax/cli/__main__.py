@@ -11,7 +11,7 @@ import tyro
 
 from egosim_jax import command
 from egosim_jax.cli.ablation import Tabletop
-from egosim_jax.cli.data import Check, Encode, Make, Pack, Sample, Stats
+from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Sample, Stats
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
@@ -26,6 +26,7 @@ class Data:
         | Annotated[Make, tyro.conf.subcommand("make")]
         | Annotated[Pack, tyro.conf.subcommand("pack")]
         | Annotated[Encode, tyro.conf.subcommand("encode")]
+        | Annotated[Look, tyro.conf.subcommand("look")]
         | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
     )

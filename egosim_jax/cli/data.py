@@ -226,6 +226,65 @@ class Check:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Look:
+    """Draw a contact sheet of shards of videos or frames. Prints its path."""
+
+    shards: Path
+    """Folder of the shards."""
+    out: Path
+    """The picture to write, .png or .jpg."""
+    by: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN [COLUMN ...]")] = ()
+    """Take the first clip of each combination of values of these columns, for instance verb."""
+    limit: int = 12
+    """Take at most so many clips."""
+    streams: tuple[Literal["truth", "prior", "hands"], ...] = ("truth", "prior", "hands")
+    """What is shown of each, from top to bottom."""
+    moments: int = 6
+    """Frames of each."""
+    width: int = 240
+    """Pixels of a picture's width."""
+
+    def run(self) -> int:
+        """Choose, decode, draw."""
+        import numpy as np
+
+        from egosim_jax.cli.sheet import Block, draw_sheet
+        from egosim_jax.data.shards import ShardReader
+        from egosim_jax.data.transforms import decode_record
+
+        for name in ("limit", "moments", "width"):
+            if getattr(self, name) < 1:
+                raise InputError(f"--{name} must be at least 1, not {getattr(self, name)}.")
+        reader = ShardReader(self.shards)
+        if reader.manifest.kind == "latents":
+            raise InputError(f"{self.shards} holds latents, not pictures. (--shards)")
+        spec = reader.manifest.spec or VideoSpec()
+        blocks: dict[object, Block] = {}
+        for number, record in enumerate(track(reader, "reading", total=len(reader))):
+            extra = record.metadata["extra"]
+            unknown = [name for name in self.by if name not in extra]
+            if unknown:
+                known = ", ".join(sorted(extra)) or "none"
+                raise InputError(f"The clips have no column {', '.join(unknown)}; known: {known}.")
+            key = tuple(extra[name] for name in self.by) if self.by else number
+            if key not in blocks:
+                videos = decode_record(record.arrays, spec)
+                shown = [videos[name] for name in self.streams if name in videos]
+                blocks[key] = Block(str(record.metadata["prompt"]), shown)
+            if len(blocks) == self.limit:
+                break
+        moments = np.linspace(0, spec.frames - 1, self.moments).round().astype(int).tolist()
+        draw_sheet(
+            [blocks[key] for key in sorted(blocks, key=str)],
+            self.out,
+            moments=moments,
+            width=self.width,
+        )
+        print(self.out)
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
 class Stats:
     """Describe shards: kind, arrays, sizes, frames, prompts and splits."""
 

@@ -19,7 +19,7 @@ CONFIG = ModelConfig(
     dit=WanDiTConfig(dim=256, ffn_dim=768, heads=4, layers=6, text_dim=64, image_dim=64),
     vae=WanVAEConfig(
         dim=8,
-        dim_mult=(1, 2, 6, 12),
+        dim_mult=(1, 2, 6, 10),
         res_blocks=1,
         latent_mean=(0.0,) * 16,
         latent_std=(1.0,) * 16,

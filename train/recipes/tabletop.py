@@ -37,7 +37,7 @@ class Tabletop:
     """Scenes to validate on, one clip of each."""
     vae: Training = field(
         default_factory=lambda: Training(
-            steps=4000,
+            steps=4500,
             batch_size=2,
             optimizer=OptimizerConfig(rule="muon", learning_rate=1e-3, warmup=20, decay="cosine"),
             log_every=25,
