@@ -13,6 +13,7 @@ from flax import nnx
 
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import MANIFEST, ShardReader
+from egosim_jax.data.transforms import record_length
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.generator import Generator, ModelConfig, Networks
 from egosim_jax.io import weights
@@ -98,7 +99,9 @@ class FromScratch:
         out = self.out / "latents" / split
         if not (out / MANIFEST).exists():
             source = ShardReader(self.frames[split])
-            every = self.stride if split == "train" else self.config.video.frames
+            # To validate, a clip's first window and, if it is longer, its last.
+            last = record_length(source[0].arrays) - self.config.video.frames
+            every = self.stride if split == "train" else max(1, last)
             progress = cache(
                 Generator(self.config, networks),
                 source=source,

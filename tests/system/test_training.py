@@ -65,7 +65,7 @@ def test_an_experiment_gives_each_clip_the_conditions_of_another(run):
 
 def test_an_experiment_draws_a_row_for_each_clip(run):
     with Image.open(run / "contact_sheet.png") as sheet:
-        assert sheet.height == 8 * (14 + 64)
+        assert sheet.height == 8 * (16 + 64)
         assert sheet.width == 3 * 4 * 96
 
 

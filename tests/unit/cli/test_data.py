@@ -1,10 +1,12 @@
 """`egosim data`: pack, check and stats, with their exit codes."""
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from egosim_jax.cli.data import Check, Pack, Stats
+from egosim_jax.cli.data import Check, Look, Pack, Stats
 from egosim_jax.command import DONE, PARTIAL
-from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.types import InputError, VideoSpec
 
 
@@ -97,3 +99,29 @@ def test_progress_goes_to_stderr_and_ends_with_the_total(clips, out, capsys):
 def test_a_shard_of_no_size_is_refused(clips, out):
     with pytest.raises(InputError, match="--shard-megabytes must be at least 1, not 0"):
         Pack(metadata=clips, out=out, shard_megabytes=0).run()
+
+
+def test_look_draws_the_first_clip_of_each_value_of_a_column(make_clips, out, tmp_path):
+    Pack(metadata=make_clips(count=5), out=out, size=(16, 32), num_frames=5).run()
+    sheet = tmp_path / "sheet.png"
+    look = Look(shards=out, out=sheet, by=("split",), streams=("truth", "prior"), moments=3)
+    assert look.run() == DONE
+    with Image.open(sheet) as picture:
+        assert picture.size == (3 * 240, 2 * (16 + 2 * 120))
+    Look(shards=out, out=sheet, limit=4, streams=("hands",), moments=3, width=32).run()
+    with Image.open(sheet) as picture:
+        drawn = np.asarray(picture)
+    assert drawn.shape == (4 * (16 + 16), 3 * 32, 3)
+    np.testing.assert_array_equal(drawn[16:32, 32:64], ShardReader(out)[0].arrays["hands"][2])
+
+
+def test_look_refuses_unknown_columns_and_latents(clips, out, tmp_path):
+    Pack(metadata=clips, out=out, size=(16, 32), num_frames=5).run()
+    with pytest.raises(InputError, match="no column verb; known: split"):
+        Look(shards=out, out=tmp_path / "sheet.png", by=("verb",)).run()
+    spec = VideoSpec(frames=5, height=16, width=32)
+    latents = tmp_path / "latents"
+    with ShardWriter(latents, kind="latents", spec=spec) as writer:
+        writer.add({"truth": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a", "prompt": "b"})
+    with pytest.raises(InputError, match="holds latents"):
+        Look(shards=latents, out=tmp_path / "sheet.png").run()

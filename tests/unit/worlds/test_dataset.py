@@ -33,6 +33,13 @@ def test_a_finished_folder_is_left_alone(tmp_path):
     assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
 
 
+def test_of_mixed_scenes_every_fourth_is_a_robots(tmp_path):
+    plan = Plan(seeds=(7, 8, 9), clips=1, spec=SPEC, kind="mixed")
+    list(make_shards(plan, out=tmp_path, workers=1))
+    records = list(ShardReader(tmp_path))
+    assert [record.metadata["extra"]["kind"] for record in records] == ["human", "robot", "human"]
+
+
 def test_nothing_to_make_is_refused():
     with pytest.raises(InputError, match="--scenes"):
         Plan(seeds=(), clips=1, spec=SPEC, kind="human")

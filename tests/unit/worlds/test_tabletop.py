@@ -227,6 +227,29 @@ def test_a_thing_moves_smoothly_and_ends_where_it_is_meant_to(verb, kind):
         assert moments[-1].scene.openings[intent.name] == pytest.approx(1)
 
 
+def test_what_stands_under_something_is_neither_taken_nor_opened():
+    """After stacking, the lower thing is offered for nothing, except that a drawer may slide."""
+    checked = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        scene = make_scene(rng)
+        intent = actions.choose(scene, rng)
+        if intent.verb != "stack":
+            continue
+        hand = actions.start_hand(scene, intent, "human", rng)
+        after = actions.act(scene, (hand,), intent, "human", frames=9)[-1].scene
+        top = after.body(intent.name).world_from_body[:2, 3]
+        below = min(
+            (body for body in after.bodies if body.name != intent.name),
+            key=lambda body: np.linalg.norm(body.world_from_body[:2, 3] - top),
+        )
+        chosen = [actions.choose(after, np.random.default_rng(k)) for k in range(40)]
+        if below.shape != "drawer":
+            assert below.name not in {choice.name for choice in chosen}
+            checked += 1
+    assert checked > 5
+
+
 def test_what_was_opened_can_be_closed():
     scene, intent, moments = act_on("open")
     opened = moments[-1].scene
