@@ -11,7 +11,7 @@ import tyro
 
 from egosim_jax import command
 from egosim_jax.cli.ablation import Tabletop
-from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Sample, Stats
+from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
@@ -19,11 +19,10 @@ from egosim_jax.cli.generate import Generate
 
 @dataclass(frozen=True, kw_only=True)
 class Data:
-    """Prepare data: sample clips, shards of videos, frames or latents."""
+    """Prepare data: clips of a procedural world, shards of videos, frames or latents."""
 
     command: (
-        Annotated[Sample, tyro.conf.subcommand("sample")]
-        | Annotated[Make, tyro.conf.subcommand("make")]
+        Annotated[Make, tyro.conf.subcommand("make")]
         | Annotated[Pack, tyro.conf.subcommand("pack")]
         | Annotated[Encode, tyro.conf.subcommand("encode")]
         | Annotated[Look, tyro.conf.subcommand("look")]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from egosim_jax.types import Triplet
     from egosim_jax.worlds.tabletop import TabletopClip
 
-Hidden = Literal["prior", "mask", "hands", "text"]
+Hidden = Literal["prior", "mask", "hands"]
 Summary = dict[str, float]
 Table = dict[str, dict[str, Summary]]
 METHODS: tuple[tuple[str, Hidden | None], ...] = (
@@ -28,7 +28,6 @@ METHODS: tuple[tuple[str, Hidden | None], ...] = (
     ("without prior", "prior"),
     ("without mask", "mask"),
     ("without hands", "hands"),
-    ("without text", "text"),
 )
 MEASURES = {
     "psnr": ("PSNR dB", "{:.2f}"),

@@ -125,32 +125,6 @@ class Encode:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample:
-    """Draw sample clips in EgoSim's format, with their truth, by seed. Prints the metadata file."""
-
-    out: Path
-    """Folder of the clips."""
-    clips: int = 1
-    """How many; every fourth belongs to the test split."""
-    seed: int = 0
-    """Seed of the first clip; the others have the next ones."""
-    frames: int = 61
-    """Frames of a clip, 4k+1."""
-    height: int = 192
-    """Rows in pixels, a multiple of 16."""
-    width: int = 320
-    """Columns in pixels, a multiple of 16."""
-
-    def run(self) -> int:
-        """Draw clip after clip."""
-        from egosim_jax.testing.sample import write_sample
-
-        spec = VideoSpec(frames=self.frames, height=self.height, width=self.width)
-        print(write_sample(self.out, spec=spec, clips=self.clips, seed=self.seed))
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
 class Make:
     """Make shards of clips of a procedural world, in parallel. Prints the folder.
 

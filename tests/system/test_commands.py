@@ -1,8 +1,9 @@
-"""The commands, from sample clips to a table, as a user runs them."""
+"""The commands, from clips to a table, as a user runs them."""
 
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,17 +11,23 @@ from PIL import Image
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.data.clips import write_clips
 from egosim_jax.generator import Networks
 from egosim_jax.io.video import probe_video
-from egosim_jax.testing.sample import write_sample
 from egosim_jax.types import VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 SPEC = VideoSpec(frames=9, height=64, width=96)
 
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sample(tmp_path_factory.mktemp("clips"), spec=SPEC, clips=2)
+    made = [to_triplet(next(make_sequence(seed, spec=SPEC))) for seed in (0, 1)]
+    clips = [
+        replace(clip, video_id=f"sample_{number}", extra={"split": "train"})
+        for number, clip in enumerate(made)
+    ]
+    return write_clips(tmp_path_factory.mktemp("clips"), clips, fps=SPEC.fps)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +67,7 @@ def test_a_clip_and_its_comparison_have_the_models_size(generated):
 def test_results_carry_seed_prompt_and_further_columns(generated):
     line = results(generated)["sample_0"]
     assert line["split"] == "train"
-    assert "ball" in line["prompt"]
+    assert "hand" in line["prompt"]
     assert line["seed"] != results(generated)["sample_1"].get("seed")
     assert json.loads((generated / "config.json").read_text("utf-8"))["model"]["name"] == "debug"
 

@@ -1,4 +1,4 @@
-"""From sample clips to trained weights to a generated clip, by the commands alone."""
+"""From clips to trained weights to a generated clip, by the commands alone."""
 
 import json
 from pathlib import Path
@@ -34,7 +34,7 @@ def test_a_recipe_leaves_weights_of_every_network(run):
 def test_every_window_of_a_training_clip_is_cached_with_its_start(run):
     reader = ShardReader(run / "latents" / "train")
     starts = {(record.metadata["video_id"], record.metadata["start"]) for record in reader}
-    clips = {f"sample_{number}" for number in (0, 1, 2, 4, 5, 6)}
+    clips = {f"tabletop_human_{number}_0" for number in (0, 1, 2, 4, 5, 6)}
     assert starts == {(clip, start) for clip in clips for start in range(0, 53, 8)}
 
 
@@ -102,7 +102,7 @@ def test_trained_weights_generate(run, tmp_path):
     }
     flags = [str(x) for name, value in options.items() for x in (f"--{name}", value)]
     assert egosim(["generate", *flags]) == 0
-    assert (tmp_path / "out" / "sample_3.mp4").is_file()
+    assert (tmp_path / "out" / "tabletop_human_3_0.mp4").is_file()
 
 
 def test_the_tabletop_recipe_makes_its_own_clips_and_half_wide_weights(tmp_path):

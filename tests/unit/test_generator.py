@@ -20,8 +20,8 @@ from egosim_jax.generator import (
     denoise,
     encode_condition,
 )
-from egosim_jax.testing.sample import make_sample
 from egosim_jax.types import InputError, Triplet, VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 DEBUG = configs.get("debug")
 CONFIG = dataclasses.replace(DEBUG, video=VideoSpec(frames=5, height=32, width=48), steps=2)
@@ -43,7 +43,7 @@ def generator(networks: Networks) -> Generator:
 
 @pytest.fixture(scope="module")
 def triplets() -> list[Triplet]:
-    return [make_sample(CONFIG.video, seed=seed) for seed in range(4)]
+    return [to_triplet(next(make_sequence(seed, spec=CONFIG.video))) for seed in range(4)]
 
 
 def test_a_batch_of_four_equals_four_batches_of_one(networks, triplets):
@@ -135,7 +135,7 @@ def test_the_cache_of_frozen_encoders_holds_their_embeddings(networks, triplets)
 
 def test_a_clip_without_truth_cannot_be_cached(generator, triplets):
     blind = dataclasses.replace(triplets[0], truth=None)
-    with pytest.raises(InputError, match="sample_0: no truth"):
+    with pytest.raises(InputError, match="tabletop_human_0_0: no truth"):
         generator.cache([blind])
 
 
@@ -143,7 +143,7 @@ def test_latents_that_are_not_finite_name_their_clips(networks, triplets):
     graph, state = nnx.split(networks)
     broken = nnx.merge(graph, jax.tree.map(jnp.copy, state))
     broken.dit.head.linear.bias[...] = jnp.full_like(broken.dit.head.linear.bias[...], jnp.nan)
-    with pytest.raises(FloatingPointError, match="sample_0"):
+    with pytest.raises(FloatingPointError, match="tabletop_human_0_0"):
         Generator(CONFIG, broken).generate(triplets[:1], [0])
 
 

@@ -1,4 +1,4 @@
-"""The smallest training there is, on clips made by formula: to see that everything runs.
+"""The smallest training there is, on clips of the tabletop world: to see that everything runs.
 
     egosim-train debug --out runs/debug
 
@@ -7,7 +7,7 @@ takes about two minutes on 2 CPU cores.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from egosim_jax.train.optimizer import OptimizerConfig
@@ -28,12 +28,12 @@ def _training(steps: int) -> Training:
 
 @dataclass(frozen=True, kw_only=True)
 class Debug:
-    """Train `debug` for a few steps on sample clips."""
+    """Train `debug` for a few steps on a few clips of the tabletop world."""
 
     out: Path
     """Folder of the run."""
     clips: int = 8
-    """Sample clips to make; every fourth is for testing."""
+    """Clips to make; every fourth is for testing."""
     vae: Training = field(default_factory=lambda: _training(20))
     """Training of the autoencoder."""
     denoiser: Training = field(default_factory=lambda: _training(20))
@@ -41,17 +41,21 @@ class Debug:
 
     @property
     def metadata(self) -> Path:
-        """The sample clips."""
+        """The clips, as files."""
         return self.out / "clips" / "metadata.csv"
 
     def run(self) -> int:
         """Make the clips, then do as `real_tiny` does."""
         from egosim_jax import configs
-        from egosim_jax.testing.sample import write_sample
+        from egosim_jax.data.clips import write_clips
+        from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
-        video = configs.get("debug").video
-        spec = type(video)(frames=CLIP_FRAMES, height=video.height, width=video.width)
-        write_sample(self.metadata.parent, spec=spec, clips=self.clips)
+        spec = replace(configs.get("debug").video, frames=CLIP_FRAMES)
+        if not self.metadata.exists():
+            made = (to_triplet(next(make_sequence(seed, spec=spec))) for seed in range(self.clips))
+            splits = ({"split": "test" if n % 4 == 3 else "train"} for n in range(self.clips))
+            clips = (replace(clip, extra=extra) for clip, extra in zip(made, splits, strict=True))
+            write_clips(self.metadata.parent, clips, fps=spec.fps)
         return RealTiny(
             metadata=self.metadata,
             out=self.out,

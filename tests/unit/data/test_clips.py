@@ -9,8 +9,7 @@ from PIL import Image
 from egosim_jax.data.clips import check_clip, load_triplet, write_clips
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.io.video import read_image, read_video, write_video
-from egosim_jax.testing.sample import make_sample
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, Triplet, VideoSpec
 
 NATIVE = VideoSpec(frames=9, height=32, width=48)
 
@@ -172,9 +171,27 @@ def test_lenient_still_refuses_a_missing_prior(files):
 def test_clips_that_were_written_are_read_back(tmp_path):
     """Within what 4:2:0 colour and near-lossless H.264 leave of smooth pictures."""
     spec = VideoSpec(frames=9, height=32, width=48)
+    frame, row, column = np.mgrid[:9, :32, :48]
+    smooth = [
+        np.stack([8 * frame + 3 * row, 4 * column, 60 * shift + row + column], axis=-1).astype(
+            np.uint8
+        )
+        for shift in range(3)
+    ]
+    mask = np.zeros((9, 32, 48), np.uint8)
+    mask[:, :, 30:] = 255
     triplets = [
-        dataclasses.replace(make_sample(spec, seed=seed), extra={"split": "train"})
-        for seed in (0, 1)
+        Triplet(
+            video_id=f"clip_{number}",
+            prompt="hands move, and more",
+            prior=smooth[0],
+            hands=smooth[2],
+            mask=mask,
+            first_frame=smooth[0][0],
+            truth=smooth[1 + number],
+            extra={"split": "train"},
+        )
+        for number in (0, 1)
     ]
     metadata = write_clips(tmp_path / "clips", triplets, fps=8)
     items = read_metadata(metadata)

@@ -1,1 +1,0 @@
-"""Public fixtures: sample clips in the official format, made by formula."""
