@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from egosim_jax.generator import Generator
     from egosim_jax.rendering.skeleton import Kind
-    from egosim_jax.types import Triplet
+    from egosim_jax.types import Triplet, VideoSpec
     from egosim_jax.worlds.tabletop import TabletopClip
 
 Hidden = Literal["prior", "mask", "hands"]
@@ -98,14 +98,11 @@ class Tabletop:
 
     def _compare(self, kind: Kind, generator: Generator) -> Table:
         """Scores of every method on the scenes of one kind of hands, and their sheet."""
-        from egosim_jax.worlds.tabletop import make_sequence, to_triplet
-
         spec = generator.config.video
         seeds = range(self.first_scene, self.first_scene + self.scenes)
         scenes = [
-            _Scene(clip, to_triplet(clip))
+            _Scene.make(seed, spec, kind)
             for seed in track(seeds, f"making {kind} scenes", total=self.scenes)
-            for clip in make_sequence(seed, spec=spec, kind=kind)
         ]
         table: Table = {}
         shown: list[Block] = []
@@ -144,6 +141,17 @@ class _Scene:
 
     clip: TabletopClip
     triplet: Triplet
+    background: np.ndarray
+    """The true frames without hands and without what they act on."""
+
+    @classmethod
+    def make(cls, seed: int, spec: VideoSpec, kind: Kind) -> _Scene:
+        """The first clip of a seed."""
+        from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+
+        clip = next(make_sequence(seed, spec=spec, kind=kind))
+        bare = next(make_sequence(seed, spec=spec, kind=kind, bare=True))
+        return cls(clip, to_triplet(clip), bare.frames)
 
     def judge(self, video: np.ndarray) -> dict[str, float]:
         """Every measure of a video of this scene."""
@@ -156,7 +164,8 @@ class _Scene:
         truth, ids = self.clip.frames[1:], self.clip.ids[1:]
         target = self.clip.body_ids[self.clip.target]
         hands, thing = ids >= FIRST_HAND, ids == target
-        seen = region.label(video[1:], self.clip.paints)
+        movers = {n: c for n, c in self.clip.paints.items() if n == target or n >= FIRST_HAND}
+        seen = region.label(video[1:], self.background[1:], movers)
         whole = score(video[1:], truth)
         errors = region.centroid_errors(seen == target, thing)
         return {

@@ -1,9 +1,10 @@
 """Whether the right things are where they should be: silhouettes and places read off by colour.
 
-A thing of colour c that is lit by s shows s * c. In a world whose colours are known, each pixel
-therefore belongs to the thing whose ray {s * c : 0.45 <= s <= 1.15} comes nearest to its colour.
-The same rule reads the truth and the generated video; on the truth, where ids are known, it says
-how far it can be trusted.
+A thing of colour c that is lit by s shows s * c. Where the scene without hands and without the
+thing they move is known, each pixel belongs to whichever comes nearest to its colour: that
+background in some light, {s * b : 0.45 <= s <= 1.15}, or one of the colours of hands and thing. The
+same rule reads the truth and the generated video; on the truth, where ids are known, it says how
+far it can be trusted.
 """
 
 from __future__ import annotations
@@ -24,16 +25,25 @@ NEAR = 0.12
 
 
 def label(
-    video: UInt8[np.ndarray, "f h w 3"], paints: Mapping[int, tuple[int, int, int]]
+    video: UInt8[np.ndarray, "f h w 3"],
+    background: UInt8[np.ndarray, "f h w 3"],
+    paints: Mapping[int, tuple[int, int, int]],
 ) -> Int[np.ndarray, "f h w"]:
-    """The id of the paint, RGB by id, that each pixel's colour comes nearest to."""
-    numbers = np.array(list(paints))
-    colours = np.array([paints[number] for number in numbers], np.float32)
-    pixels = video.reshape(-1, 3).astype(np.float32)
-    shades = np.clip(pixels @ colours.T / np.square(colours).sum(axis=1), *SHADES)
-    # |x - s c|^2 = x.x - 2 s x.c + s^2 c.c, whose first term is the same for all paints
-    distance = shades**2 * np.square(colours).sum(axis=1) - 2 * shades * (pixels @ colours.T)
-    return numbers[distance.argmin(axis=1)].reshape(video.shape[:-1])
+    """What each pixel shows: an id of `paints`, which are RGB by id, or 0 for the background."""
+    pixels = video.astype(np.float32)
+    numbers = np.array([0, *paints])
+    colours = [background, *(np.array(colour) for colour in paints.values())]
+    distances = [_distance(pixels, colour.astype(np.float32)) for colour in colours]
+    return numbers[np.argmin(distances, axis=0)]
+
+
+def _distance(
+    pixels: Float[np.ndarray, "f h w 3"], colour: Float[np.ndarray, "*b 3"]
+) -> Float[np.ndarray, "f h w"]:
+    """Squared distance from a colour in the light that brings it nearest."""
+    strength = np.maximum(np.square(colour).sum(axis=-1), 1e-6)
+    shade = np.clip((pixels * colour).sum(axis=-1) / strength, *SHADES)
+    return np.square(pixels - shade[..., None] * colour).sum(axis=-1)
 
 
 def region_psnr(

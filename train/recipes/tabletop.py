@@ -31,7 +31,7 @@ class Tabletop:
     """Folder of the run."""
     config: str = "tabletop"
     """Name of the model; it must train its own encoders."""
-    scenes: int = 1300
+    scenes: int = 1000
     """Scenes to train on, two clips of each."""
     held_out: int = 48
     """Scenes to validate on, one clip of each."""

@@ -62,11 +62,12 @@ class TabletopClip:
 
 
 def make_sequence(
-    seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human"
+    seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human", bare: bool = False
 ) -> Iterator[TabletopClip]:
     """The clips of a seed, each `spec.frames` long; robots have one gripper.
 
-    Equal seeds give equal clips at equal sizes, and the same events at any.
+    Equal seeds give equal clips at equal sizes, and the same events at any. `bare` leaves the hands
+    and what they act on out of the pictures: the background of the same clip.
     """
     rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
     scene = make_scene(rng)
@@ -74,14 +75,14 @@ def make_sequence(
     eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
     hands: tuple[Hand, ...] = ()
     for number in range(clips):
-        intent = actions.choose(scene, rng)
+        intent = actions.choose(scene, rng, hand=hands[0] if hands else None)
         if not hands:
             hands = (actions.start_hand(scene, intent, kind, rng),)
             if kind == "human" and rng.random() < 0.35:
                 hands = (*hands, actions.waiting_hand(hands[0].side, rng))
         moments = actions.act(scene, hands, intent, kind, frames=spec.frames)
         cameras = _cameras(number + np.linspace(0, 1, spec.frames), eye, sway, spec)
-        yield _clip(seed, number, kind, intent, moments, cameras)
+        yield _clip(seed, number, kind, intent, moments, cameras, bare=bare)
         scene, hands = moments[-1].scene, moments[-1].hands
 
 
@@ -110,6 +111,8 @@ def _clip(
     intent: actions.Intent,
     moments: list[Moment],
     cameras: Cameras,
+    *,
+    bare: bool,
 ) -> TabletopClip:
     pictures, joints, paints = [], [], {}
     for moment, pose in zip(moments, cameras.world_from_camera, strict=True):
@@ -124,6 +127,9 @@ def _clip(
             ]
         joints.append(here)
         paints |= {item.number: item.part.paint.colour for item in placed}
+        if bare:
+            target = moment.scene.number(intent.name)
+            placed = [x for x in placed if x.number < FIRST_HAND and x.number != target]
         pictures.append(_look(Stage(placed), pose, cameras))
     first, points, colours = _scene_points(moments[0].scene, cameras)
     who = f"The {moments[0].hands[0].side} hand" if kind == "human" else "The gripper"

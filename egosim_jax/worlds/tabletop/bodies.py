@@ -215,8 +215,8 @@ def darker(colour: tuple[int, int, int]) -> tuple[int, int, int]:
 
 def make_loose(shape: Shape, colour: str, rng: np.random.Generator) -> Body:
     """A thing to pick up, of random size, at the origin."""
-    width = float(rng.uniform(0.062, 0.078))
-    height = float(rng.uniform(0.06, 0.09))
+    width = float(rng.uniform(0.066, 0.08))
+    height = float(rng.uniform(0.065, 0.09))
     if shape == "ball":
         height = width
     if shape == "ring":

@@ -30,6 +30,11 @@ TABLE, FLOOR, WALL, FIRST_BODY, FIRST_HAND = 1, 2, 3, 10, 100
 100 + 2 i and its forearm 101 + 2 i."""
 DRAWER_M, LID_DEGREES = 0.075, 100.0
 """How far a drawer slides, and a lid turns, when it is open."""
+WOODS = (
+    (196, 178, 150), (170, 168, 160), (118, 92, 72), (105, 112, 120), (214, 200, 172), (88, 78, 70),
+    (150, 122, 92),
+)  # fmt: skip
+"""RGB of table tops: oak, ash, walnut, slate, birch, wenge, teak."""
 GAP_M = 0.035
 """Least free space between two things on the table."""
 
@@ -81,13 +86,13 @@ class Scene:
         return items
 
     def free_place(
-        self, body: Body, rng: np.random.Generator, *, away_m: float = 0.0
+        self, body: Body, rng: np.random.Generator, *, away_m: tuple[float, float] = (0, np.inf)
     ) -> Float[np.ndarray, " 2"] | None:
-        """A random x and y where the body fits, at least `away_m` from where it is, if any."""
+        """A random x and y where the body fits, so far from where it is, if there is any."""
         here = body.world_from_body[:2, 3]
         for _ in range(200):
             place = rng.uniform([REACH_M[0], REACH_M[2]], [REACH_M[1], REACH_M[3]])
-            if np.linalg.norm(place - here) < away_m:
+            if not away_m[0] <= np.linalg.norm(place - here) <= away_m[1]:
                 continue
             if all(
                 np.linalg.norm(place - other.world_from_body[:2, 3])
@@ -149,8 +154,9 @@ def make_scene(rng: np.random.Generator) -> Scene:
 def _room(rng: np.random.Generator) -> tuple[Placed, ...]:
     """Table, floor and three walls."""
     x, y, z = TABLE_SIZE_M
-    wood = rng.uniform([120, 85, 55], [195, 160, 125]) + rng.uniform(-12, 12)
-    walls, floors = rng.uniform(130, 215, 3), rng.uniform(70, 130, 3)
+    wood = np.array(WOODS[rng.integers(len(WOODS))]) + rng.normal(0, 6, 3)
+    walls = rng.uniform(150, 205) + rng.normal(0, 12, 3)
+    floors = rng.uniform(75, 125) + rng.normal(0, 8, 3)
     pieces: list[tuple[str, tuple, np.ndarray, Pattern, float, int]] = [
         ("table", box((-x / 2, 0, -z), (x / 2, y, 0)), wood, "grain", 0.06, TABLE),
         ("floor", box((-2.5, -1.5, -0.76), (2.5, 2.5, -0.74)), floors, "checks", 0.30, FLOOR),
