@@ -37,7 +37,7 @@ class Tabletop:
     """Scenes to validate on, one clip of each."""
     vae: Training = field(
         default_factory=lambda: Training(
-            steps=3600,
+            steps=3000,
             batch_size=2,
             # With a short warm-up the first steps close the channel that tells green from purple,
             # and it stays closed.

@@ -14,15 +14,16 @@ def discs(*centres, radius=4):
     return np.stack([np.hypot(rows - y, columns - x) <= radius for y, x in centres])
 
 
-def test_a_pixel_belongs_to_the_paint_whose_ray_it_is_nearest_to():
-    paints = {3: (200, 40, 40), 7: (40, 40, 200), 9: (120, 120, 120)}
+def test_a_pixel_shows_what_comes_nearest_to_its_colour_in_some_light():
+    paints = {3: (200, 40, 40), 7: (40, 40, 200)}
     rng = np.random.default_rng(0)
-    video = rng.integers(0, 256, (1, 8, 8, 3), dtype=np.uint8)
-    got = label(video, paints)
+    video, background = rng.integers(0, 256, (2, 1, 8, 8, 3), dtype=np.uint8)
+    got = label(video, background, paints)
+    assert set(np.unique(got)) == {0, 3, 7}
     for row, column in np.ndindex(8, 8):
         pixel = video[0, row, column].astype(float)
         distances = {}
-        for number, colour in paints.items():
+        for number, colour in {0: background[0, row, column], **paints}.items():
             colour = np.array(colour, float)
             shade = min(max(pixel @ colour / (colour @ colour), 0.45), 1.15)
             distances[number] = np.linalg.norm(pixel - shade * colour)
@@ -56,10 +57,16 @@ def test_the_distance_of_centroids_leaves_stray_pixels_out():
     np.testing.assert_allclose(centroid_errors(found, truth), [5, 0, 48])
 
 
-def test_the_measures_find_hands_and_things_in_the_truth_itself():
+@pytest.mark.parametrize(("kind", "least"), [("human", 0.85), ("robot", 0.75)])
+def test_the_measures_find_hands_and_things_in_the_truth_itself(kind, least):
+    """Less well those of a grey gripper over a table of slate."""
     spec = VideoSpec(frames=5, height=96, width=160)
     for seed in (100, 101, 102):
-        clip = next(make_sequence(seed, spec=spec))
-        seen, target = label(clip.frames, clip.paints), clip.body_ids[clip.target]
-        assert silhouette_iou(seen >= FIRST_HAND, clip.ids >= FIRST_HAND) > 0.85
+        clip, bare = (
+            next(make_sequence(seed, spec=spec, kind=kind, bare=bare)) for bare in (False, True)
+        )
+        target = clip.body_ids[clip.target]
+        movers = {n: c for n, c in clip.paints.items() if n == target or n >= FIRST_HAND}
+        seen = label(clip.frames, bare.frames, movers)
+        assert silhouette_iou(seen >= FIRST_HAND, clip.ids >= FIRST_HAND) > least
         assert centroid_errors(seen == target, clip.ids == target).max() < 2
