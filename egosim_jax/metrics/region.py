@@ -13,6 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy.lib.stride_tricks import sliding_window_view
 
 from egosim_jax.metrics.image import MAX_PSNR
 
@@ -44,6 +45,17 @@ def _distance(
     strength = np.maximum(np.square(colour).sum(axis=-1), 1e-6)
     shade = np.clip((pixels * colour).sum(axis=-1) / strength, *SHADES)
     return np.square(pixels - shade[..., None] * colour).sum(axis=-1)
+
+
+def opened(silhouette: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """The silhouette without what no 3 x 3 square fits into: lines along blurred edges, specks."""
+
+    def around(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w 3 3"]:
+        padded = np.pad(mask, ((0, 0), (1, 1), (1, 1)), mode="edge")
+        return sliding_window_view(padded, (3, 3), axis=(1, 2))
+
+    eroded = np.min(around(silhouette), axis=(3, 4))
+    return np.max(around(eroded), axis=(3, 4))
 
 
 def region_psnr(
