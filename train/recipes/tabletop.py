@@ -50,9 +50,9 @@ class Tabletop:
     """Training of the autoencoder."""
     denoiser: Training = field(
         default_factory=lambda: Training(
-            steps=6000,
+            steps=4400,
             batch_size=8,
-            optimizer=OptimizerConfig(rule="muon", learning_rate=2e-3, warmup=50, decay="cosine"),
+            optimizer=OptimizerConfig(rule="muon", learning_rate=2e-3, warmup=200, decay="cosine"),
             log_every=25,
             save_every=250,
             validate_every=500,

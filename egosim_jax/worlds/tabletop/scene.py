@@ -37,6 +37,8 @@ WOODS = (
 """RGB of table tops: oak, ash, walnut, slate, birch, wenge, teak."""
 GAP_M = 0.035
 """Least free space between two things on the table."""
+LEAST, MOST = 3, 6
+"""Things on a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +128,16 @@ def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
 
 def make_scene(rng: np.random.Generator) -> Scene:
     """A random scene of three to six things of different colours, at most one to be opened."""
+    while len((scene := _scatter(rng)).bodies) < LEAST:
+        pass  # the table was full before the least number stood on it
+    return scene
+
+
+def _scatter(rng: np.random.Generator) -> Scene:
+    """Things put down one after another, as long as there is room."""
     scene = Scene(bodies=(), room=_room(rng), openings={})
     names = list(rng.permutation(list(COLOURS)))
-    count = int(rng.integers(3, 7))
+    count = int(rng.integers(LEAST, MOST + 1))
     candidates: list[Body] = []
     if rng.random() < 0.5:
         make = make_drawer if rng.random() < 0.5 else make_lidded_box
