@@ -10,10 +10,10 @@ depends on its own seed only, so that a clip does not depend on the batch it was
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, no_type_check
+from typing import Any, Literal, TypeVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,8 @@ from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 from egosim_jax.types import Clip, Condition, InputError, Triplet, VideoSpec
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,6 +316,12 @@ class Generator:
     def _clips(self, latents: Float[Array, "b f h w 16"]) -> list[Clip]:
         frames = np.asarray(self._decode(latents))
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
+
+
+def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
+    """The items, `size` at a time; the last batch may be smaller."""
+    for first in range(0, len(items), size):
+        yield items[first : first + size]
 
 
 def _truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:

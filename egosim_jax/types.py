@@ -44,6 +44,13 @@ def check_frame_count(frames: int, *, what: str = "a video", fix: str = "--num-f
         )
 
 
+def check_counts(counts: Mapping[str, int | None]) -> None:
+    """Raise `InputError` at the first count below 1; by name, None if none was given."""
+    for name, count in counts.items():
+        if count is not None and count < 1:
+            raise InputError(f"{name} must be at least 1, not {count}.")
+
+
 @dataclass(frozen=True, kw_only=True)
 class VideoSpec:
     """Length, size and rate of the videos that a model reads and writes."""
@@ -67,8 +74,7 @@ class VideoSpec:
                     f"{name} {size} does not fit the model: it must be a multiple of 16 (8 pixels "
                     f"a latent cell, 2 cells a token). Nearest: {max(16, round(size / 16) * 16)}."
                 )
-        if self.fps < 1:
-            raise InputError(f"fps must be at least 1, not {self.fps}.")
+        check_counts({"fps": self.fps})
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:

@@ -6,18 +6,21 @@ alone. The manifest's provenance names the config and the hashes of the encoders
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import decode_record, record_length
-from egosim_jax.generator import Generator
+from egosim_jax.generator import Generator, batches
 from egosim_jax.types import InputError, Triplet
 
 
 def windows(source: ShardReader, *, frames: int, stride: int) -> list[tuple[int, int]]:
-    """Record number and first frame of every window of `frames` frames, `stride` apart."""
+    """Record number and first frame of every window of `frames` frames, `stride` apart.
+
+    Reads every record. Raises `InputError` if a clip is shorter than a window.
+    """
     found = []
     for number, record in enumerate(source):
         last = record_length(record.arrays) - frames
@@ -33,29 +36,26 @@ def cache(
     generator: Generator,
     *,
     source: ShardReader,
+    todo: Sequence[tuple[int, int]],
     out: Path,
-    stride: int,
     batch_size: int,
     provenance: Mapping[str, Any],
     overwrite: bool = False,
-) -> Iterator[int]:
-    """Write latents shards; yields the number of windows done after each batch.
+) -> Iterator[tuple[int, int]]:
+    """Write latents shards; yields each window of `todo` once it is encoded.
 
-    `source` holds videos or frames with a truth. Raises `InputError` before encoding if a clip is
-    shorter than a window.
+    `source` holds videos or frames with a truth, `todo` the windows of it that are wanted.
     """
     spec = generator.config.video
-    todo = windows(source, frames=spec.frames, stride=stride)
     with ShardWriter(
         out, kind="latents", spec=spec, provenance=provenance, overwrite=overwrite
     ) as writer:
-        for first in range(0, len(todo), batch_size):
-            batch = todo[first : first + batch_size]
+        for batch in batches(todo, batch_size):
             filled = [*batch, *[batch[-1]] * (batch_size - len(batch))]
             examples = generator.cache([_triplet(source, *window, generator) for window in filled])
             for (number, start), arrays in zip(batch, examples, strict=False):
                 writer.add(arrays, {**source[number].metadata, "start": start})
-            yield first + len(batch)
+                yield number, start
 
 
 def _triplet(source: ShardReader, number: int, start: int, generator: Generator) -> Triplet:

@@ -102,18 +102,18 @@ class FromScratch:
             # To validate, a clip's first window and, if it is longer, its last.
             last = record_length(source[0].arrays) - self.config.video.frames
             every = self.stride if split == "train" else max(1, last)
+            todo = windows(source, frames=self.config.video.frames, stride=every)
             progress = cache(
                 Generator(self.config, networks),
                 source=source,
+                todo=todo,
                 out=out,
-                stride=every,
                 batch_size=BATCH,
                 provenance={
                     "config": self.config.name,
                     "weights": weights.hashes(self.out / "weights"),
                 },
             )
-            todo = len(windows(source, frames=self.config.video.frames, stride=every))
-            for _ in track(progress, f"encoding {split}, by {BATCH}", total=-(-todo // BATCH)):
+            for _ in track(progress, f"encoding {split}", total=len(todo)):
                 pass
         return out

@@ -30,7 +30,7 @@ from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sha
 from egosim_jax.train.optimizer import OptimizerConfig, learning_rate, make_optimizer
 from egosim_jax.train.state import TrainState
 from egosim_jax.train.step import Task, make_update, make_validation
-from egosim_jax.types import InputError
+from egosim_jax.types import check_counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +58,8 @@ class Training:
 
     def __post_init__(self) -> None:
         """Check that every count is positive."""
-        for name in ("steps", "batch_size", "log_every", "save_every", "validate_every"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
+        counts = ("steps", "batch_size", "log_every", "save_every", "validate_every")
+        check_counts({name: getattr(self, name) for name in counts})
 
 
 def train(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from egosim_jax.cli.sheet import Block, draw_sheet
 from egosim_jax.command import DONE
 from egosim_jax.progress import track
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,9 +80,9 @@ class Tabletop:
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
 
-        for name in ("scenes", "seeds", "batch_size"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
+        check_counts(
+            {"--scenes": self.scenes, "--seeds": self.seeds, "--batch-size": self.batch_size}
+        )
         config = configs.get(self.config)
         weights = self.weights or configs.shipped_weights(self.config)
         if weights is None:
@@ -125,12 +125,12 @@ class Tabletop:
         self, generator: Generator, scenes: Sequence[_Scene], hidden: Hidden | None, seed: int
     ) -> list[np.ndarray]:
         """One video of every scene, from noise that differs by scene and seed."""
-        triplets = [scene.triplet for scene in scenes]
-        noise = [1000 * seed + scene.clip.seed for scene in scenes]
+        from egosim_jax.generator import batches
+
         videos = []
-        for first in range(0, len(scenes), self.batch_size):
-            some = slice(first, first + self.batch_size)
-            clips = generator.generate(triplets[some], noise[some], without=hidden)
+        for some in batches(scenes, self.batch_size):
+            noise = [1000 * seed + scene.clip.seed for scene in some]
+            clips = generator.generate([scene.triplet for scene in some], noise, without=hidden)
             videos += [clip.frames for clip in clips]
         return videos
 
@@ -188,11 +188,13 @@ def _baselines(
     """What can be had without a denoiser, and the best that any could give."""
     import numpy as np
 
+    from egosim_jax.generator import batches
+
     triplets = [scene.triplet for scene in scenes]
     ceiling = [
         clip.frames
-        for first in range(0, len(scenes), batch_size)
-        for clip in generator.reconstruct(triplets[first : first + batch_size])
+        for some in batches(triplets, batch_size)
+        for clip in generator.reconstruct(some)
     ]
     truths = [scene.clip.frames for scene in scenes]
     return {

@@ -13,7 +13,7 @@ import tyro
 
 from egosim_jax.command import DONE, PARTIAL
 from egosim_jax.progress import track
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, VideoSpec, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.data.shards import ShardReader
@@ -52,8 +52,7 @@ class Pack:
         from egosim_jax.data.pack import pack
         from egosim_jax.data.shards import sha256
 
-        if self.shard_megabytes < 1:
-            raise InputError(f"--shard-megabytes must be at least 1, not {self.shard_megabytes}.")
+        check_counts({"--shard-megabytes": self.shard_megabytes})
         items = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
         progress = pack(
             items,
@@ -103,22 +102,21 @@ class Encode:
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.generator import Generator, Networks
         from egosim_jax.io.weights import hashes
-        from egosim_jax.train.cache import cache
+        from egosim_jax.train.cache import cache, windows
 
-        for name, value in (("stride", self.stride), ("batch-size", self.batch_size)):
-            if value < 1:
-                raise InputError(f"--{name} must be at least 1, not {value}.")
+        check_counts({"--stride": self.stride, "--batch-size": self.batch_size})
         config, source = configs.get(self.config).at(self.weights), ShardReader(self.shards)
+        todo = windows(source, frames=config.video.frames, stride=self.stride)
         progress = cache(
             Generator(config, Networks.load(config, self.weights)),
             source=source,
+            todo=todo,
             out=self.out,
-            stride=self.stride,
             batch_size=self.batch_size,
             provenance={"config": config.name, "weights": hashes(self.weights)},
             overwrite=self.overwrite,
         )
-        for _ in track(progress, "encoding", total=len(source)):
+        for _ in track(progress, "encoding", total=len(todo)):
             pass
         print(self.out)
         return DONE
@@ -158,8 +156,7 @@ class Make:
         """Make scene after scene."""
         from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
 
-        if self.workers < 1:
-            raise InputError(f"--workers must be at least 1, not {self.workers}.")
+        check_counts({"--workers": self.workers})
         plan = Plan(
             seeds=tuple(range(self.seed, self.seed + self.scenes)),
             clips=self.clips,
@@ -226,9 +223,7 @@ class Look:
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.data.transforms import decode_record
 
-        for name in ("limit", "moments", "width"):
-            if getattr(self, name) < 1:
-                raise InputError(f"--{name} must be at least 1, not {getattr(self, name)}.")
+        check_counts({"--limit": self.limit, "--moments": self.moments, "--width": self.width})
         reader = ShardReader(self.shards)
         if reader.manifest.kind == "latents":
             raise InputError(f"{self.shards} holds latents, not pictures. (--shards)")

@@ -7,7 +7,7 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +16,7 @@ import tyro
 
 from egosim_jax.cli.sheet import Block, draw_sheet
 from egosim_jax.command import DONE, PARTIAL, USAGE
-from egosim_jax.types import Clip, InputError, Triplet
+from egosim_jax.types import Clip, InputError, Triplet, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.data.metadata import ClipFiles
@@ -72,7 +72,9 @@ class Generate:
 
     def run(self) -> int:
         """Check everything, compile, generate."""
-        self._check_counts()
+        check_counts(
+            {"--steps": self.steps, "--batch-size": self.batch_size, "--limit": self.limit}
+        )
         config = self._config()
         items = None if self.metadata is None else self._items(self.metadata)
         self._open(config)
@@ -92,12 +94,6 @@ class Generate:
             self._draw(items, config)
         print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self._folder}", file=sys.stderr)
         return PARTIAL if bad else DONE
-
-    def _check_counts(self) -> None:
-        counts = {"steps": self.steps, "batch-size": self.batch_size, "limit": self.limit}
-        for name, value in counts.items():
-            if value is not None and value < 1:
-                raise InputError(f"--{name} must be at least 1, not {value}.")
 
     def _make_scenes(self, config: ModelConfig) -> Path:
         """Scenes of the tabletop world at the model's size, as files; their metadata."""
@@ -169,6 +165,8 @@ class Generate:
 
     def _generate(self, items: Sequence[_Item], config: ModelConfig) -> list[tuple[_Item, str]]:
         """Generate batch after batch; the items that failed."""
+        from egosim_jax.generator import batches
+
         generator = self._generator(config)
         then = time.monotonic()
         generator.compile(min(self.batch_size, len(items)))
@@ -177,7 +175,7 @@ class Generate:
         bad: list[tuple[_Item, str]] = []
         began, size = time.monotonic(), min(self.batch_size, len(items))
         done = 0
-        for batch in _batches(items, size):
+        for batch in batches(items, size):
             then = time.monotonic()
             loaded, problems = self._load(batch, config)
             bad += problems
@@ -314,11 +312,6 @@ class _Item:
     files: ClipFiles
     start: int
     output_id: str
-
-
-def _batches(items: Sequence[_Item], size: int) -> Iterator[Sequence[_Item]]:
-    for first in range(0, len(items), size):
-        yield items[first : first + size]
 
 
 def _warn_of_long_prompts(items: Sequence[_Item], config: ModelConfig) -> None:

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
 
 REQUIRED = ("ego_prior_video", "hand_keypoint_video", "first_frame", "prompt", "video_id")
 TRUTH = "video"
@@ -123,8 +123,7 @@ def select(
                 raise InputError(f"No clip is called {video_id}.{hint} (--video-id)")
         chosen = [by_id[video_id] for video_id in video_ids]
     if limit is not None:
-        if limit < 1:
-            raise InputError(f"--limit must be at least 1, not {limit}.")
+        check_counts({"--limit": limit})
         chosen = chosen[:limit]
     return chosen
 

@@ -15,6 +15,7 @@ windows that lie within the frame (no border is made up), then over channels and
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,11 @@ def psnr(
             for frame, other in zip(video, reference, strict=True)
         ]
     )
+    return decibels(errors)
+
+
+def decibels(errors: Float[Any, "*n"]) -> Any:
+    """PSNR of mean squared errors, at most `MAX_PSNR`."""
     floor = 255**2 / 10 ** (MAX_PSNR / 10)
     return 10 * np.log10(255**2 / np.maximum(errors, floor))
 

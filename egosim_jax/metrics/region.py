@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 
-from egosim_jax.metrics.image import MAX_PSNR
+from egosim_jax.metrics.image import decibels
 
 SHADES = (0.45, 1.15)
 """Least and greatest light on a surface."""
@@ -66,8 +66,7 @@ def region_psnr(
     """PSNR in dB over the pixels of a region in all frames together; NaN if there are none."""
     if not region.any():
         return float("nan")
-    error = np.square(video[region].astype(np.float64) - truth[region]).mean()
-    return float(min(MAX_PSNR, 10 * np.log10(255**2 / max(error, 1e-12))))
+    return float(decibels(np.square(video[region].astype(np.float64) - truth[region]).mean()))
 
 
 def silhouette_iou(found: Bool[np.ndarray, "f h w"], truth: Bool[np.ndarray, "f h w"]) -> float:

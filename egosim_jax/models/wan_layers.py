@@ -31,7 +31,7 @@ from egosim_jax.models import rope
 from egosim_jax.models.attention import Kernel, attention
 from egosim_jax.models.layers import Axes, Initializer, LayerNorm, Linear, RMSNorm, zeros
 from egosim_jax.models.sinusoid import time_sinusoid
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
 
 PATCH = 2
 """Latent rows and columns of a token; a token has one latent frame."""
@@ -81,9 +81,8 @@ class WanDiTConfig:
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other and the kernel fits the dtype."""
-        for name in ("out_channels", "dim", "ffn_dim", "heads", "layers", "text_dim", "freq_dim"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
+        sizes = ("out_channels", "dim", "ffn_dim", "heads", "layers", "text_dim", "freq_dim")
+        check_counts({name: getattr(self, name) for name in sizes})
         if self.in_channels < self.out_channels:
             raise InputError(
                 f"in_channels {self.in_channels} must hold the {self.out_channels} noisy channels "

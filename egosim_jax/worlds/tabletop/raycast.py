@@ -14,7 +14,7 @@ import numpy as np
 from einops import rearrange, reduce
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import finer, pixel_rays
+from egosim_jax.geometry import finer, pixel_rays, transform
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
 
@@ -55,11 +55,10 @@ class Stage:
         self.placed = list(placed)
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         for item in self.placed:
-            pose, part = item.world_from_part, item.part
-            vertices = part.vertices_m @ pose[:3, :3].T + pose[:3, 3]
+            vertices = transform(item.world_from_part, item.part.vertices_m)
             self.scene.add_triangles(
                 o3d.core.Tensor(vertices.astype(np.float32)),
-                o3d.core.Tensor(part.triangles.astype(np.uint32)),
+                o3d.core.Tensor(item.part.triangles.astype(np.uint32)),
             )
 
     def look(
