@@ -35,7 +35,8 @@ from egosim_jax.models.layers import initialise
 from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
-from egosim_jax.types import Clip, Condition, InputError, Triplet, VideoSpec
+from egosim_jax.rendering.reference import draw_hands
+from egosim_jax.types import Action, Clip, Condition, InputError, Triplet, VideoSpec, View
 
 T = TypeVar("T")
 
@@ -283,6 +284,20 @@ class Generator:
         if bad:
             raise FloatingPointError(f"The latents of {bad} are not finite (NaN or infinity).")
         return self._clips(latents)
+
+    def __call__(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        """The frames of one clip of a simulation (`simulator.Generator`)."""
+        triplet = Triplet(
+            video_id="clip",
+            prompt=action.prompt,
+            prior=view.frames,
+            mask=view.mask,
+            hands=draw_hands(action.joints_m, action.cameras, kind=action.kind)[0],
+            first_frame=first_frame,
+        )
+        return self.generate([triplet], [seed])[0].frames
 
     def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
         """The truth through the autoencoder and back: the best any denoiser could give."""

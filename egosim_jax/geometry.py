@@ -7,10 +7,13 @@ coordinates. A matrix `a_from_b` takes coordinates in b to coordinates in a, so 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+
+from egosim_jax.types import Cameras, InputError
 
 
 def transform(a_from_b: Float[Any, "*#b 4 4"], points: Float[Any, "*#b n 3"]) -> Any:
@@ -77,3 +80,40 @@ def look_at(
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     pose[:3, 3] = eye
     return pose
+
+
+def umeyama(
+    points: Float[np.ndarray, "n 3"],
+    targets: Float[np.ndarray, "n 3"],
+    *,
+    scaled: bool = False,
+    weights: Float[np.ndarray, " n"] | None = None,
+) -> Float[np.ndarray, "4 4"]:
+    """The motion that brings points nearest to their targets in the least squares sense.
+
+    Rotation, translation and, if `scaled`, one positive scale; never a reflection. Source: Umeyama
+    1991, equations 40 to 43. Raises `InputError` if the points do not determine it: fewer than
+    three, or all on one line.
+    """
+    share = np.full(len(points), 1.0) if weights is None else weights
+    share = share / share.sum()
+    middle, aim = share @ points, share @ targets
+    centred, aimed = points - middle, targets - aim
+    u, strength, vt = np.linalg.svd((share[:, None] * aimed).T @ centred)
+    if len(points) < 3 or strength[1] <= 1e-12 * max(strength[0], 1e-300):
+        raise InputError(
+            f"{len(points)} points do not determine a motion: it takes three that are not in line."
+        )
+    signs = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    motion = np.eye(4)
+    motion[:3, :3] = (u * signs) @ vt
+    if scaled:
+        motion[:3, :3] *= (strength * signs).sum() / (share @ np.square(centred).sum(axis=1))
+    motion[:3, 3] = aim - motion[:3, :3] @ middle
+    return motion
+
+
+def beside(cameras: Cameras, world_from_object: Float[np.ndarray, "f 4 4"]) -> Cameras:
+    """The cameras in the coordinates of a thing that moves."""
+    poses = invert(world_from_object) @ cameras.world_from_camera
+    return replace(cameras, world_from_camera=poses)

@@ -19,15 +19,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, no_type_check
+from typing import Any, Literal, no_type_check
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 TEMPORAL_STRIDE = 4
 """Pixel frames per latent frame, after the first."""
 SPATIAL_STRIDE = 8
 """Pixels per latent cell, along each axis."""
+Kind = Literal["human", "robot"]
+"""Whose hands: 21 keypoints, or a gripper's three."""
 
 
 class InputError(ValueError):
@@ -165,3 +167,97 @@ class Clip:
 
     frames: UInt8[np.ndarray, "f h w 3"]
     fps: int
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class SceneState:
+    """The 3D memory: coloured points in the world, and what is known of each."""
+
+    points_m: Float32[np.ndarray, "n 3"]
+    """In the world."""
+    colours: UInt8[np.ndarray, "n 3"]
+    object_ids: Int32[np.ndarray, " n"]
+    """The thing that each point belongs to; 0 is the background."""
+    last_seen: Int32[np.ndarray, " n"]
+    """The step at which each point was last seen."""
+    intrinsics_px: Float[np.ndarray, "3 3"]
+    """Of the camera that the scene is looked at with."""
+    step: int = 0
+    """Clips that the state has seen."""
+    names: Mapping[int, str] = field(default_factory=dict)
+    """What the things are called, by id."""
+    world_from_object: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    """Where each thing that has moved is now; an object's own coordinates are the world's when it
+    was first seen."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Where the state comes from."""
+
+    def __post_init__(self) -> None:
+        """Check that there are points, all finite, and as much of everything as of points."""
+        count = len(self.points_m)
+        for name in ("colours", "object_ids", "last_seen"):
+            if len(getattr(self, name)) != count:
+                raise InputError(
+                    f"A state of {count} points has {len(getattr(self, name))} {name}: there must "
+                    "be one for each point."
+                )
+        if not count:
+            raise InputError("A state without points shows nothing: it needs at least one.")
+        finite = np.isfinite(self.points_m).all(axis=1)
+        if not finite.all():
+            raise InputError(
+                f"Point {int(np.argmin(finite))} of the state is not finite: "
+                f"{self.points_m[np.argmin(finite)]}."
+            )
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Action:
+    """What the wearer does in a clip."""
+
+    cameras: Cameras
+    """The head's path."""
+    joints_m: Float[np.ndarray, "f n j 3"]
+    """Of n hands, in the world; a hand with a joint that is not finite is missing."""
+    kind: Kind
+    """Whose hands."""
+    prompt: str
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """A state seen along a camera path."""
+
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """Black where no point is seen."""
+    mask: UInt8[np.ndarray, "f h w"]
+    """255 where nothing was observed, 0 where something was."""
+    depth_m: Float32[np.ndarray, "f h w"]
+    """Infinite where no point is seen."""
+    object_ids: Int32[np.ndarray, "f h w"]
+    """The thing that each pixel sees; 0 for the background and where nothing is seen."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Perceived:
+    """What was read from a clip: everything in the world, frame by frame."""
+
+    step: int
+    """Number of the clip, from 1."""
+    frames: UInt8[np.ndarray, "f h w 3"]
+    cameras: Cameras
+    depth_m: Float32[np.ndarray, "f h w"]
+    """Infinite where it is unknown."""
+    object_ids: Int32[np.ndarray, "f h w"]
+    """0 for the background; negative for hands and arms, one id a part, which never enter the
+    state."""
+    names: Mapping[int, str]
+    """What the things are called, by id."""
+    world_from_object: Mapping[int, Float[np.ndarray, "f 4 4"]]
+    """Poses of the things that were tracked; the first is that in the state before."""
+    touched: Mapping[int, Bool[np.ndarray, " f"]]
+    """For each thing that hands acted on, the frames in which they did."""

@@ -1,4 +1,4 @@
-"""`egosim`: generate clips, compare them with the truth, prepare data."""
+"""`egosim`: generate clips, simulate a world, compare with the truth, prepare data."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import tyro
 
 from egosim_jax import command
 from egosim_jax.cli.ablation import Tabletop
+from egosim_jax.cli.continuous import Continuous
 from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
+from egosim_jax.cli.simulate import Simulate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +43,7 @@ class Experiment:
 
     command: (
         Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
+        | Annotated[Continuous, tyro.conf.subcommand("continuous")]
         | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
         | Annotated[Debug, tyro.conf.subcommand("debug")]
     )
@@ -52,6 +55,7 @@ class Experiment:
 
 Commands = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]

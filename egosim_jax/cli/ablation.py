@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from egosim_jax.generator import Generator
-    from egosim_jax.rendering.skeleton import Kind
-    from egosim_jax.types import Triplet, VideoSpec
+    from egosim_jax.types import Kind, Triplet, VideoSpec
     from egosim_jax.worlds.tabletop import TabletopClip
 
 Hidden = Literal["prior", "mask", "hands"]

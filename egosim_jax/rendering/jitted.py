@@ -22,9 +22,8 @@ from egosim_jax.rendering.skeleton import (
     JOINT_RADIUS_M,
     NEAR_M,
     SKELETONS,
-    Kind,
 )
-from egosim_jax.types import Cameras
+from egosim_jax.types import Cameras, Kind
 
 
 def splat(

@@ -19,9 +19,8 @@ from egosim_jax.rendering.skeleton import (
     JOINT_RADIUS_M,
     NEAR_M,
     SKELETONS,
-    Kind,
 )
-from egosim_jax.types import Cameras
+from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
 
 
 def splat(
@@ -85,6 +84,25 @@ def unobserved(
         for right in range(3):
             wide |= padded[:, down : down + height, right : right + width]
     return np.where(wide, 0, 255).astype(np.uint8)
+
+
+def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
+    """A state along a camera path: Π of EgoSim's section 3.2, as the memory is drawn.
+
+    Raises `InputError` if the first frame shows no point.
+    """
+    depth_m, index = splat(state.points_m, cameras, point_px=point_px)
+    if (index[0] < 0).all():
+        raise InputError(
+            f"None of the {len(state.points_m)} points of the scene is seen in the first frame: "
+            "the camera must look at the scene, from 1 cm to 100 m away."
+        )
+    return View(
+        frames=paint(index, state.colours, gamma=False),
+        mask=unobserved(index, dilate=True),
+        depth_m=depth_m,
+        object_ids=np.append(state.object_ids, np.int32(0))[index],
+    )
 
 
 def draw_hands(

@@ -8,11 +8,10 @@ gripper's opening.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-Kind = Literal["human", "robot"]
+from egosim_jax.types import Kind
 
 JOINT_RADIUS_M = 0.0055
 """Of the sphere at a joint: measured on the published videos, give or take a fifth."""

@@ -8,20 +8,20 @@ before.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import finer, look_at, pixel_rays, transform
-from egosim_jax.rendering.reference import draw_hands, paint, splat, unobserved
-from egosim_jax.rendering.skeleton import Kind
-from egosim_jax.types import Cameras, InputError, Triplet, VideoSpec
+from egosim_jax.perception.oracle import Truth
+from egosim_jax.rendering.reference import draw_hands, render
+from egosim_jax.types import Action, Cameras, Kind, SceneState, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, Stage
-from egosim_jax.worlds.tabletop.scene import FIRST_HAND, Scene, make_scene
+from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene, make_scene
 
 FIELD_OF_VIEW = 66.0
 """Degrees, across."""
@@ -55,10 +55,8 @@ class TabletopClip:
     """RGB of everything by its id in `ids`, in full light."""
     first: Picture
     """The first frame without hands."""
-    points_m: Float32[np.ndarray, "n 3"]
-    """The scene as its first frame shows it without hands, in the world."""
-    colours: UInt8[np.ndarray, "n 3"]
-    """Of the points."""
+    state: SceneState
+    """The scene as its first frame shows it without hands, a moving part and its case apart."""
 
 
 def make_sequence(
@@ -131,7 +129,7 @@ def _clip(
             target = moment.scene.number(intent.name)
             placed = [x for x in placed if x.number < FIRST_HAND and x.number != target]
         pictures.append(_look(Stage(placed), pose, cameras))
-    first, points, colours = _scene_points(moments[0].scene, cameras)
+    first, state = _first_look(moments[0].scene, cameras)
     who = f"The {moments[0].hands[0].side} hand" if kind == "human" else "The gripper"
     return TabletopClip(
         seed=seed,
@@ -149,8 +147,7 @@ def _clip(
         body_ids=_numbers(moments[0].scene),
         paints=paints,
         first=first,
-        points_m=points,
-        colours=colours,
+        state=replace(state, step=number, provenance={"world": "tabletop", "seed": str(seed)}),
     )
 
 
@@ -170,10 +167,8 @@ def _numbers(scene: Scene) -> dict[str, int]:
     return {body.name: scene.number(body.name) for body in scene.bodies}
 
 
-def _scene_points(
-    scene: Scene, cameras: Cameras
-) -> tuple[Picture, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """The first frame without hands, and the points of a finer picture of it in the world."""
+def _first_look(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
+    """The first frame without hands, and the points of a finer picture of it."""
     stage, pose = Stage(scene.placed()), cameras.world_from_camera[0]
     first = _look(stage, pose, cameras)
     intrinsics = finer(cameras.intrinsics_px, FINER)
@@ -182,30 +177,50 @@ def _scene_points(
     seen = np.isfinite(fine.depth_m)
     rays = pixel_rays(intrinsics, height=height, width=width)
     points = transform(pose, rays[seen] * fine.depth_m[seen][:, None])
-    return first, points.astype(np.float32), fine.colours[seen]
+    ids = fine.ids[seen].astype(np.int32)
+    return first, SceneState(
+        points_m=points.astype(np.float32),
+        colours=fine.colours[seen],
+        object_ids=np.where(ids < FIRST_BODY, 0, ids).astype(np.int32),
+        last_seen=np.zeros(len(points), np.int32),
+        intrinsics_px=cameras.intrinsics_px,
+        names=scene.names(),
+    )
 
 
 def to_triplet(clip: TabletopClip) -> Triplet:
-    """The clip in EgoSim's format: prior and mask from the points, hands as skeletons.
+    """The clip in EgoSim's format: prior and mask from the state, hands as skeletons.
 
     What leaves the view, hands and things, is simply not seen there. A first frame without any
     point raises `InputError`.
     """
-    _, index = splat(clip.points_m, clip.cameras, point_px=POINT_PX)
-    if (index[0] < 0).all():
-        raise InputError(
-            f"None of the {len(clip.points_m)} points of the scene is seen in the first frame: the "
-            "camera must look at the scene, from 1 cm to 100 m away."
-        )
+    view = render(clip.state, clip.cameras, point_px=POINT_PX)
     hands, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
     name = f"tabletop_{clip.kind}_{clip.seed}_{clip.number}"
     return Triplet(
         video_id=name,
         prompt=clip.caption,
-        prior=paint(index, clip.colours, gamma=False),
-        mask=unobserved(index, dilate=True),
+        prior=view.frames,
+        mask=view.mask,
         hands=hands,
         first_frame=clip.first.colours,
         truth=clip.frames,
         extra={"verb": clip.verb, "target": clip.target, "kind": clip.kind},
+    )
+
+
+def to_action(clip: TabletopClip) -> Action:
+    """What the wearer does in the clip."""
+    return Action(cameras=clip.cameras, joints_m=clip.joints_m, kind=clip.kind, prompt=clip.caption)
+
+
+def to_truth(clip: TabletopClip) -> Truth:
+    """What perception should find in the clip."""
+    ids = np.where(clip.ids >= FIRST_HAND, FIRST_HAND - 1 - clip.ids, clip.ids)
+    return Truth(
+        cameras=clip.cameras,
+        depth_m=clip.depth_m,
+        object_ids=np.where((ids > 0) & (ids < FIRST_BODY), 0, ids).astype(np.int32),
+        names=clip.state.names,
+        world_from_body={clip.body_ids[n]: path for n, path in clip.world_from_body.items()},
     )

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import turned
-from egosim_jax.rendering.skeleton import Kind
+from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Body, Part
 from egosim_jax.worlds.tabletop.hands import Side, closure_for, flesh, joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import Scene, moving_part

@@ -13,8 +13,7 @@ from typing import Literal
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
 from egosim_jax.io.run import open_folder
-from egosim_jax.rendering.skeleton import Kind
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 

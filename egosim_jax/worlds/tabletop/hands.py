@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.rendering.skeleton import SKELETONS, Kind
+from egosim_jax.rendering.skeleton import SKELETONS
+from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Paint, Part, join, mesh
 
 Side = Literal["left", "right"]

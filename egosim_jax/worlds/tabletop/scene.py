@@ -70,6 +70,15 @@ class Scene:
         """The id in the pictures of a body, or of its moving part."""
         return FIRST_BODY + 2 * [body.name for body in self.bodies].index(name)
 
+    def names(self) -> dict[int, str]:
+        """What the ids of bodies mean; an articulated body's case has one of its own."""
+        found = {}
+        for body in self.bodies:
+            found[self.number(body.name)] = body.name
+            if body.articulated:
+                found[self.number(body.name) + 1] = f"case of the {body.name}"
+        return found
+
     def first_part_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
         """Where a body is or, if it is articulated, its moving part."""
         body = self.body(name)

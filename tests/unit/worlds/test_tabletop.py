@@ -172,9 +172,10 @@ def test_a_camera_inside_a_thing_is_refused():
 
 
 def test_a_scene_that_nobody_sees_is_refused(clips):
-    behind = replace(clips[0], points_m=clips[0].points_m - np.array([0, 9, 0], np.float32))
+    state = clips[0].state
+    behind = replace(state, points_m=state.points_m - np.array([0, 9, 0], np.float32))
     with pytest.raises(InputError, match="None of the"):
-        to_triplet(behind)
+        to_triplet(replace(clips[0], state=behind))
 
 
 def test_hands_and_things_may_leave_the_view(clips):

@@ -1,0 +1,225 @@
+"""`egosim simulate`: several clips in a row, each in the world that the last one left."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from egosim_jax.cli.sheet import Block, draw_sheet
+from egosim_jax.command import DONE
+from egosim_jax.types import InputError, check_counts
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egosim_jax.perception import Perception
+    from egosim_jax.simulator import Step
+    from egosim_jax.types import Action, Clip, Perceived, SceneState
+    from egosim_jax.worlds.tabletop import TabletopClip
+
+SHEET_MOMENTS = (0, 3, 6, 9, 12, 16)
+Backend = Literal["classical", "oracle"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Act several times in a scene of the tabletop world, which remembers what was done.
+
+    Each clip is generated from a view of the state, read back, and fused into it. Writes for each
+    clip clip_N.mp4 and clip_N_cmp.mp4 (view | hands | generated | truth), the states before and
+    after as PLY, contact_sheet.png and report.json. An interrupted run goes on where it stopped.
+    """
+
+    config: str = "tabletop"
+    """Name of the model."""
+    clips: int = 3
+    """How many."""
+    seed: int = 0
+    """Of the scene, what is done in it, and the noise."""
+    perception: Backend = "classical"
+    """What reads the clips: without network weights, or told the truth."""
+    update: Literal["full", "none"] = "full"
+    """Whether the state learns from the clips, or stays as it was before the first."""
+    robot: bool = False
+    """The hands are a robot's gripper."""
+    first_frame: Path | None = None
+    """Image that the first clip begins with; else the scene without hands."""
+    out: Path | None = None
+    """Folder to write to; runs/simulate_SEED if not given."""
+    weights: Path | None = None
+    """Folder of weights, if not those that come with the package."""
+
+    def run(self) -> int:
+        """Simulate, measure, draw."""
+        from egosim_jax import configs
+        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.io.run import open_folder, write_json
+        from egosim_jax.io.weights import hashes
+        from egosim_jax.simulator import Simulator
+        from egosim_jax.worlds.tabletop import make_sequence, to_action
+
+        check_counts({"--clips": self.clips})
+        config = configs.get(self.config)
+        weights = self.weights or configs.shipped_weights(self.config)
+        if weights is None:
+            raise InputError(f"{self.config} comes without weights. (--weights FOLDER)")
+        folder = self.out or Path("runs") / f"simulate_{self.seed}"
+        open_folder(folder, {"simulate": self, "model": config, "weights": hashes(weights)})
+        kind = "robot" if self.robot else "human"
+        truth = list(make_sequence(self.seed, spec=config.video, clips=self.clips, kind=kind))
+        simulator = Simulator(
+            generator=Generator(config.at(weights), Networks.load(config, weights)),
+            perception=None if self.update == "none" else backend(self.perception, truth),
+            fps=config.video.fps,
+        )
+        steps = simulator.run(
+            truth[0].state,
+            [to_action(clip) for clip in truth],
+            out=folder,
+            seed=self.seed,
+            first_frame=self._image(truth[0]),
+        )
+        _write_state(folder / "state_0.ply", truth[0].state)
+        report, blocks = [], []
+        then = time.monotonic()
+        for clip, step in zip(truth, steps, strict=True):
+            report.append({"clip": clip.number + 1, "action": clip.caption, **score(step, clip)})
+            blocks.append(_write(folder, clip, step))
+            print(folder / f"clip_{clip.number + 1}.mp4")
+            print(
+                f"clip {clip.number + 1}/{self.clips}: {clip.caption} "
+                f"({time.monotonic() - then:.1f} s)",
+                file=sys.stderr,
+            )
+            then = time.monotonic()
+        write_json(folder / "report.json", {"definitions": DEFINITIONS, "clips": report})
+        draw_sheet(blocks, folder / "contact_sheet.png", moments=SHEET_MOMENTS)
+        _print(report)
+        print(folder / "contact_sheet.png")
+        return DONE
+
+    def _image(self, clip: TabletopClip) -> np.ndarray:
+        if self.first_frame is None:
+            return clip.first.colours
+        from egosim_jax.io.video import read_image
+
+        image = read_image(self.first_frame)
+        if image.shape != clip.first.colours.shape:
+            raise InputError(
+                f"{self.first_frame} is {image.shape}, the clips are {clip.first.colours.shape}. "
+                "(--first-frame)"
+            )
+        return image
+
+
+def backend(name: Backend, truth: Sequence[TabletopClip]) -> Perception:
+    """The perception of that name, for a sequence whose truth is known."""
+    if name == "oracle":
+        return Told(truth)
+    from egosim_jax.perception.classical import Classical
+
+    return Classical()
+
+
+@dataclass(frozen=True)
+class Told:
+    """Perception that knows the truth of every clip of a sequence."""
+
+    truth: Sequence[TabletopClip]
+
+    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
+        """The truth of the clip after so many steps."""
+        from egosim_jax.perception.oracle import oracle
+        from egosim_jax.worlds.tabletop import to_truth
+
+        return oracle(to_truth(self.truth[state.step]))(clip, action, state)
+
+
+MEASURES = {
+    "psnr": ("PSNR dB", "{:.2f}"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "region_psnr": ("region PSNR dB", "{:.2f}"),
+    "prior_psnr": ("PSNR of the view dB", "{:.2f}"),
+    "depth_error": ("depth error %", "{:.2f}"),
+    "camera_error": ("camera error mm", "{:.1f}"),
+}
+DEFINITIONS = {
+    "psnr, ssim": "of the generated clip against the true one, without frame 0, as in evaluate",
+    "region_psnr": "the same over the pixels where the truth shows a hand or the thing acted on",
+    "prior_psnr": "of the view of the state, copied, against the true clip",
+    "depth_error": "mean |depth - truth| / truth in percent: the state after the clip, seen from "
+    "the clip's last camera, against the true depth there, without hands",
+    "camera_error": "root mean square distance in mm between where the generated frames were seen "
+    "from (flow from the true frames, PnP with their depth) and the true cameras",
+}
+
+
+def score(step: Step, clip: TabletopClip) -> dict[str, float]:
+    """Every measure of one step."""
+    import numpy as np
+
+    from egosim_jax.metrics.depth import coverage, depth_error
+    from egosim_jax.metrics.region import region_psnr
+    from egosim_jax.metrics.report import score as compare
+    from egosim_jax.rendering.reference import render
+    from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+
+    video, truth, ids = step.clip.frames[1:], clip.frames[1:], clip.ids
+    whole = compare(video, truth)
+    acted = (ids >= FIRST_HAND) | (ids == clip.body_ids[clip.target])
+    after = render(step.state, clip.cameras, point_px=2)
+    bare = np.zeros_like(acted)
+    bare[-1] = ids[-1] < FIRST_HAND
+    return {
+        "psnr": whole.psnr,
+        "ssim": whole.ssim,
+        "region_psnr": region_psnr(video, truth, acted[1:]),
+        "prior_psnr": compare(step.view.frames[1:], truth).psnr,
+        "depth_error": depth_error(after.depth_m, clip.depth_m, bare),
+        "depth_known": coverage(after.depth_m, bare),
+        "camera_error": _camera_error(step.clip.frames, clip, ~acted),
+    }
+
+
+def _camera_error(frames: np.ndarray, clip: TabletopClip, still: np.ndarray) -> float:
+    from egosim_jax.metrics.trajectory import camera_errors, seen_from
+
+    path = seen_from(frames, clip.frames, clip.depth_m, still, clip.cameras)
+    return 1000 * camera_errors(path, clip.cameras.world_from_camera)[0]
+
+
+def _write(folder: Path, clip: TabletopClip, step: Step) -> Block:
+    """The videos and the state of one step; its part of the contact sheet."""
+    import numpy as np
+
+    from egosim_jax.io.video import write_video
+    from egosim_jax.rendering.reference import draw_hands
+
+    hands = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)[0]
+    shown = [step.view.frames, hands, step.clip.frames, clip.frames]
+    name = f"clip_{clip.number + 1}"
+    write_video(folder / f"{name}.mp4", step.clip.frames, step.clip.fps)
+    write_video(folder / f"{name}_cmp.mp4", np.concatenate(shown, axis=2), step.clip.fps)
+    _write_state(folder / f"state_{clip.number + 1}.ply", step.state)
+    return Block(f"{clip.number + 1}: {clip.caption}   (view, hands, generated, truth)", shown)
+
+
+def _write_state(path: Path, state: SceneState) -> None:
+    from egosim_jax.state.snapshot import write_ply
+
+    write_ply(path, state)
+
+
+def _print(report: Sequence[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("clip", "action", *(name for name, _ in MEASURES.values()))
+    for line in report:
+        cells = [form.format(line[name]) for name, (_, form) in MEASURES.items()]
+        table.add_row(str(line["clip"]), line["action"], *cells)
+    Console(width=160).print(table)

@@ -1,0 +1,67 @@
+"""Where a video was seen from, for true frames taken for one another."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import look_at
+from egosim_jax.metrics.trajectory import camera_errors, seen_from
+from egosim_jax.types import VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence
+from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+
+
+def path(count=5):
+    eyes = [np.array([0.1 * k, -0.4, 0.5]) for k in range(count)]
+    return np.stack([look_at(eye, np.zeros(3), up=np.array([0, 0, 1.0])) for eye in eyes])
+
+
+def test_position_and_rotation_errors_are_root_mean_squares():
+    found = path()
+    found[2, :3, 3] += found[2, :3, :3] @ [0, 0, 0.06]
+    metres, degrees = camera_errors(found, path())
+    assert metres == pytest.approx(0.06 / np.sqrt(5))
+    assert degrees == pytest.approx(0, abs=1e-5)
+    found = path()
+    turn = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
+    found[3, :3, :3] = found[3, :3, :3] @ turn
+    assert camera_errors(found, path())[1] == pytest.approx(90 / np.sqrt(5))
+
+
+def test_lost_frames_do_not_count():
+    found = path()
+    found[1] = np.nan
+    np.testing.assert_allclose(camera_errors(found, path()), (0, 0), atol=1e-5)
+    assert np.isnan(camera_errors(np.full((5, 4, 4), np.nan), path())).all()
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return next(make_sequence(5, spec=VideoSpec(frames=9, height=96, width=160, fps=8)))
+
+
+def still(clip):
+    return ~((clip.ids >= FIRST_HAND) | (clip.ids == clip.body_ids[clip.target]))
+
+
+def test_the_true_video_was_seen_from_the_true_cameras(clip):
+    found = seen_from(clip.frames, clip.frames, clip.depth_m, still(clip), clip.cameras)
+    metres, degrees = camera_errors(found, clip.cameras.world_from_camera)
+    assert metres < 1e-6
+    assert degrees < 1e-4
+
+
+def test_a_video_from_elsewhere_was_seen_from_there(clip):
+    """Each frame is taken for the one after it."""
+    late = np.concatenate([clip.frames[1:], clip.frames[-1:]])
+    truth = clip.cameras.world_from_camera
+    found = seen_from(late, clip.frames, clip.depth_m, still(clip), clip.cameras)[:-1]
+    moved, _ = camera_errors(truth[1:], truth[:-1])
+    off, _ = camera_errors(found, truth[1:])
+    assert off < moved / 2
+    assert moved > 0.01
+
+
+def test_a_video_without_features_was_seen_from_nowhere(clip):
+    grey = np.full_like(clip.frames, 128)
+    found = seen_from(clip.frames, grey, clip.depth_m, np.zeros_like(still(clip)), clip.cameras)
+    assert np.isnan(found).all()

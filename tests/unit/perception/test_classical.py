@@ -1,0 +1,80 @@
+"""Classical perception of true frames: what was carried, where it ended, what came to light."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import transform
+from egosim_jax.perception.classical import Classical, flesh
+from egosim_jax.perception.oracle import oracle
+from egosim_jax.state.fuse import fuse
+from egosim_jax.types import Clip, VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_action, to_truth
+from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+
+SPEC = VideoSpec(frames=17, height=96, width=160, fps=8)
+SEEDS = (0, 1)
+
+
+@pytest.fixture(scope="module", params=SEEDS)
+def clip(request):
+    return next(make_sequence(request.param, spec=SPEC))
+
+
+@pytest.fixture(scope="module")
+def found(clip):
+    return Classical()(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
+
+
+def test_the_thing_that_was_carried_is_found(clip, found):
+    assert set(found.world_from_object) == {clip.body_ids[clip.target]}
+
+
+def test_its_points_end_within_a_centimetre_of_where_it_is(clip, found):
+    target = clip.body_ids[clip.target]
+    points = clip.state.points_m[clip.state.object_ids == target].astype(float)
+    true = oracle(to_truth(clip))(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
+    here = transform(found.world_from_object[target][-1], points)
+    there = transform(true.world_from_object[target][-1], points)
+    gaps = np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)
+    assert np.percentile(gaps, 95) < 0.01
+    assert np.linalg.norm(there.mean(axis=0) - points.mean(axis=0)) > 0.1
+
+
+def test_where_it_stood_the_table_comes_to_light(clip, found):
+    bared = np.isfinite(found.depth_m[-1]) & (found.object_ids[-1] == 0)
+    assert bared.any()
+    truth = clip.depth_m[-1][bared]
+    assert np.median(np.abs(found.depth_m[-1][bared] - truth)) < 0.005
+
+
+def test_what_agrees_with_the_state_stays_unknown(clip, found):
+    assert np.isfinite(found.depth_m).mean() < 0.1
+
+
+def test_flesh_covers_the_hands(clip):
+    covered = flesh(to_action(clip)) >= 0
+    hands = clip.ids >= FIRST_HAND
+    assert (covered & hands).sum() / hands.sum() > 0.9
+    assert covered.mean() < 3 * hands.mean()
+
+
+def test_a_clip_in_which_nothing_moves_changes_nothing(clip):
+    still = np.repeat(clip.first.colours[None], SPEC.frames, axis=0)
+    cameras = clip.cameras
+    action = to_action(clip)
+    poses = np.repeat(cameras.world_from_camera[:1], SPEC.frames, axis=0)
+    action = replace(action, cameras=replace(cameras, world_from_camera=poses))
+    found = Classical()(Clip(frames=still, fps=8), action, clip.state)
+    assert not found.world_from_object
+    after = fuse(clip.state, found)
+    assert len(after.points_m) == len(clip.state.points_m)
+
+
+def test_without_hands_nothing_is_found(clip):
+    action = to_action(clip)
+    missing = replace(action, joints_m=np.full_like(action.joints_m, np.nan))
+    found = Classical()(Clip(frames=clip.frames, fps=8), missing, clip.state)
+    assert not found.world_from_object
+    assert not np.isfinite(found.depth_m).any()

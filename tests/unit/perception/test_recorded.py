@@ -1,0 +1,118 @@
+"""Artefacts in the official layout, written here by hand, come back as what they say."""
+
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from egosim_jax.geometry import look_at, transform
+from egosim_jax.perception.recorded import IDS_A_STEP, Recorded
+from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
+
+FRAMES, HEIGHT, WIDTH = 5, 6, 8
+INTRINSICS = np.array([[9.0, 0, 3.5], [0, 9, 2.5], [0, 0, 1]])
+
+
+def path():
+    eyes = [np.array([0.1 * k, -0.4, 0.5 + 0.02 * k**2]) for k in range(FRAMES)]
+    return np.stack([look_at(eye, np.zeros(3), up=np.array([0, 0, 1.0])) for eye in eyes])
+
+
+def motion(scale=1.0):
+    matrix = look_at(np.array([0.3, 0.2, 0.1]), np.ones(3), up=np.array([0, 1.0, 0]))
+    matrix[:3, :3] *= scale
+    return matrix
+
+
+def asked(step=0):
+    cameras = Cameras(
+        world_from_camera=path(), intrinsics_px=INTRINSICS, height=HEIGHT, width=WIDTH
+    )
+    action = Action(
+        cameras=cameras, joints_m=np.full((FRAMES, 1, 21, 3), np.nan), kind="human", prompt=""
+    )
+    state = SceneState(
+        points_m=np.zeros((1, 3), np.float32),
+        colours=np.zeros((1, 3), np.uint8),
+        object_ids=np.zeros(1, np.int32),
+        last_seen=np.zeros(1, np.int32),
+        intrinsics_px=INTRINSICS,
+        step=step,
+    )
+    frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
+    return Clip(frames=frames, fps=8), action, state
+
+
+def write(folder: Path, *, scale=1.0, frames=FRAMES, depth=0.5):
+    """What a reconstruction in coordinates and units of its own would have left."""
+    for kind in ("pose", "intrinsics", "depth", "mask"):
+        (folder / kind).mkdir(exist_ok=True)
+    there = path()
+    inverse = np.linalg.inv(motion(scale))
+    there[:, :3, 3] = transform(inverse, there[:, :3, 3])
+    there[:, :3, :3] = scale * inverse[:3, :3] @ there[:, :3, :3]
+    numbers = np.arange(frames)
+    np.savez(folder / "pose" / "clip.npz", data=there[:frames], inds=numbers)
+    lenses = np.tile([9.0, 9, 3.5, 2.5], (frames, 1))
+    np.savez(folder / "intrinsics" / "clip.npz", data=lenses, inds=numbers)
+    pixels = np.full((HEIGHT, WIDTH), depth / scale, np.float16)
+    pixels[0, 0], pixels[0, 1] = 0, np.nan
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": pixels}).write(str(folder / "one.exr"))
+    ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+    ids[2], ids[3], ids[4] = 1, 2, 3
+    cv2.imwrite(str(folder / "one.png"), ids)
+    for kind, ending in (("depth", "exr"), ("mask", "png")):
+        with zipfile.ZipFile(folder / kind / "clip.zip", "w") as archive:
+            for number in range(frames):
+                archive.write(folder / f"one.{ending}", f"{number:05d}.{ending}")
+    (folder / "mask" / "clip.txt").write_text("1: red cup\n2: left hand\n3: sky\n")
+
+
+@pytest.mark.parametrize(
+    ("alignment", "scale"), [("orientations", 1.0), ("orientations and scale", 0.5)]
+)
+def test_cameras_and_depth_come_into_the_world(tmp_path, alignment, scale):
+    write(tmp_path, scale=scale)
+    found = Recorded(folder=tmp_path, name="clip", alignment=alignment).backends()(*asked())
+    np.testing.assert_allclose(found.cameras.world_from_camera, path(), atol=1e-9)
+    np.testing.assert_allclose(found.cameras.intrinsics_px, INTRINSICS)
+    assert np.isinf(found.depth_m[:, 0, :2]).all()
+    np.testing.assert_allclose(found.depth_m[:, 1:], 0.5, rtol=1e-3)
+
+
+def test_hands_are_negative_and_things_have_numbers_of_their_step(tmp_path):
+    write(tmp_path)
+    found = Recorded(folder=tmp_path, name="clip").backends()(*asked(step=2))
+    assert (found.object_ids[:, 2] == 3 * IDS_A_STEP + 1).all()
+    assert (found.object_ids[:, 3] < 0).all()
+    assert (found.object_ids[:, 4] == 0).all()
+    assert found.names[3 * IDS_A_STEP + 1] == "red cup"
+    assert "left hand" not in found.names.values()
+    assert found.step == 3
+
+
+def test_what_is_missing_or_damaged_is_named(tmp_path):
+    write(tmp_path)
+    read = Recorded(folder=tmp_path, name="clip").backends()
+    (tmp_path / "depth" / "clip.zip").write_bytes(b"not an archive")
+    with pytest.raises(InputError, match=r"clip\.zip is damaged"):
+        read(*asked())
+    (tmp_path / "pose" / "clip.npz").unlink()
+    with pytest.raises(InputError, match=r"pose/clip\.npz is not there"):
+        read(*asked())
+
+
+def test_another_number_of_frames_is_named(tmp_path):
+    write(tmp_path, frames=4)
+    with pytest.raises(InputError, match="is for 4 frames, the clip has 5"):
+        Recorded(folder=tmp_path, name="clip").backends()(*asked())
+
+
+def test_a_phrase_without_an_id_is_named(tmp_path):
+    write(tmp_path)
+    (tmp_path / "mask" / "clip.txt").write_text("red cup\n")
+    with pytest.raises(InputError, match="`id: phrase`"):
+        Recorded(folder=tmp_path, name="clip").backends()(*asked())

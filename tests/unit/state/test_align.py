@@ -1,0 +1,123 @@
+"""Alignment against motions that are known, with wrong pairs among the right ones."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egosim_jax.geometry import transform, umeyama
+from egosim_jax.state.align import align_cameras, align_points, refine
+from egosim_jax.types import InputError
+
+
+def motion(scale=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * Rotation.random(rng=rng).as_matrix()
+    matrix[:3, 3] = rng.normal(size=3)
+    return matrix
+
+
+def cloud(count=40, seed=1):
+    return np.random.default_rng(seed).normal(size=(count, 3))
+
+
+@pytest.mark.parametrize(("scaled", "scale"), [(False, 1.0), (True, 1.0), (True, 0.3)])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_known_motion_is_found_exactly(scaled, scale, seed):
+    truth = motion(scale, seed)
+    found = umeyama(cloud(), transform(truth, cloud()), scaled=scaled)
+    np.testing.assert_allclose(found, truth, atol=1e-10)
+
+
+def test_rotations_agree_with_scipys_solution_on_noisy_points():
+    points, targets = cloud(), transform(motion(), cloud()) + 0.1 * cloud(seed=2)
+    weights = np.random.default_rng(3).uniform(0.1, 1, len(points))
+    found = umeyama(points, targets, weights=weights)
+    share = weights[:, None] / weights.sum()
+    middle, aim = (share * points).sum(axis=0), (share * targets).sum(axis=0)
+    other = Rotation.align_vectors(targets - aim, points - middle, weights=weights)[0]
+    np.testing.assert_allclose(found[:3, :3], other.as_matrix(), atol=1e-10)
+    np.testing.assert_allclose(found[:3, 3], aim - other.apply(middle), atol=1e-10)
+
+
+def test_the_scale_of_noisy_points_is_the_best_one():
+    points, targets = cloud(), transform(motion(0.5), cloud()) + 0.05 * cloud(seed=2)
+
+    def error(matrix):
+        return np.square(transform(matrix, points) - targets).sum()
+
+    found = umeyama(points, targets, scaled=True)
+    for factor in (0.999, 1.001):
+        other = found.copy()
+        other[:3, :3] *= factor
+        other[:3, 3] = targets.mean(axis=0) - other[:3, :3] @ points.mean(axis=0)
+        assert error(found) < error(other)
+
+
+def test_a_mirror_image_is_answered_with_a_rotation():
+    found = umeyama(cloud(), cloud() * [1, 1, -1])
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("points", [cloud(2), np.outer(np.arange(5.0), [1, 2, 3])])
+def test_too_few_points_or_points_in_line_are_refused(points):
+    with pytest.raises(InputError, match="three that are not in line"):
+        umeyama(points, points)
+
+
+@pytest.mark.parametrize(("freedom", "scale"), [("rigid", 1.0), ("similarity", 2.5)])
+def test_a_third_of_wrong_pairs_changes_nothing(freedom, scale):
+    truth, points = motion(scale), cloud(200)
+    targets = transform(truth, points)
+    wrong = np.random.default_rng(4).permutation(200)[:60]
+    targets[wrong] += np.random.default_rng(5).uniform(0.5, 2, (60, 3))
+    found = align_points(points, targets, freedom=freedom, tolerance_m=0.01)
+    np.testing.assert_allclose(found, truth, atol=1e-10)
+
+
+def test_pairs_that_agree_on_nothing_are_refused():
+    with pytest.raises(InputError, match="No motion brings half of 40 points"):
+        align_points(cloud(), cloud(seed=9), tolerance_m=0.01)
+
+
+def test_points_that_are_not_finite_are_named():
+    points = cloud()
+    points[7, 1] = np.nan
+    with pytest.raises(InputError, match="Row 7 is not finite"):
+        align_points(points, cloud(), tolerance_m=0.01)
+
+
+def cameras(count=6):
+    return np.stack([motion(seed=10 + k) for k in range(count)])
+
+
+@pytest.mark.parametrize(
+    ("method", "scale"), [("centres", 0.4), ("orientations", 1.0), ("orientations and scale", 0.4)]
+)
+def test_cameras_known_in_both_give_the_motion_between(method, scale):
+    truth = motion(scale)
+    there, here = cameras(), cameras()
+    here[:, :3, :3] = truth[:3, :3] / scale @ there[:, :3, :3]
+    here[:, :3, 3] = transform(truth, there[:, :3, 3])
+    np.testing.assert_allclose(align_cameras(there, here, method=method), truth, atol=1e-10)
+
+
+def test_one_camera_is_enough_for_a_rigid_alignment_and_leaves_the_scale_at_one():
+    truth = motion()
+    there = cameras(1)
+    found = align_cameras(there, truth @ there, method="orientations and scale")
+    np.testing.assert_allclose(found, truth, atol=1e-10)
+
+
+def test_refinement_ends_on_the_surface():
+    truth, points = motion(), cloud(500)
+    off = np.eye(4)
+    off[:3, :3] = Rotation.from_rotvec([0.01, -0.02, 0.01]).as_matrix()
+    off[:3, 3] = [0.01, 0.01, -0.01]
+    found = refine(points, transform(truth, points), start=off @ truth, radius_m=0.1)
+    np.testing.assert_allclose(found, truth, atol=1e-6)
+
+
+def test_refinement_from_too_far_is_refused():
+    with pytest.raises(InputError, match="too far off"):
+        refine(cloud(), cloud() + 100, start=np.eye(4), radius_m=0.1)

@@ -1,0 +1,252 @@
+"""Fusion of a scene whose surfaces a formula gives: a plate on a table, moved and taken away."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import pixel_rays
+from egosim_jax.state.fuse import fuse
+from egosim_jax.state.snapshot import fingerprint
+from egosim_jax.state.tsdf import Fusion
+from egosim_jax.types import Cameras, Perceived, SceneState
+
+HEIGHT, WIDTH, FRAMES = 60, 80, 6
+TABLE_M, PLATE_M = 0.60, 0.55
+COARSE = Fusion(voxel_m=0.005)
+INTRINSICS = np.array([[100.0, 0, (WIDTH - 1) / 2], [0, 100, (HEIGHT - 1) / 2], [0, 0, 1]])
+
+
+def cameras(x=0.0):
+    """Straight down the z axis, `x` metres aside."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return Cameras(
+        world_from_camera=np.repeat(pose[None], FRAMES, axis=0),
+        intrinsics_px=INTRINSICS,
+        height=HEIGHT,
+        width=WIDTH,
+    )
+
+
+def picture(plates, x=0.0):
+    """Depth and ids when the plate's lower left corner is at each of `plates`; None: no plate."""
+    depth = np.full((FRAMES, HEIGHT, WIDTH), TABLE_M, np.float32)
+    ids = np.zeros(depth.shape, np.int32)
+    rays = pixel_rays(INTRINSICS, height=HEIGHT, width=WIDTH)
+    for frame, corner in enumerate(plates):
+        if corner is not None:
+            places = rays[..., :2] * PLATE_M + [x, 0] - corner
+            on = ((places >= 0) & (places <= 0.08)).all(axis=-1)
+            depth[frame][on], ids[frame][on] = PLATE_M, 1
+    return depth, ids
+
+
+def perceived(plates, *, x=0.0, step=1, **changes):
+    depth, ids = picture(plates, x)
+    colours = np.where(ids[..., None] == 1, [200, 30, 30], [120, 110, 90]).astype(np.uint8)
+    whole = {
+        "step": step,
+        "frames": colours,
+        "cameras": cameras(x),
+        "depth_m": depth,
+        "object_ids": ids,
+        "names": {1: "plate"},
+        "world_from_object": {},
+        "touched": {},
+    }
+    return Perceived(**{**whole, **changes})
+
+
+def start(x=0.0):
+    """A state with a far away point alone, then what the first picture shows."""
+    seed = SceneState(
+        points_m=np.array([[50.0, 50, 50]], np.float32),
+        colours=np.zeros((1, 3), np.uint8),
+        object_ids=np.zeros(1, np.int32),
+        last_seen=np.zeros(1, np.int32),
+        intrinsics_px=INTRINSICS,
+    )
+    return fuse(seed, perceived([HERE] * FRAMES, x=x, step=0), fusion=COARSE)
+
+
+HERE, THERE = np.array([-0.12, -0.04]), np.array([0.06, -0.04])
+
+
+def path():
+    """The plate slides over in the middle frames and lies still at the end."""
+    shares = np.array([0, 0, 0.5, 1, 1, 1])
+    poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
+    poses[:, :2, 3] = shares[:, None] * (THERE - HERE)
+    return poses, [HERE + share * (THERE - HERE) for share in shares]
+
+
+def at(state, corner, *, lower=0.0):
+    """How many points lie at the plate's height over a place."""
+    places = state.points_m[:, :2] - corner
+    on = ((places >= lower) & (places <= 0.08 - lower)).all(axis=1)
+    return int((on & (np.abs(state.points_m[:, 2] - PLATE_M) < 0.01)).sum())
+
+
+def tracked(step=1):
+    poses, plates = path()
+    return perceived(plates, step=step, world_from_object={1: poses})
+
+
+def test_a_tracked_thing_is_at_its_new_place_alone():
+    state = fuse(start(), tracked(), fusion=COARSE)
+    assert at(start(), HERE) > 100
+    assert at(state, HERE) == 0
+    assert at(state, THERE) > 100
+    own = state.points_m[state.object_ids == 1]
+    assert (np.abs(own[:, 2] - PLATE_M) < 0.0025).mean() > 0.95
+    assert (np.abs(own[:, :2] - THERE - 0.04).max(axis=1) < 0.046).all()
+
+
+def test_where_it_lay_the_table_is_now_known():
+    state = fuse(start(), tracked(), fusion=COARSE)
+
+    def table_under_plate(state):
+        places = state.points_m[:, :2] - HERE
+        inside = ((places > 0.02) & (places < 0.06)).all(axis=1)
+        return int((inside & (np.abs(state.points_m[:, 2] - TABLE_M) < 0.003)).sum())
+
+    assert table_under_plate(start()) == 0
+    assert table_under_plate(state) > 30
+
+
+def test_fusing_the_same_again_changes_nothing():
+    once = fuse(start(), tracked(), fusion=COARSE)
+    twice = fuse(once, tracked(), fusion=COARSE)
+    assert fingerprint(twice) == fingerprint(once)
+
+
+def test_a_thing_comes_back_by_the_way_it_went():
+    poses, plates = path()
+    there = fuse(start(), tracked(), fusion=COARSE)
+    back = perceived(plates[::-1], step=2, world_from_object={1: poses[::-1]})
+    state = fuse(there, back, fusion=COARSE)
+    assert at(state, THERE) == 0
+    assert at(state, HERE) > 100
+    np.testing.assert_array_equal(state.world_from_object[1], np.eye(4))
+
+
+def test_its_back_that_no_frame_shows_moves_with_it():
+    before = start()
+    back = np.array([[HERE[0] + 0.04, HERE[1] + 0.04, PLATE_M + 0.03]], np.float32)
+    before = replace(
+        before,
+        points_m=np.concatenate([before.points_m, back]),
+        colours=np.concatenate([before.colours, [[1, 2, 3]]]).astype(np.uint8),
+        object_ids=np.append(before.object_ids, np.int32(1)),
+        last_seen=np.append(before.last_seen, np.int32(0)),
+    )
+    state = fuse(before, tracked(), fusion=COARSE)
+    (row,) = np.flatnonzero((state.colours == (1, 2, 3)).all(axis=1))
+    expected = back[0] + [*(THERE - HERE), 0]
+    np.testing.assert_allclose(state.points_m[row], expected, atol=1e-6)
+    assert state.last_seen[row] == 0
+
+
+def test_a_thing_that_moved_unseen_leaves_no_ghost():
+    """It is touched, nothing says how it moved: it is where it was seen last."""
+    _, plates = path()
+    touched = np.array([False, True, True, True, False, False])
+    state = fuse(start(), perceived(plates, touched={1: touched}), fusion=COARSE)
+    assert at(state, HERE, lower=0.015) == 0
+    assert at(state, THERE) > 100
+
+
+def test_a_thing_that_was_carried_away_is_gone():
+    plates = [HERE, HERE, None, None, None, None]
+    touched = np.array([False, True, True, False, False, False])
+    state = fuse(start(), perceived(plates, touched={1: touched}), fusion=COARSE)
+    assert at(state, HERE) == 0
+    assert not (state.object_ids == 1).any()
+
+
+def test_what_nobody_touched_and_nobody_looked_through_stays():
+    plates = [HERE, HERE, HERE, None, None, None]
+    hidden = perceived(plates)
+    depth, ids = hidden.depth_m.copy(), hidden.object_ids.copy()
+    depth[3:, :, :45], ids[3:, :, :45] = 0.3, -1  # an arm in front
+    state = fuse(start(), replace(hidden, depth_m=depth, object_ids=ids), fusion=COARSE)
+    assert at(state, HERE) > 100
+
+
+def test_hands_never_enter_the_state():
+    clip = tracked()
+    depth, ids = clip.depth_m.copy(), clip.object_ids.copy()
+    depth[:, 20:40, 60:70], ids[:, 20:40, 60:70] = 0.3, -2
+    state = fuse(start(), replace(clip, depth_m=depth, object_ids=ids), fusion=COARSE)
+    assert (state.points_m[:, 2] > 0.5).all()
+    assert (state.object_ids >= 0).all()
+
+
+def test_a_clip_in_which_nothing_is_known_leaves_the_points():
+    before = start()
+    nothing = perceived([None] * FRAMES, depth_m=np.full((FRAMES, HEIGHT, WIDTH), np.inf, "f4"))
+    state = fuse(before, nothing, fusion=COARSE)
+    np.testing.assert_array_equal(state.points_m, before.points_m)
+    assert (before.step, state.step) == (0, 1)
+
+
+def test_nan_depth_is_unknown_depth():
+    clip = tracked()
+    depth = np.where(clip.object_ids == 1, clip.depth_m, np.nan).astype(np.float32)
+    state = fuse(start(), replace(clip, depth_m=depth), fusion=COARSE)
+    assert np.isfinite(state.points_m).all()
+    assert at(state, THERE) > 100
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_clips_that_see_different_places_may_come_in_either_order(order):
+    clips = [tracked(1), perceived([None] * FRAMES, x=3.0, step=2)]
+    state = start()
+    for number in order:
+        state = fuse(state, clips[number], fusion=COARSE)
+    expected = fuse(fuse(start(), clips[0], fusion=COARSE), clips[1], fusion=COARSE)
+    assert fingerprint(state) == fingerprint(expected)
+
+
+def test_a_hundred_steps_do_not_make_it_grow():
+    """A wobbling look at a small piece of table, with noise in its depth."""
+    rng = np.random.default_rng(0)
+    state, sizes = start(), []
+    for step in range(1, 101):
+        pose = np.repeat(np.eye(4)[None], 2, axis=0)
+        pose[:, :2, 3] = rng.uniform(-0.01, 0.01, 2)
+        look = Cameras(
+            world_from_camera=pose,
+            intrinsics_px=np.array([[100.0, 0, 7.5], [0, 100, 5.5], [0, 0, 1]]),
+            height=12,
+            width=16,
+        )
+        clip = Perceived(
+            step=step,
+            frames=np.zeros((2, 12, 16, 3), np.uint8),
+            cameras=look,
+            depth_m=rng.normal(TABLE_M, 0.002, (2, 12, 16)).astype(np.float32),
+            object_ids=np.zeros((2, 12, 16), np.int32),
+            names={},
+            world_from_object={},
+            touched={},
+        )
+        state = fuse(state, clip, fusion=COARSE)
+        sizes.append(len(state.points_m))
+    assert max(sizes[20:]) <= 1.1 * max(sizes[:20])
+
+
+def test_the_callers_state_is_not_changed():
+    before = start()
+    mark = fingerprint(before)
+    fuse(before, tracked(), fusion=COARSE)
+    assert fingerprint(before) == mark
+
+
+def test_points_that_are_seen_again_say_so():
+    state = fuse(start(), tracked(), fusion=COARSE)
+    own = state.object_ids == 1
+    assert own.any()
+    assert (state.last_seen[own] == 1).all()
+    assert state.last_seen[(state.points_m == 50).all(axis=1)] == 0

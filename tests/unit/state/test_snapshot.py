@@ -1,0 +1,135 @@
+"""States on disk: what is read is what was written, and damage is named."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.state.snapshot import fingerprint, load, read_ply, save, write_ply
+from egosim_jax.types import InputError, SceneState
+
+
+def state(count=50):
+    rng = np.random.default_rng(0)
+    return SceneState(
+        points_m=rng.normal(size=(count, 3)).astype(np.float32),
+        colours=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        object_ids=rng.integers(0, 3, count).astype(np.int32),
+        last_seen=rng.integers(0, 5, count).astype(np.int32),
+        intrinsics_px=np.array([[100.0, 0, 49.5], [0, 100, 29.5], [0, 0, 1]]),
+        step=4,
+        names={1: "red cup", 2: "lid"},
+        world_from_object={2: np.diag([-1.0, -1, 1, 1])},
+        provenance={"world": "tabletop"},
+    )
+
+
+def test_what_is_read_is_what_was_written(tmp_path):
+    save(tmp_path / "state", state())
+    again = load(tmp_path / "state")
+    assert fingerprint(again) == fingerprint(state())
+    for name in ("points_m", "colours", "object_ids", "last_seen", "intrinsics_px"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(state(), name))
+        assert getattr(again, name).dtype == getattr(state(), name).dtype
+    assert (again.step, again.names, again.provenance) == (
+        4,
+        {1: "red cup", 2: "lid"},
+        {"world": "tabletop"},
+    )
+    np.testing.assert_array_equal(again.world_from_object[2], np.diag([-1.0, -1, 1, 1]))
+
+
+def test_a_state_is_replaced_as_a_whole(tmp_path):
+    save(tmp_path / "state", state(50))
+    save(tmp_path / "state", state(20))
+    assert len(load(tmp_path / "state").points_m) == 20
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step": 5},
+        {"names": {1: "blue cup", 2: "lid"}},
+        {"colours": np.zeros((50, 3), np.uint8)},
+        {"world_from_object": {}},
+    ],
+)
+def test_any_change_changes_the_fingerprint(change):
+    assert fingerprint(replace(state(), **change)) != fingerprint(state())
+
+
+def test_a_flipped_byte_is_named(tmp_path):
+    save(tmp_path / "state", state())
+    path = tmp_path / "state" / "points.npz"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match=r"points\.npz is damaged"):
+        load(tmp_path / "state")
+
+
+def test_another_version_is_named(tmp_path):
+    save(tmp_path / "state", state())
+    path = tmp_path / "state" / "state.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 2}))
+    with pytest.raises(InputError, match="version 2; this program reads version 1"):
+        load(tmp_path / "state")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1}'])
+def test_what_is_no_state_is_named(tmp_path, text):
+    (tmp_path / "state.json").write_text(text)
+    with pytest.raises(InputError, match="no state that can be read"):
+        load(tmp_path)
+
+
+def test_ply_keeps_places_colours_and_ids(tmp_path):
+    write_ply(tmp_path / "a.ply", state())
+    again = read_ply(tmp_path / "a.ply", state())
+    for name in ("points_m", "colours", "object_ids", "last_seen"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(state(), name))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_a_ply_of_another_program_needs_only_places_and_colours(tmp_path):
+    text = (
+        "ply\nformat ascii 1.0\nelement vertex 2\n"
+        + "".join(f"property float {c}\n" for c in "xyz")
+        + "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+        + "end_header\n0 1 2 10 20 30\n3 4 5 40 50 60\n"
+    )
+    (tmp_path / "b.ply").write_text(text)
+    found = read_ply(tmp_path / "b.ply")
+    np.testing.assert_array_equal(found.points_m, [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(found.colours, [[10, 20, 30], [40, 50, 60]])
+    assert not found.object_ids.any()
+
+
+def test_a_ply_without_colours_or_a_missing_one_is_named(tmp_path):
+    with pytest.raises(InputError, match="is not there"):
+        read_ply(tmp_path / "c.ply")
+    (tmp_path / "c.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+        "property float z\nend_header\n0 1 2\n"
+    )
+    with pytest.raises(InputError, match="no points with colours"):
+        read_ply(tmp_path / "c.ply")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points_m": np.zeros((0, 3), np.float32)}, "one for each point"),
+        ({"points_m": np.full((50, 3), np.nan, np.float32)}, "Point 0 of the state is not finite"),
+    ],
+)
+def test_points_that_make_no_state_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(state(), **change)
+
+
+def test_a_state_without_points_is_refused():
+    with pytest.raises(InputError, match="at least one"):
+        state(0)

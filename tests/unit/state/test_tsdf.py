@@ -1,0 +1,126 @@
+"""Surfaces of shapes whose depth a formula gives."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import look_at, pixel_rays
+from egosim_jax.state.tsdf import Fusion, steady, surface
+from egosim_jax.types import Cameras, InputError
+
+HEIGHT, WIDTH = 120, 200
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def cameras(count=9):
+    turns = np.linspace(0, 2 * np.pi, count)
+    eyes = [np.array([0.1 * np.sin(a), -0.12 + 0.05 * np.cos(a), 0.46]) for a in turns]
+    focal = 150.0
+    return Cameras(
+        world_from_camera=np.stack([look_at(e, np.array([0.01, 0.28, 0.03]), up=UP) for e in eyes]),
+        intrinsics_px=np.array(
+            [[focal, 0, (WIDTH - 1) / 2], [0, focal, (HEIGHT - 1) / 2], [0, 0, 1]]
+        ),
+        height=HEIGHT,
+        width=WIDTH,
+    )
+
+
+def rays(cameras, frame):
+    pose = cameras.world_from_camera[frame]
+    directions = pixel_rays(cameras.intrinsics_px, height=HEIGHT, width=WIDTH)
+    return pose[:3, 3], directions @ pose[:3, :3].T
+
+
+def plane(origin, directions):
+    with np.errstate(divide="ignore"):
+        return np.where(directions[..., 2] < 0, (0.004 - origin[2]) / directions[..., 2], np.inf)
+
+
+CENTRE, RADIUS = np.array([0.02, 0.3, 0.06]), 0.11
+
+
+def sphere(origin, directions):
+    offset = origin - CENTRE
+    a, b = (directions**2).sum(axis=-1), directions @ offset
+    inside = b**2 - a * (offset @ offset - RADIUS**2)
+    return np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
+
+
+LOW, HIGH = np.array([-0.1, 0.2, 0.0]), np.array([0.12, 0.4, 0.1])
+
+
+def box(origin, directions):
+    """The slab method: the last of the three entries, if before the first of the three exits."""
+    with np.errstate(divide="ignore"):
+        first, second = (LOW - origin) / directions, (HIGH - origin) / directions
+    enter = np.minimum(first, second).max(axis=-1)
+    leave = np.maximum(first, second).min(axis=-1)
+    return np.where(enter < leave, enter, np.inf)
+
+
+def to_plane(points):
+    return np.abs(points[:, 2] - 0.004)
+
+
+def to_sphere(points):
+    return np.abs(np.linalg.norm(points - CENTRE, axis=1) - RADIUS)
+
+
+def to_box(points):
+    outside = np.linalg.norm(np.maximum(np.maximum(LOW - points, points - HIGH), 0), axis=1)
+    inside = np.minimum(points - LOW, HIGH - points).min(axis=1)
+    return np.where(outside > 0, outside, np.abs(inside))
+
+
+@pytest.mark.parametrize(
+    ("depth", "distance"), [(plane, to_plane), (sphere, to_sphere), (box, to_box)]
+)
+def test_points_lie_within_half_a_voxel_of_the_true_surface(depth, distance):
+    path = cameras()
+    depths = np.stack([depth(*rays(path, k)) for k in range(9)]).astype(np.float32)
+    depths = np.where(steady(depths), depths, 0)
+    colours = np.full((9, HEIGHT, WIDTH, 3), (10, 200, 77), np.uint8)
+    points, shades = surface(depths, colours, path, fusion=Fusion())
+    assert len(points) > 5000
+    errors = distance(points.astype(np.float64))
+    assert np.mean(errors <= Fusion().voxel_m / 2) >= 0.95, np.percentile(errors, [50, 90, 95])
+    assert (shades == (10, 200, 77)).all()
+
+
+def test_the_whole_surface_that_is_seen_has_points():
+    path = cameras()
+    depths = np.stack([plane(*rays(path, k)) for k in range(9)]).astype(np.float32)
+    colours = np.zeros((9, HEIGHT, WIDTH, 3), np.uint8)
+    points, _ = surface(depths, colours, path, fusion=Fusion())
+    grid = np.stack(np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(0.15, 0.4, 0.01)), axis=-1)
+    gaps = np.linalg.norm(grid.reshape(-1, 1, 2) - points[None, :, :2], axis=-1).min(axis=1)
+    assert gaps.max() <= 0.003
+
+
+def test_unknown_and_far_depths_leave_no_points():
+    path = cameras(3)
+    for value in (0.0, np.inf, np.nan, 3.5):
+        depths = np.full((3, HEIGHT, WIDTH), value, np.float32)
+        points, shades = surface(
+            depths, np.zeros((3, HEIGHT, WIDTH, 3), np.uint8), path, fusion=Fusion()
+        )
+        assert points.shape == shades.shape == (0, 3)
+
+
+def test_depth_is_not_steady_at_an_edge_nor_next_to_the_unknown():
+    depth = np.full((12, 20), 1.0, np.float32)
+    depth[:, 10:] = 0.8
+    depth[5, 3] = np.nan
+    found = steady(depth)
+    assert not found[:, 8:12].any()
+    assert not found[5, 3]
+    assert found[:3, :7].all()
+    assert found[:, 13:].all()
+
+
+@pytest.mark.parametrize(
+    "sizes", [{"voxel_m": 0.0}, {"truncation_m": 0.001}, {"max_depth_m": -1.0}]
+)
+def test_sizes_that_make_no_surface_are_refused(sizes):
+    with pytest.raises(InputError, match="make no surface"):
+        Fusion(**sizes)

@@ -1,0 +1,170 @@
+"""The loop around a generator of thirty lines, in a world whose truth is known."""
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+import pytest
+
+from egosim_jax.perception.oracle import oracle
+from egosim_jax.rendering.reference import draw_hands
+from egosim_jax.simulator import Simulator
+from egosim_jax.state.snapshot import fingerprint
+from egosim_jax.state.tsdf import Fusion
+from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_action, to_truth
+
+SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
+
+
+def paint_the_hands(view, action, first_frame, seed):
+    """The prior copied, the skeletons painted over it, and a little noise."""
+    hands, depth = draw_hands(action.joints_m, action.cameras, kind=action.kind)
+    frames = np.where((depth < view.depth_m)[..., None], hands, view.frames).astype(float)
+    frames[0] = np.where(np.isfinite(depth[0])[..., None], hands[0], first_frame)
+    noise = np.random.default_rng(seed).normal(0, 2, frames.shape)
+    return np.clip(np.rint(frames + noise), 0, 255).astype(np.uint8)
+
+
+@cache
+def clips():
+    return tuple(make_sequence(3, spec=SPEC, clips=2))
+
+
+@dataclass
+class Told:
+    """The oracle of each clip in turn."""
+
+    truths: list = field(default_factory=lambda: [to_truth(clip) for clip in clips()])
+
+    def __call__(self, clip, action, state):
+        return oracle(self.truths[state.step])(clip, action, state)
+
+
+def simulator(**changes):
+    parts = {
+        "generator": paint_the_hands,
+        "perception": Told(),
+        "fps": SPEC.fps,
+        "fusion": Fusion(voxel_m=0.006),
+    }
+    return Simulator(**{**parts, **changes})
+
+
+def run(out, **changes):
+    actions = [to_action(clip) for clip in clips()]
+    return list(simulator(**changes).run(clips()[0].state, actions, out=out, seed=0))
+
+
+def test_each_clip_starts_from_the_state_that_the_last_one_left(tmp_path):
+    first, second = run(tmp_path)
+    assert (first.state.step, second.state.step) == (1, 2)
+    expected = simulator().step(first.state, to_action(clips()[1]), seed=2)
+    np.testing.assert_array_equal(second.view.frames, expected.view.frames)
+    np.testing.assert_array_equal(second.clip.frames, expected.clip.frames)
+    assert fingerprint(second.state) == fingerprint(expected.state)
+    target = clips()[0].body_ids[clips()[0].target]
+    moved = clips()[0].world_from_body[clips()[0].target]
+    np.testing.assert_allclose(
+        first.state.world_from_object[target], moved[-1] @ np.linalg.inv(moved[0]), atol=1e-12
+    )
+
+
+def test_without_perception_the_state_stays(tmp_path):
+    for step in run(tmp_path, perception=None):
+        assert fingerprint(step.state) == fingerprint(clips()[0].state)
+
+
+def test_a_replay_gives_the_same_states(tmp_path):
+    states = [[fingerprint(s.state) for s in run(tmp_path / name)] for name in "ab"]
+    assert states[0] == states[1]
+
+
+@pytest.mark.parametrize("phase", range(6))
+def test_a_run_killed_after_any_phase_ends_the_same(tmp_path, phase):
+    """A child dies by SIGKILL when the journal has so many lines; the run goes on from there."""
+    code = (
+        "import os, signal, sys; sys.path.insert(0, sys.argv[1])\n"
+        "import test_simulator as t; from pathlib import Path\n"
+        "from egosim_jax.io.journal import Journal\n"
+        "enter = Journal._enter\n"
+        "def die(self, *args):\n"
+        "    if len(self.done) == int(sys.argv[3]): os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    enter(self, *args)\n"
+        "Journal._enter = die\n"
+        "t.run(Path(sys.argv[2]))\n"
+    )
+    here = os.path.dirname(__file__)
+    command = [sys.executable, "-c", code, here, str(tmp_path / "killed"), str(phase)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    lines = (tmp_path / "killed" / "journal.jsonl").exists()
+    assert lines == (phase > 0)
+    resumed, straight = run(tmp_path / "killed"), run(tmp_path / "straight")
+    for a, b in zip(resumed, straight, strict=True):
+        np.testing.assert_array_equal(a.clip.frames, b.clip.frames)
+        assert fingerprint(a.state) == fingerprint(b.state)
+
+
+def test_finished_phases_are_not_made_again(tmp_path):
+    run(tmp_path)
+
+    def never(*args):
+        raise AssertionError("made again")
+
+    assert len(run(tmp_path, generator=never, perception=never)) == 2
+
+
+def test_a_torn_line_of_the_journal_is_forgotten(tmp_path):
+    straight = run(tmp_path / "straight")
+    run(tmp_path / "torn")
+    path = tmp_path / "torn" / "journal.jsonl"
+    path.write_bytes(path.read_bytes()[:-20])
+    assert fingerprint(run(tmp_path / "torn")[1].state) == fingerprint(straight[1].state)
+
+
+def test_a_changed_file_of_a_finished_phase_is_named(tmp_path):
+    run(tmp_path)
+    path = tmp_path / "clip_1" / "frames.npz"
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match=r"frames\.npz is not what the run wrote in phase 1 gener"):
+        run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "bad", [lambda *a: np.zeros((4, 48, 80, 3), np.uint8), lambda *a: np.zeros((5, 48, 80, 3))]
+)
+def test_a_generator_that_gives_other_frames_is_refused(tmp_path, bad):
+    with pytest.raises(InputError, match="must give as many frames of the same size"):
+        run(tmp_path, generator=bad)
+
+
+def test_the_first_frame_may_be_given(tmp_path):
+    image = np.full((48, 80, 3), 9, np.uint8)
+    seen = []
+
+    def generator(view, action, first_frame, seed):
+        seen.append(first_frame)
+        return view.frames
+
+    actions = [to_action(clip) for clip in clips()]
+    loop = simulator(generator=generator)
+    steps = list(loop.run(clips()[0].state, actions, out=tmp_path, seed=0, first_frame=image))
+    np.testing.assert_array_equal(seen[0], image)
+    np.testing.assert_array_equal(seen[1], steps[1].view.frames[0])
+
+
+def test_the_loop_needs_no_jax(tmp_path):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import test_simulator as t; from pathlib import Path\n"
+        "t.run(Path(sys.argv[2]))\n"
+        "assert 'jax' not in sys.modules, 'jax was imported'\n"
+    )
+    command = [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path)]
+    subprocess.run(command, check=True)
