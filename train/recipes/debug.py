@@ -2,7 +2,7 @@
 
     egosim-train debug --out runs/debug
 
-takes about two minutes on 2 CPU cores.
+takes minutes on 2 CPU cores.
 """
 
 from __future__ import annotations
