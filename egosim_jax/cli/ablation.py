@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from egosim_jax.cli.sheet import Block, draw_sheet
 from egosim_jax.command import DONE
 from egosim_jax.progress import track
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,9 +83,7 @@ class Tabletop:
             {"--scenes": self.scenes, "--seeds": self.seeds, "--batch-size": self.batch_size}
         )
         config = configs.get(self.config)
-        weights = self.weights or configs.shipped_weights(self.config)
-        if weights is None:
-            raise InputError(f"{self.config} comes without weights. (--weights FOLDER)")
+        weights = configs.weights_of(self.config, self.weights)
         open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
         generator = Generator(config, Networks.load(config, weights))
         kinds: tuple[Kind, ...] = ("human", "robot")

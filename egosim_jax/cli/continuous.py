@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
 from egosim_jax.command import DONE
 from egosim_jax.progress import track
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.generator import Generator
@@ -54,9 +54,7 @@ class Continuous:
 
         check_counts({"--sequences": self.sequences, "--clips": self.clips})
         config = configs.get(self.config)
-        weights = self.weights or configs.shipped_weights(self.config)
-        if weights is None:
-            raise InputError(f"{self.config} comes without weights. (--weights FOLDER)")
+        weights = configs.weights_of(self.config, self.weights)
         open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
         generator = Generator(config, Networks.load(config, weights))
         seeds = range(self.first_scene, self.first_scene + self.sequences)

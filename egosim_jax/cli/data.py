@@ -50,7 +50,7 @@ class Pack:
         """Check and pack clip after clip."""
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.data.pack import pack
-        from egosim_jax.data.shards import sha256
+        from egosim_jax.io.digest import sha256
 
         check_counts({"--shard-megabytes": self.shard_megabytes})
         items = select(read_metadata(self.metadata), where=self.where, limit=self.limit)

@@ -60,13 +60,12 @@ class Simulate:
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
         from egosim_jax.simulator import Simulator
+        from egosim_jax.state.snapshot import write_ply
         from egosim_jax.worlds.tabletop import make_sequence, to_action
 
         check_counts({"--clips": self.clips})
         config = configs.get(self.config)
-        weights = self.weights or configs.shipped_weights(self.config)
-        if weights is None:
-            raise InputError(f"{self.config} comes without weights. (--weights FOLDER)")
+        weights = configs.weights_of(self.config, self.weights)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
         open_folder(folder, {"simulate": self, "model": config, "weights": hashes(weights)})
         kind = "robot" if self.robot else "human"
@@ -83,7 +82,7 @@ class Simulate:
             seed=self.seed,
             first_frame=self._image(truth[0]),
         )
-        _write_state(folder / "state_0.ply", truth[0].state)
+        write_ply(folder / "state_0.ply", truth[0].state)
         report, blocks = [], []
         then = time.monotonic()
         for clip, step in zip(truth, steps, strict=True):
@@ -198,20 +197,15 @@ def _write(folder: Path, clip: TabletopClip, step: Step) -> Block:
 
     from egosim_jax.io.video import write_video
     from egosim_jax.rendering.reference import draw_hands
+    from egosim_jax.state.snapshot import write_ply
 
     hands = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)[0]
     shown = [step.view.frames, hands, step.clip.frames, clip.frames]
     name = f"clip_{clip.number + 1}"
     write_video(folder / f"{name}.mp4", step.clip.frames, step.clip.fps)
     write_video(folder / f"{name}_cmp.mp4", np.concatenate(shown, axis=2), step.clip.fps)
-    _write_state(folder / f"state_{clip.number + 1}.ply", step.state)
+    write_ply(folder / f"state_{clip.number + 1}.ply", step.state)
     return Block(f"{clip.number + 1}: {clip.caption}   (view, hands, generated, truth)", shown)
-
-
-def _write_state(path: Path, state: SceneState) -> None:
-    from egosim_jax.state.snapshot import write_ply
-
-    write_ply(path, state)
 
 
 def _print(report: Sequence[dict[str, Any]]) -> None:

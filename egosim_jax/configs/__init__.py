@@ -38,3 +38,11 @@ def shipped_weights(name: str) -> Path | None:
     """The folder of the weights that come with the package, if the config has any."""
     folder = SHIPPED / name
     return folder if folder.is_dir() else None
+
+
+def weights_of(name: str, given: Path | None) -> Path:
+    """The folder that was given, else the shipped one; `InputError` if there is neither."""
+    folder = given or shipped_weights(name)
+    if folder is None:
+        raise InputError(f"{name} comes without weights. (--weights FOLDER)")
+    return folder

@@ -18,8 +18,8 @@ from egosim_jax.data.shards import (
     file_problems,
     from_bytes,
     read_manifest,
-    sha256,
 )
+from egosim_jax.io.digest import sha256
 from egosim_jax.io.video import decode_image, decode_video
 from egosim_jax.types import InputError, check_frame_count
 

@@ -33,6 +33,7 @@ import safetensors.numpy
 from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordWriter
 
+from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
 from egosim_jax.types import InputError, VideoSpec
 
@@ -341,9 +342,3 @@ def file_problems(folder: Path, shard: ShardInfo) -> list[str]:
         return [f"{path}: missing"]
     size = path.stat().st_size
     return [] if size == shard.size else [f"{path}: {size} bytes, the manifest says {shard.size}"]
-
-
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

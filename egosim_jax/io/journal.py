@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from egosim_jax.io.digest import sha256
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -86,5 +87,4 @@ def digest(path: Path) -> str:
     if path.is_dir():
         listing = [f"{file.name} {digest(file)}\n" for file in sorted(path.iterdir())]
         return hashlib.sha256("".join(listing).encode()).hexdigest()
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256(path)

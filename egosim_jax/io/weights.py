@@ -9,7 +9,6 @@ reported in one list.
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import numpy as np
 from einops import EinopsError, rearrange
 from flax import nnx
 
+from egosim_jax.io.digest import sha256
 from egosim_jax.types import InputError
 
 
@@ -212,11 +212,7 @@ def hashes(folder: Path) -> dict[str, str]:
     """SHA-256 of each file of a weights folder, by network."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of weights. (--weights)")
-    found = {}
-    for path in sorted(folder.glob("*.safetensors")):
-        with path.open("rb") as file:
-            found[path.stem] = hashlib.file_digest(file, "sha256").hexdigest()
-    return found
+    return {path.stem: sha256(path) for path in sorted(folder.glob("*.safetensors"))}
 
 
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import beside, invert, project, transform, umeyama
 from egosim_jax.rendering.reference import splat
+from egosim_jax.state.fuse import widened
 from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState
 
 PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
@@ -280,8 +281,6 @@ class _Neighbourhood:
         cameras: Cameras,
     ) -> _Neighbourhood:
         """What is needed to judge ends near that of the path."""
-        import cv2
-
         cameras = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
         others = state.object_ids != best.thing.number
         depth, index = splat(state.points_m[others], cameras, point_px=POINT_PX)
@@ -289,16 +288,13 @@ class _Neighbourhood:
         background = np.append(colours, np.full((1, 3), np.nan, np.float32), axis=0)[index]
         there = beside(cameras, best.path[frames])
         _, drawn = splat(best.thing.points_m, there, point_px=POINT_PX)
-        border = 2 * round(AROUND_PX * cameras.width) + 1
-        square = np.ones((border, border), np.uint8)
-        near = np.stack([cv2.dilate((f >= 0).astype(np.uint8), square) > 0 for f in drawn])
         return cls(
             thing=best.thing,
             cameras=cameras,
             shown=shown[frames],
             background=background,
             background_m=depth,
-            counted=near & ~hidden[frames],
+            counted=widened(drawn >= 0, AROUND_PX) & ~hidden[frames],
         )
 
     def cost(self, path: Float[np.ndarray, "f 4 4"]) -> float:

@@ -50,9 +50,10 @@ class _Points:
 def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = None) -> SceneState:
     """The state after what was perceived; a clip in which nothing is known leaves its points."""
     lost = gone(perceived.object_ids, dict(perceived.touched)) - set(perceived.world_from_object)
-    new = _observed(perceived, lost, fusion or Fusion())
+    sure = steady(perceived.depth_m)
+    new = _observed(perceived, sure, lost, fusion or Fusion())
     old = _moved(state, perceived, lost)
-    old = _carved(old, perceived)
+    old = _carved(old, perceived, sure)
     old = old[~_near(old.points_m, new.points_m, REPLACE_M)]
     everything = _ordered(_together([old, new]))
     poses = {n: path[-1] for n, path in perceived.world_from_object.items()}
@@ -65,9 +66,11 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
     )
 
 
-def _observed(perceived: Perceived, lost: set[int], fusion: Fusion) -> _Points:
+def _observed(
+    perceived: Perceived, sure: Bool[np.ndarray, "f h w"], lost: set[int], fusion: Fusion
+) -> _Points:
     """Surfaces of the background and of every thing that is not lost, at the end of the clip."""
-    trusted = steady(perceived.depth_m) & ~_widened(perceived.object_ids < 0)
+    trusted = sure & ~widened(perceived.object_ids < 0, BORDER)
     pieces = []
     for number in sorted(set(np.unique(perceived.object_ids).tolist()) - lost):
         if number < 0:
@@ -93,10 +96,11 @@ def _observed(perceived: Perceived, lost: set[int], fusion: Fusion) -> _Points:
     return _without_outliers(_together(pieces))
 
 
-def _widened(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+def widened(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, "f h w"]:
+    """The mask and what is within a border of it, a share of the width but at least a pixel."""
     import cv2
 
-    border = max(1, round(BORDER * mask.shape[2]))
+    border = max(1, round(border * mask.shape[2]))
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
     return np.stack([cv2.dilate(frame.astype(np.uint8), square) > 0 for frame in mask])
 
@@ -125,11 +129,11 @@ def _moved(state: SceneState, perceived: Perceived, lost: set[int]) -> _Points:
     )[kept]
 
 
-def _carved(old: _Points, perceived: Perceived) -> _Points:
+def _carved(old: _Points, perceived: Perceived, sure: Bool[np.ndarray, "f h w"]) -> _Points:
     """The points that the last frames that could have seen them did not look through."""
     verdict = np.zeros(len(old.points_m), int)
     confirmed = np.zeros(len(verdict), bool)
-    depth = np.where(steady(perceived.depth_m), perceived.depth_m, np.nan)
+    depth = np.where(sure, perceived.depth_m, np.nan)
     for frame in range(len(depth)):
         behind = _surface_behind(old, perceived, depth[frame], frame)
         here = np.abs(behind) <= THROUGH_M

@@ -95,13 +95,16 @@ def surface(
     centred[:2, 2] += 0.5
     intrinsics = o3d.core.Tensor(centred)
     reach = fusion.truncation_m / fusion.voxel_m
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    focal_px = float(cameras.intrinsics_px[0, 0])
     for frame in frames:
         depth = _image(np.where(known[frame], depth_m[frame], 0).astype(np.float32))
         colour = _image(colours[frame].astype(np.float32))
         camera = cameras.world_from_camera[frame].copy()
         camera[:3, 3] += SHIFT * fusion.voxel_m
         pose = o3d.core.Tensor(np.linalg.inv(camera))
-        blocks = o3d.core.Tensor(_blocks(depth_m[frame], known[frame], camera, cameras, fusion))
+        near = _blocks(depth_m[frame], known[frame], camera, rays, focal_px, fusion)
+        blocks = o3d.core.Tensor(near)
         grid.integrate(
             blocks, depth, colour, intrinsics, intrinsics, pose, 1.0, fusion.max_depth_m, reach
         )
@@ -118,7 +121,8 @@ def _blocks(
     depth_m: Float32[np.ndarray, "h w"],
     known: Bool[np.ndarray, "h w"],
     grid_from_camera: Float[np.ndarray, "4 4"],
-    cameras: Cameras,
+    rays: Float[np.ndarray, "h w 3"],
+    focal_px: float,
     fusion: Fusion,
 ) -> Int32[np.ndarray, "n 3"]:
     """The blocks that the rays pass through within the truncation of the surface.
@@ -126,13 +130,12 @@ def _blocks(
     Open3D's own looks at every fourth pixel only, and misses small things.
     """
     edge = BLOCK * fusion.voxel_m
-    apart = float(np.median(depth_m[known])) / cameras.intrinsics_px[0, 0]
+    apart = float(np.median(depth_m[known])) / focal_px
     every = max(1, int(edge / 4 / apart))  # pixels whose rays are a quarter of a block apart
     some = np.zeros_like(known)
     some[::every, ::every] = True
     if not (known & some).any():
         some[:] = True
-    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     rays, depth = rays[known & some], depth_m[known & some]
     steps = np.linspace(-1, 1, 1 + 2 * int(np.ceil(2 * fusion.truncation_m / edge)))
     depths = depth[:, None] + steps * fusion.truncation_m
