@@ -37,7 +37,7 @@ class Tabletop:
     """Scenes to validate on, one clip of each."""
     vae: Training = field(
         default_factory=lambda: Training(
-            steps=3000,
+            steps=4000,
             batch_size=2,
             # With a short warm-up the first steps close the channel that tells green from purple,
             # and it stays closed.
@@ -50,7 +50,7 @@ class Tabletop:
     """Training of the autoencoder."""
     denoiser: Training = field(
         default_factory=lambda: Training(
-            steps=4400,
+            steps=8000,
             batch_size=8,
             optimizer=OptimizerConfig(rule="muon", learning_rate=2e-3, warmup=200, decay="cosine"),
             log_every=25,

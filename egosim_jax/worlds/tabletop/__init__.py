@@ -23,7 +23,7 @@ from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, Stage
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene, make_scene
 
-FIELD_OF_VIEW = 66.0
+FIELD_OF_VIEW = 60.0
 """Degrees, across."""
 FINER, POINT_PX = 2, 2
 """The scene's points: rays along each side of a pixel of the first frame, and their size."""
@@ -188,13 +188,25 @@ def _first_look(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
     )
 
 
-def to_triplet(clip: TabletopClip) -> Triplet:
-    """The clip in EgoSim's format: prior and mask from the state, hands as skeletons.
+def state_after(clip: TabletopClip, state: SceneState) -> SceneState:
+    """A state before the clip with every thing moved as it truly moved; nothing new is seen."""
+    points = state.points_m.copy()
+    for name, world_from_body in clip.world_from_body.items():
+        moved = state.object_ids == clip.body_ids[name]
+        last_from_first = world_from_body[-1] @ np.linalg.inv(world_from_body[0])
+        points[moved] = transform(last_from_first, points[moved])
+    return replace(state, points_m=points, step=clip.number + 1)
 
-    What leaves the view, hands and things, is simply not seen there. A first frame without any
-    point raises `InputError`.
+
+def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
+    """The clip in EgoSim's format: prior and mask from a state, hands as skeletons.
+
+    The state is the clip's own, with the true picture of its first camera, unless another is given:
+    one that was carried over from the clip before, as in the closed loop, where the first picture
+    is the state's own and has holes. What leaves the view, hands and things, is simply not seen
+    there. A first frame without any point raises `InputError`.
     """
-    view = render(clip.state, clip.cameras, point_px=POINT_PX)
+    view = render(state or clip.state, clip.cameras, point_px=POINT_PX)
     hands, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
     name = f"tabletop_{clip.kind}_{clip.seed}_{clip.number}"
     return Triplet(
@@ -203,7 +215,7 @@ def to_triplet(clip: TabletopClip) -> Triplet:
         prior=view.frames,
         mask=view.mask,
         hands=hands,
-        first_frame=clip.first.colours,
+        first_frame=clip.first.colours if state is None else view.frames[0],
         truth=clip.frames,
         extra={"verb": clip.verb, "target": clip.target, "kind": clip.kind},
     )

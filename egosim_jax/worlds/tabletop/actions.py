@@ -104,7 +104,7 @@ def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) 
     """A random action that the scene allows; if there are any, with what is near the hand."""
     options: list[Intent] = []
     for body in scene.bodies:
-        if _covered(scene, body) and body.shape != "drawer":
+        if body.stays or (_covered(scene, body) and body.shape != "drawer"):
             continue
         if body.articulated:
             open_now = scene.openings[body.name] > 0.5

@@ -26,7 +26,11 @@ COLOURS = {
     "blue": (44, 92, 190),
     "purple": (126, 64, 160),
     "white": (226, 224, 216),
+    "black": (16, 16, 17),
 }
+STAYS = "black"
+"""Colour of things that are never acted on. In a prior they look like what was never seen, so that
+the mask has to tell; and a black thing could not be found in a picture by its colour."""
 TABLE_SIZE_M = (1.3, 0.62, 0.03)
 REACH_M = (-0.20, 0.20, 0.15, 0.37)
 """Least and greatest x and y at which things are put: within sight and reach."""
@@ -102,6 +106,11 @@ class Body:
     """The first is what moves when the thing is opened or carried; loose bodies have one."""
     world_from_body: Float[np.ndarray, "4 4"]
     """Pose at the start."""
+
+    @property
+    def stays(self) -> bool:
+        """Whether it is left alone."""
+        return self.name.startswith(STAYS)
 
     @property
     def articulated(self) -> bool:

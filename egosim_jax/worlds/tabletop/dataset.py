@@ -14,7 +14,7 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
 from egosim_jax.io.run import open_folder
 from egosim_jax.types import InputError, Kind, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+from egosim_jax.worlds.tabletop import make_sequence, state_after, to_triplet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Plan:
     seeds: tuple[int, ...]
     """One scene each."""
     clips: int
-    """In a row in each scene."""
+    """In a row in each scene; those after the first see the state that the one before left."""
     spec: VideoSpec
     kind: Kind | Literal["mixed"]
     """Whose hands; mixed: a robot's in the scenes whose seed is a multiple of four."""
@@ -70,11 +70,13 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
 
 def _make(plan: Plan, seed: int, parts: Path) -> None:
     sequence = make_sequence(seed, spec=plan.spec, clips=plan.clips, kind=plan.kind_of(seed))
+    state = None
     for number, clip in enumerate(sequence):
         path = _part(parts, seed, number)
         temporary = path.with_suffix(".tmp")
-        temporary.write_bytes(to_bytes(triplet_record(to_triplet(clip))))
+        temporary.write_bytes(to_bytes(triplet_record(to_triplet(clip, state))))
         temporary.replace(path)
+        state = state_after(clip, state or clip.state)
 
 
 def _part(parts: Path, seed: int, number: int) -> Path:

@@ -31,7 +31,7 @@ THUMB_M = (np.array([-0.028, 0.026, -0.014]), (0.040, 0.031, 0.025))
 """First joint of the thumb, and the lengths after it."""
 GRIPPER_M = (0.12, 0.10)
 """Length of a gripper's fingers, and between its open tips."""
-SKIN, SLEEVE, STEEL = (214, 160, 130), (72, 88, 112), (150, 152, 158)
+SKIN, SLEEVE, ENAMEL, RUBBER = (216, 150, 118), (72, 88, 112), (40, 150, 160), (52, 52, 56)
 
 
 def human_joints(closure: float, side: Side) -> Float[np.ndarray, "21 3"]:
@@ -95,7 +95,7 @@ def flesh(
     kind: Kind,
     back: Float[np.ndarray, " 3"],
 ) -> tuple[Part, ...]:
-    """Skin and sleeve, or steel, around joints in the world; `back` is the back of the hand."""
+    """Skin and sleeve, or rubber and enamel; `back` is the direction of the back of the hand."""
     if kind == "robot":
         wrist, left, right = joints_m
         across = right - left
@@ -104,18 +104,18 @@ def flesh(
         along = along / np.linalg.norm(along)
         knuckle = wrist + 0.045 * along
         fingers = [
-            _limb(knuckle + across * ((tip - knuckle) @ across), tip, 0.008, 0.008)
+            _limb(knuckle + across * ((tip - knuckle) @ across), tip, 0.012, 0.010)
             for tip in (left, right)
         ]
-        palm = _limb(knuckle - 0.055 * across, knuckle + 0.055 * across, 0.014, 0.014)
+        palm = _limb(knuckle - 0.055 * across, knuckle + 0.055 * across, 0.020, 0.020)
         arm = join(
-            _limb(wrist - 0.02 * along, knuckle, 0.024, 0.024), _limb(wrist, elbow_m, 0.024, 0.03)
+            _limb(wrist - 0.02 * along, knuckle, 0.026, 0.026), _limb(wrist, elbow_m, 0.027, 0.034)
         )
-        steel = Paint(colour=STEEL, second=STEEL, pattern="plain", scale_m=0.1)
-        dark = Paint(colour=(62, 62, 66), second=STEEL, pattern="plain", scale_m=0.1)
+        enamel = Paint(colour=ENAMEL, second=ENAMEL, pattern="plain", scale_m=0.1)
+        rubber = Paint(colour=RUBBER, second=RUBBER, pattern="plain", scale_m=0.1)
         return (
-            _part("gripper", join(*fingers), dark),
-            _part("wrist", join(palm, arm), steel),
+            _part("gripper", join(*fingers), rubber),
+            _part("wrist", join(palm, arm), enamel),
         )
     radii = np.array([0.026, 0.016, 0.0125, 0.0115, 0.0095] + [0.0105, 0.0095, 0.0085, 0.0075] * 4)
     pieces = [

@@ -18,9 +18,9 @@ from egosim_jax.geometry import finer, pixel_rays, transform
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
 
-SUN = np.array([-0.42, -0.35, 0.84])
+SUN = np.array([-0.25, -0.50, 0.83])
 """Towards the light; from behind the wearer's left shoulder."""
-AMBIENT, SUNLIGHT = 0.55, 0.55
+AMBIENT, SUNLIGHT = 0.62, 0.48
 SKY = np.array([0.0, 0.0, 0.0])
 RAYS = 2
 """Rays along each side of a pixel, of which the colour is the mean."""

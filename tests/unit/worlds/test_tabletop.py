@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
 from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop import actions, make_sequence, to_triplet
+from egosim_jax.worlds.tabletop import actions, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.bodies import box, make_loose, split_edges
 from egosim_jax.worlds.tabletop.hands import closure_for, joints_of, pinch
 from egosim_jax.worlds.tabletop.raycast import Placed, Stage
@@ -143,8 +143,30 @@ def test_a_prior_shows_the_first_frame_where_it_is_observed():
     seen = triplet.mask[0] == 0
     assert seen.mean() > 0.95
     difference = triplet.prior[0][seen].astype(float) - clip.first.colours[seen]
-    assert np.abs(difference).mean() < 4
+    assert np.abs(difference).mean() < 5  # of 255: the points of half a pixel round to whole ones
     assert not triplet.prior[-1][triplet.mask[-1] == 255].any()
+
+
+def test_a_carried_state_has_its_things_where_the_clip_left_them(clips):
+    first, second = clips
+    state = state_after(first, first.state)
+    start, end = first.world_from_body[first.target][[0, -1]]
+    moved = state.object_ids == first.body_ids[first.target]
+    np.testing.assert_array_equal(state.points_m[~moved], first.state.points_m[~moved])
+    np.testing.assert_allclose(
+        transform(np.linalg.inv(end), state.points_m[moved]),
+        transform(np.linalg.inv(start), first.state.points_m[moved]),
+        atol=1e-6,
+    )
+    triplet = to_triplet(second, state)
+    np.testing.assert_array_equal(triplet.first_frame, triplet.prior[0])
+
+
+def test_black_things_are_left_alone():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        scene = make_scene(rng)
+        assert not scene.body(actions.choose(scene, rng).name).stays
 
 
 @pytest.mark.parametrize("kind", ["human", "robot"])
