@@ -17,6 +17,7 @@ from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.simulate import Simulate
+from egosim_jax.cli.view import View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +57,7 @@ class Experiment:
 Commands = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]

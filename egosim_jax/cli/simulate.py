@@ -6,10 +6,13 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from egosim_jax.cli.recording import Recording
 from egosim_jax.cli.sheet import Block, draw_sheet
+from egosim_jax.cli.view import RECORDING, write_portrait
 from egosim_jax.command import DONE
 from egosim_jax.types import InputError, check_counts
 
@@ -30,8 +33,10 @@ class Simulate:
     """Act several times in a scene of the tabletop world, which remembers what was done.
 
     Each clip is generated from a view of the state, read back, and fused into it. Writes for each
-    clip clip_N.mp4 and clip_N_cmp.mp4 (view | hands | generated | truth), the states before and
-    after as PLY, contact_sheet.png and report.json. An interrupted run goes on where it stopped.
+    clip clip_N.mp4 and clip_N_cmp.mp4 (view | hands | generated | truth), the state before the
+    first and after each as state_N.ply and state_N.png, contact_sheet.png, report.json and, if
+    Rerun is installed, simulation.rrd for `egosim view`. An interrupted run goes on where it
+    stopped.
     """
 
     config: str = "tabletop"
@@ -60,7 +65,6 @@ class Simulate:
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
         from egosim_jax.simulator import Simulator
-        from egosim_jax.state.snapshot import write_ply
         from egosim_jax.worlds.tabletop import make_sequence, to_action
 
         check_counts({"--clips": self.clips})
@@ -82,12 +86,16 @@ class Simulate:
             seed=self.seed,
             first_frame=self._image(truth[0]),
         )
-        write_ply(folder / "state_0.ply", truth[0].state)
-        report, blocks = [], []
+        recording = Recording(folder / RECORDING, folder.name) if find_spec("rerun") else None
+        state, report, blocks = truth[0].state, [], []
+        _write_state(folder, 0, state)
         then = time.monotonic()
         for clip, step in zip(truth, steps, strict=True):
             report.append({"clip": clip.number + 1, "action": clip.caption, **score(step, clip)})
             blocks.append(_write(folder, clip, step))
+            if recording is not None:
+                recording.add(state, to_action(clip), step, clip.frames)
+            state = step.state
             print(folder / f"clip_{clip.number + 1}.mp4")
             print(
                 f"clip {clip.number + 1}/{self.clips}: {clip.caption} "
@@ -95,6 +103,8 @@ class Simulate:
                 file=sys.stderr,
             )
             then = time.monotonic()
+        if recording is not None:
+            recording.close(state)
         write_json(folder / "report.json", {"definitions": DEFINITIONS, "clips": report})
         draw_sheet(blocks, folder / "contact_sheet.png", moments=SHEET_MOMENTS)
         _print(report)
@@ -197,15 +207,21 @@ def _write(folder: Path, clip: TabletopClip, step: Step) -> Block:
 
     from egosim_jax.io.video import write_video
     from egosim_jax.rendering.reference import draw_hands
-    from egosim_jax.state.snapshot import write_ply
 
     hands = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)[0]
     shown = [step.view.frames, hands, step.clip.frames, clip.frames]
     name = f"clip_{clip.number + 1}"
     write_video(folder / f"{name}.mp4", step.clip.frames, step.clip.fps)
     write_video(folder / f"{name}_cmp.mp4", np.concatenate(shown, axis=2), step.clip.fps)
-    write_ply(folder / f"state_{clip.number + 1}.ply", step.state)
+    _write_state(folder, clip.number + 1, step.state)
     return Block(f"{clip.number + 1}: {clip.caption}   (view, hands, generated, truth)", shown)
+
+
+def _write_state(folder: Path, number: int, state: SceneState) -> None:
+    from egosim_jax.state.snapshot import write_ply
+
+    write_ply(folder / f"state_{number}.ply", state)
+    write_portrait(folder / f"state_{number}.png", state, up="z")
 
 
 def _print(report: Sequence[dict[str, Any]]) -> None:

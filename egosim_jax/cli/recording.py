@@ -1,0 +1,84 @@
+"""A simulation as a Rerun recording: scene, cameras, hands and videos, to be looked at in time.
+
+Entities, in metres and the world's coordinates: `world/state`, the points before each clip;
+`world/hands/N`, the skeletons; `world/camera`, with the generated picture in its frustum; beside
+it `view` and `truth`. The timeline `frame` counts through all clips.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egosim_jax.simulator import Step
+    from egosim_jax.types import Action, SceneState
+
+POINT_M, BONE_M = 0.0015, 0.004
+"""Radius of points and of bones."""
+QUALITY = 85
+"""Of the pictures, which are kept as JPEG."""
+
+
+class Recording:
+    """A recording under way; it is there under its name once it is closed."""
+
+    def __init__(self, path: Path, name: str):
+        import rerun as rr
+        import rerun.blueprint as rrb
+
+        self._path, self._temporary = path, path.with_suffix(".tmp")
+        self._rr, self._frame = rr, 0
+        self._stream = rr.RecordingStream("egosim", recording_id=name)
+        self._stream.save(self._temporary)
+        pictures = (("view", "/view"), ("generated", "/world/camera"), ("truth", "/truth"))
+        column = rrb.Vertical(*(rrb.Spatial2DView(name=n, origin=o) for n, o in pictures))
+        scene = rrb.Spatial3DView(name="world", origin="/world")
+        self._stream.send_blueprint(rrb.Blueprint(rrb.Horizontal(scene, column)))
+        self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def add(self, state: SceneState, action: Action, step: Step, truth: np.ndarray) -> None:
+        """Record a clip: the state before it, and what was done, generated and true, by frame."""
+        from egosim_jax.rendering.skeleton import SKELETONS
+
+        rr, log = self._rr, self._stream.log
+        bones = SKELETONS[action.kind].bones
+        cameras = action.cameras
+        for frame, pose in enumerate(cameras.world_from_camera):
+            self._stream.set_time("frame", sequence=self._frame)
+            if frame == 0:
+                self._points(state)
+                log("action", rr.TextLog(action.prompt))
+            log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            log(
+                "world/camera",
+                rr.Pinhole(
+                    image_from_camera=cameras.intrinsics_px,
+                    width=cameras.width,
+                    height=cameras.height,
+                    image_plane_distance=0.15,
+                ),
+            )
+            log("world/camera", self._picture(step.clip.frames[frame]))
+            log("view", self._picture(step.view.frames[frame]))
+            log("truth", self._picture(truth[frame]))
+            for number, joints in enumerate(action.joints_m[frame]):
+                log(f"world/hands/{number}", rr.LineStrips3D(joints[bones], radii=BONE_M))
+            self._frame += 1
+
+    def close(self, state: SceneState) -> None:
+        """Record the last state and give the file its name."""
+        self._stream.set_time("frame", sequence=self._frame)
+        self._points(state)
+        self._stream.flush()
+        self._stream.disconnect()
+        self._temporary.replace(self._path)
+
+    def _points(self, state: SceneState) -> None:
+        points = self._rr.Points3D(state.points_m, colors=state.colours, radii=POINT_M)
+        self._stream.log("world/state", points)
+
+    def _picture(self, frame: np.ndarray) -> Any:
+        return self._rr.Image(frame).compress(jpeg_quality=QUALITY)

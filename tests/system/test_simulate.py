@@ -1,0 +1,151 @@
+"""The closed loop by its commands: simulate, look, and compare with a world that forgets."""
+
+import json
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egosim_jax import configs
+from egosim_jax.cli import view
+from egosim_jax.cli.__main__ import main
+from egosim_jax.generator import Networks
+from egosim_jax.io.video import probe_video
+from egosim_jax.state.snapshot import load, read_ply
+from egosim_jax.types import SceneState
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("weights")
+    Networks.random(configs.get("debug"), seed=0).save(folder)
+    return folder
+
+
+def simulate(weights: Path, out: Path, *more: str) -> int:
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out), "--clips", "2"]
+    return main(["simulate", *fixed, "--perception", "oracle", *more])
+
+
+@pytest.fixture(scope="module")
+def simulated(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "demo"
+    assert simulate(weights, out) == 0
+    return out
+
+
+def test_each_clip_has_videos_numbers_and_a_state(simulated):
+    report = json.loads((simulated / "report.json").read_text("utf-8"))
+    assert [line["clip"] for line in report["clips"]] == [1, 2]
+    for line in report["clips"]:
+        assert {"psnr", "ssim", "region_psnr", "depth_error", "camera_error"} <= line.keys()
+    for number in (1, 2):
+        assert probe_video(simulated / f"clip_{number}.mp4").frames == 9
+        assert probe_video(simulated / f"clip_{number}_cmp.mp4").width == 4 * 96
+    for number in range(3):
+        assert (simulated / f"state_{number}.ply").exists()
+        assert (simulated / f"state_{number}.png").exists()
+    assert (simulated / "contact_sheet.png").exists()
+
+
+def test_the_world_has_changed_from_clip_to_clip(simulated):
+    states = [read_ply(simulated / f"state_{number}.ply") for number in range(3)]
+    moved = [not np.array_equal(a.points_m, b.points_m) for a, b in pairwise(states)]
+    assert all(moved)
+
+
+def test_the_recording_has_the_scene_the_hands_and_the_pictures(simulated):
+    command = [sys.executable, "-m", "rerun", "rrd", "print", "-v"]
+    printed = subprocess.run(
+        [*command, str(simulated / "simulation.rrd")], capture_output=True, text=True, check=True
+    ).stdout
+    for entity in ("/world/state", "/world/hands/0", "/world/camera", "/view", "/truth"):
+        assert entity in printed
+
+
+def test_the_same_command_again_makes_nothing_new(simulated, weights):
+    journal = (simulated / "journal.jsonl").read_bytes()
+    report = (simulated / "report.json").read_bytes()
+    assert simulate(weights, simulated) == 0
+    assert (simulated / "journal.jsonl").read_bytes() == journal
+    assert (simulated / "report.json").read_bytes() == report
+
+
+def test_a_folder_of_another_run_is_refused(simulated, weights, capsys):
+    assert simulate(weights, simulated, "--seed", "7") == 2
+    assert "seed" in capsys.readouterr().err
+
+
+def test_without_update_the_state_stays(weights, tmp_path):
+    assert simulate(weights, tmp_path / "run", "--update", "none") == 0
+    states = [(tmp_path / "run" / f"state_{number}.ply").read_bytes() for number in range(3)]
+    assert states[0] == states[1] == states[2]
+
+
+@pytest.mark.parametrize("bad", ["missing.png", "small.png"])
+def test_a_first_frame_that_does_not_fit_is_refused(weights, tmp_path, capsys, bad):
+    Image.new("RGB", (8, 8)).save(tmp_path / "small.png")
+    given = ["--first-frame", str(tmp_path / bad)]
+    assert simulate(weights, tmp_path / "run", *given) == 2
+    assert bad in capsys.readouterr().err
+
+
+def test_a_state_and_a_point_cloud_are_drawn_from_three_sides(simulated, tmp_path, capsys):
+    for number, path in enumerate((simulated / "clip_1" / "state", simulated / "state_1.ply")):
+        out = tmp_path / f"{number}.png"
+        assert main(["view", str(path), "--out", str(out), "--up", "z"]) == 0
+        with Image.open(out) as picture:
+            assert picture.size == (3 * 640, 480)
+    count = len(load(simulated / "clip_1" / "state").points_m)
+    assert f"{count} points" in capsys.readouterr().out
+    assert (tmp_path / "0.png").read_bytes() == (tmp_path / "1.png").read_bytes()
+
+
+@pytest.mark.parametrize(("up", "top"), [("z", [0, 0, 1]), ("-y", [0, -1, 0])])
+def test_what_is_up_is_drawn_above(up, top):
+    """Two balls: a red one above a green one."""
+    rng = np.random.default_rng(0)
+    ball = 0.05 * rng.normal(size=(500, 3))
+    state = SceneState(
+        points_m=np.concatenate([ball, ball + 0.4 * np.array(top)]).astype(np.float32),
+        colours=np.repeat(np.array([[0, 255, 0], [255, 0, 0]], np.uint8), 500, axis=0),
+        object_ids=np.zeros(1000, np.int32),
+        last_seen=np.zeros(1000, np.int32),
+        intrinsics_px=np.eye(3),
+    )
+    for picture in view.portrait(state, up=up):
+        red, green = (np.argwhere(picture[..., k] > 0)[:, 0].mean() for k in (0, 1))
+        assert red < green - 50
+
+
+def test_what_cannot_be_looked_at_is_named(tmp_path, simulated, capsys, monkeypatch):
+    for path in (tmp_path / "nothing", tmp_path):
+        assert main(["view", str(path)]) == 2
+        assert str(path) in capsys.readouterr().err
+    monkeypatch.setattr(view, "find_spec", lambda name: None)
+    assert main(["view", str(simulated)]) == 2
+    assert "egosim-jax[viewer]" in capsys.readouterr().err
+
+
+def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(
+    weights, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
+    command = ["experiment", "continuous", *fixed, "--sequences", "2", "--clips", "2"]
+    assert main(command) == 0
+    tables = json.loads((out / "report.json").read_text("utf-8"))["tables"]
+    assert tables.keys() == {"update, oracle", "update, classical", "no update"}
+    first = [table[0]["psnr"]["mean"] for table in tables.values()]
+    assert first[0] == first[1] == first[2]  # before the first clip there is nothing to remember
+    assert tables["update, oracle"][1]["prior_psnr"] != tables["no update"][1]["prior_psnr"]
+    assert (out / "curves.png").exists()
+    assert "no update" in capsys.readouterr().out
+    kept = (out / "report.json").read_bytes()
+    (out / "no_update" / "200" / "scores.json").unlink()
+    assert main(command) == 0
+    assert (out / "report.json").read_bytes() == kept
