@@ -11,6 +11,7 @@ import tyro
 
 from egosim_jax import command
 from egosim_jax.cli.ablation import Tabletop
+from egosim_jax.cli.accuracy import Update
 from egosim_jax.cli.continuous import Continuous
 from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
 from egosim_jax.cli.evaluate import Evaluate
@@ -45,6 +46,7 @@ class Experiment:
     command: (
         Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
         | Annotated[Continuous, tyro.conf.subcommand("continuous")]
+        | Annotated[Update, tyro.conf.subcommand("update")]
         | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
         | Annotated[Debug, tyro.conf.subcommand("debug")]
     )

@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from egosim_jax import configs
-from egosim_jax.cli import view
+from egosim_jax.cli import accuracy, view
 from egosim_jax.cli.__main__ import main
 from egosim_jax.generator import Networks
 from egosim_jax.io.video import probe_video
 from egosim_jax.state.snapshot import load, read_ply
-from egosim_jax.types import SceneState
+from egosim_jax.types import SceneState, VideoSpec
 
 
 @pytest.fixture(scope="module")
@@ -149,3 +149,26 @@ def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(
     (out / "no_update" / "200" / "scores.json").unlink()
     assert main(command) == 0
     assert (out / "report.json").read_bytes() == kept
+
+
+def test_the_state_after_a_thing_was_carried_is_compared_with_the_truth(
+    weights, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(accuracy, "LARGE", VideoSpec(frames=9, height=96, width=160))
+    out = tmp_path / "out"
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
+    assert main(["experiment", "update", *fixed, "--scenes", "1"]) == 0
+    table = json.loads((out / "report.json").read_text("utf-8"))["table"]
+    assert table.keys() == {
+        "oracle, 160 x 96",
+        "oracle, 96 x 64",
+        "classical, true frames",
+        "classical, generated frames",
+    }
+    told = {name: value["mean"] for name, value in table["oracle, 160 x 96"].items()}
+    assert told["accurate"] >= 95
+    assert told["complete"] >= 80
+    assert told["left"] < 2
+    lost = table["classical, generated frames"]  # of random weights: nothing is found in noise
+    assert lost["left"]["mean"] > 90
+    assert "left behind" in capsys.readouterr().out

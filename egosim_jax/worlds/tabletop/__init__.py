@@ -20,6 +20,7 @@ from egosim_jax.rendering.reference import draw_hands, render
 from egosim_jax.types import Action, Cameras, Kind, SceneState, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
+from egosim_jax.worlds.tabletop.bodies import Part
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, Stage
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene, make_scene
 
@@ -51,6 +52,8 @@ class TabletopClip:
     """Pose of every body; of an articulated one, that of its moving part."""
     body_ids: Mapping[str, int]
     """Id of the same in `ids`."""
+    parts: Mapping[str, Part]
+    """The mesh of the same, in its own coordinates."""
     paints: Mapping[int, tuple[int, int, int]]
     """RGB of everything by its id in `ids`, in full light."""
     first: Picture
@@ -145,6 +148,7 @@ def _clip(
         joints_m=np.array(joints),
         world_from_body=_poses(moments),
         body_ids=_numbers(moments[0].scene),
+        parts={body.name: body.parts[0] for body in moments[0].scene.bodies},
         paints=paints,
         first=first,
         state=replace(state, step=number, provenance={"world": "tabletop", "seed": str(seed)}),
