@@ -56,11 +56,15 @@ def _splat(
     margin = point_px - 1  # a square may begin this far outside and still show
     rows, columns = height + margin, width + margin
     count = len(points_m)
+    points = points_m.astype(jnp.float32).T
 
     def frame(camera_from_world: Array) -> tuple[Array, Array]:
-        local = transform(camera_from_world, points_m.astype(jnp.float32))
-        z = local[:, 2]
-        u, v = project(intrinsics_px, local)
+        # Written out: as a product of matrices with three columns it takes ten times as long.
+        x, y, z = (
+            a * points[0] + b * points[1] + c * points[2] + shift
+            for a, b, c, shift in camera_from_world[:3]
+        )
+        u, v = project(intrinsics_px, jnp.stack([x, y, z], axis=-1))
         column = jnp.ceil(u - point_px / 2) + margin
         row = jnp.ceil(v - point_px / 2) + margin
         seen = (z >= NEAR_M) & (z <= FAR_M)
