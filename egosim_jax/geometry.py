@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from egosim_jax.types import Cameras, InputError
 
@@ -39,6 +39,21 @@ def project(intrinsics_px: Float[Any, "3 3"], points: Float[Any, "*b n 3"]) -> t
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     focal_x, focal_y = intrinsics_px[0, 0], intrinsics_px[1, 1]
     return focal_x * x / z + intrinsics_px[0, 2], focal_y * y / z + intrinsics_px[1, 2]
+
+
+def pixels_of(
+    cameras: Cameras, points: Float[np.ndarray, "*b n 3"]
+) -> tuple[Int[np.ndarray, "*b n"], Int[np.ndarray, "*b n"], Bool[np.ndarray, "*b n"]]:
+    """Row and column of the pixel that points of a camera's coordinates fall into.
+
+    And whether they do: those behind the camera or beside the picture have row and column 0.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = project(cameras.intrinsics_px, points)
+        inside = (points[..., 2] > 0) & (u > -0.5) & (v > -0.5)
+        inside &= (u < cameras.width - 0.5) & (v < cameras.height - 0.5)
+    column, row = (np.rint(np.where(inside, x, 0)).astype(int) for x in (u, v))
+    return row, column, inside
 
 
 def pixel_rays(
@@ -87,7 +102,6 @@ def umeyama(
     targets: Float[np.ndarray, "n 3"],
     *,
     scaled: bool = False,
-    weights: Float[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, "4 4"]:
     """The motion that brings points nearest to their targets in the least squares sense.
 
@@ -95,11 +109,9 @@ def umeyama(
     1991, equations 40 to 43. Raises `InputError` if the points do not determine it: fewer than
     three, or all on one line.
     """
-    share = np.full(len(points), 1.0) if weights is None else weights
-    share = share / share.sum()
-    middle, aim = share @ points, share @ targets
+    middle, aim = points.mean(axis=0), targets.mean(axis=0)
     centred, aimed = points - middle, targets - aim
-    u, strength, vt = np.linalg.svd((share[:, None] * aimed).T @ centred)
+    u, strength, vt = np.linalg.svd(aimed.T @ centred / len(points))
     if len(points) < 3 or strength[1] <= 1e-12 * max(strength[0], 1e-300):
         raise InputError(
             f"{len(points)} points do not determine a motion: it takes three that are not in line."
@@ -108,7 +120,7 @@ def umeyama(
     motion = np.eye(4)
     motion[:3, :3] = (u * signs) @ vt
     if scaled:
-        motion[:3, :3] *= (strength * signs).sum() / (share @ np.square(centred).sum(axis=1))
+        motion[:3, :3] *= (strength * signs).sum() / np.square(centred).sum(axis=1).mean()
     motion[:3, 3] = aim - motion[:3, :3] @ middle
     return motion
 

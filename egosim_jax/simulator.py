@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.io.journal import Journal
+from egosim_jax.io.whole import whole
 from egosim_jax.perception import Perception, archive
 from egosim_jax.rendering.reference import render
 from egosim_jax.state import snapshot
@@ -170,10 +171,8 @@ def _afresh(
 
 
 def _save_frames(path: Path, frames: UInt8[np.ndarray, "f h w 3"]) -> None:
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        np.savez(file, frames=frames)
-    temporary.replace(path)
+    with whole(path) as temporary:
+        np.savez(temporary, frames=frames)
 
 
 def _load_frames(path: Path) -> UInt8[np.ndarray, "f h w 3"]:

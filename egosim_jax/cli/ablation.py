@@ -85,7 +85,7 @@ class Tabletop:
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
-        generator = Generator(config, Networks.load(config, weights))
+        generator = Generator(config.at(weights), Networks.load(config, weights))
         kinds: tuple[Kind, ...] = ("human", "robot")
         tables = {kind: self._compare(kind, generator) for kind in kinds}
         write_json(self.out / "report.json", {"definitions": DEFINITIONS, "tables": tables})

@@ -155,16 +155,13 @@ def _seen_before(clip: TabletopClip, after: SceneState) -> np.ndarray:
     """
     import numpy as np
 
-    from egosim_jax.geometry import invert, project, transform
+    from egosim_jax.geometry import invert, pixels_of, transform
     from egosim_jax.metrics.update import NEAR_M
 
     cameras, first = clip.cameras, clip.first
     points = after.points_m[after.object_ids == 0]
     local = transform(invert(cameras.world_from_camera[0]), points.astype(float))
-    points, local = points[local[:, 2] > 0], local[local[:, 2] > 0]
-    column, row = (np.rint(x).astype(int) for x in project(cameras.intrinsics_px, local))
-    inside = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    row, column, inside = pixels_of(cameras, local)
     bare = np.where(np.isin(first.ids, list(clip.state.names)), np.inf, first.depth_m)
     return points[inside & (np.abs(bare[row, column] - local[:, 2]) <= NEAR_M)]
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
 from egosim_jax.command import DONE
+from egosim_jax.io.whole import whole
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
 
@@ -56,7 +57,7 @@ class Continuous:
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
-        generator = Generator(config, Networks.load(config, weights))
+        generator = Generator(config.at(weights), Networks.load(config, weights))
         seeds = range(self.first_scene, self.first_scene + self.sequences)
         jobs = [(method, seed) for seed in seeds for method in METHODS]
         scores: dict[str, list[Scores]] = {method: [] for method in METHODS}
@@ -133,9 +134,8 @@ def draw(tables: Mapping[str, Sequence[Mapping[str, Mapping[str, float]]]], path
         axes.set_xlabel("clip")
         axes.grid(visible=True, alpha=0.3)
     figure.axes[0].legend()
-    temporary = path.with_name(f"{path.stem}.tmp.png")
-    figure.savefig(temporary, dpi=100)
-    temporary.replace(path)
+    with whole(path) as temporary:
+        figure.savefig(temporary, dpi=100)
 
 
 def _print(method: str, table: Sequence[Mapping[str, Mapping[str, float]]]) -> None:

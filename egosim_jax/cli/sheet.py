@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egosim_jax.io.whole import whole
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -47,6 +49,5 @@ def draw_sheet(
                 ImageDraw.Draw(header).text((2, 2), block.title, fill="black")
                 rows.append(np.asarray(header))
             rows.append(row)
-    temporary = out.with_name(f"{out.stem}.tmp{out.suffix}")
-    Image.fromarray(np.concatenate(rows)).save(temporary)
-    temporary.replace(out)
+    with whole(out) as temporary:
+        Image.fromarray(np.concatenate(rows)).save(temporary)

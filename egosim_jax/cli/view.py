@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from egosim_jax.command import DONE
+from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -87,10 +88,8 @@ def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:
     import numpy as np
     from PIL import Image
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
-    Image.fromarray(np.concatenate(list(portrait(state, up=up)), axis=1)).save(temporary)
-    temporary.replace(path)
+    with whole(path) as temporary:
+        Image.fromarray(np.concatenate(list(portrait(state, up=up)), axis=1)).save(temporary)
 
 
 def portrait(state: SceneState, *, up: Up) -> np.ndarray:

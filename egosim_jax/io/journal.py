@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -28,10 +29,11 @@ class Journal:
         self._path = folder / "journal.jsonl"
         self.done: dict[str, dict[str, str | float]] = {}
         if self._path.exists():
-            whole, _, torn = self._path.read_bytes().rpartition(b"\n")
+            lines, _, torn = self._path.read_bytes().rpartition(b"\n")
             if torn:  # the run was killed in the middle of a line
-                self._rewrite(whole + b"\n" if whole else b"")
-            for line in whole.splitlines():
+                with whole(self._path) as temporary:
+                    temporary.write_bytes(lines + b"\n" if lines else b"")
+            for line in lines.splitlines():
                 entry = json.loads(line)
                 self.done[entry["phase"]] = entry
 
@@ -75,11 +77,6 @@ class Journal:
             file.flush()
             os.fsync(file.fileno())
         self.done[name] = entry
-
-    def _rewrite(self, data: bytes) -> None:
-        temporary = self._path.with_suffix(".tmp")
-        temporary.write_bytes(data)
-        temporary.replace(self._path)
 
 
 def digest(path: Path) -> str:

@@ -26,6 +26,7 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
+from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000
@@ -107,12 +108,10 @@ def decode_video(
 def write_video(
     path: Path, frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = 10
 ) -> None:
-    """Write an H.264 mp4: to a temporary name, then renamed, so that it is whole or absent."""
+    """Write an H.264 mp4, whole or not at all."""
     data = encode_video(frames, fps, crf=crf)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    temporary.replace(path)
+    with whole(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def encode_video(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from egosim_jax.io.whole import whole
 from egosim_jax.state.filter import from_arrays, to_arrays
 from egosim_jax.types import Cameras, InputError, Perceived
 
@@ -15,7 +16,7 @@ PIXELS = ("frames", "depth_m", "object_ids")
 
 
 def save(path: Path, perceived: Perceived) -> None:
-    """Write to a temporary name, then rename."""
+    """Write a file that ends in .npz, whole or not at all."""
     tracked = sorted(perceived.world_from_object)
     about = {
         "step": perceived.step,
@@ -31,10 +32,8 @@ def save(path: Path, perceived: Perceived) -> None:
         **{name: getattr(perceived, name) for name in PIXELS},
         **to_arrays(perceived.touched),
     }
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
-    temporary.replace(path)
+    with whole(path) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def load(path: Path) -> Perceived:

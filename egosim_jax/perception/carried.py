@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import beside, invert, project, transform, umeyama
+from egosim_jax.geometry import beside, invert, pixels_of, transform, umeyama
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.fuse import widened
 from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState
@@ -203,10 +203,7 @@ def _cost(
     every = max(1, len(thing.points_m) // SOME_POINTS)
     points, colours = thing.points_m[::every], thing.colours[::every]
     there = transform(invert(cameras.world_from_camera) @ path, points)
-    u, v = project(cameras.intrinsics_px, there)
-    column, row = np.rint(u).astype(int), np.rint(v).astype(int)
-    inside = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
-    inside &= there[..., 2] > 0
+    row, column, inside = pixels_of(cameras, there)
     frame = np.broadcast_to(np.arange(len(path))[:, None], column.shape)
     place = frame[inside], row[inside], column[inside]
     seen = ~hidden[place]

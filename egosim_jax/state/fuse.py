@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import beside, invert, project, transform
+from egosim_jax.geometry import beside, invert, pixels_of, transform
 from egosim_jax.state.filter import gone
 from egosim_jax.state.tsdf import Fusion, steady, surface
 from egosim_jax.types import Perceived, SceneState
@@ -154,11 +154,7 @@ def _surface_behind(
         own = old.object_ids == number
         then = camera_from_world @ path[frame] @ invert(path[-1])
         local[own] = transform(then, old.points_m[own].astype(np.float64))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        columns, rows = project(cameras.intrinsics_px, local)
-        inside = (local[:, 2] > 0) & (np.abs(columns) < 1e6) & (np.abs(rows) < 1e6)
-    column, row = (np.rint(np.where(inside, x, -1)).astype(int) for x in (columns, rows))
-    inside &= (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
+    row, column, inside = pixels_of(cameras, local)
     behind = np.full(len(local), np.nan)
     behind[inside] = depth_m[row[inside], column[inside]] - local[inside, 2]
     return behind

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError, SceneState
 
 VERSION = 1
@@ -113,11 +114,9 @@ def write_ply(path: Path, state: SceneState) -> None:
     for name in ("object_ids", "last_seen"):
         column = np.ascontiguousarray(getattr(state, name).reshape(-1, 1))
         cloud.point[name] = o3d.core.Tensor(column)
-    temporary = path.with_name(f"{path.stem}.tmp.ply")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not o3d.t.io.write_point_cloud(str(temporary), cloud):
-        raise OSError(f"{path} could not be written")
-    temporary.replace(path)
+    with whole(path) as temporary:
+        if not o3d.t.io.write_point_cloud(str(temporary), cloud):
+            raise OSError(f"{path} could not be written")
 
 
 def read_ply(path: Path, template: SceneState | None = None) -> SceneState:

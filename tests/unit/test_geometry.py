@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from egosim_jax.geometry import finer, invert, look_at, pixel_rays, project, transform, turned
+from egosim_jax.geometry import (
+    finer,
+    invert,
+    look_at,
+    pixel_rays,
+    pixels_of,
+    project,
+    transform,
+    turned,
+)
+from egosim_jax.types import Cameras
 
 INTRINSICS = np.array([[50.0, 0, 15.3], [0, 48.0, 11.1], [0, 0, 1]])
 
@@ -52,3 +62,20 @@ def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_up_above():
     assert local[1, 1] < 0
     assert local[1, 0] == pytest.approx(0)
     assert np.linalg.det(world_from_camera[:3, :3]) == pytest.approx(1)
+
+
+def test_points_fall_into_the_pixels_whose_squares_they_are_in():
+    cameras = Cameras(
+        world_from_camera=np.eye(4)[None],
+        intrinsics_px=np.array([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]]),
+        height=3,
+        width=5,
+    )
+    u, v, z = np.array(
+        [[0, 0, 1], [4.49, 2.49, 2], [-0.49, -0.49, 3], [4.51, 1, 1], [2, -0.51, 1], [2, 1, -1]]
+    ).T
+    points = np.stack([(u - 2) / 10 * z, (v - 1) / 10 * z, z], axis=-1)
+    row, column, inside = pixels_of(cameras, np.concatenate([points, np.zeros((1, 3))]))
+    assert inside.tolist() == [True, True, True, False, False, False, False]
+    assert row[inside].tolist() == [0, 2, 0]
+    assert column[inside].tolist() == [0, 4, 0]
