@@ -45,7 +45,7 @@ MOST_PICKLE, MOST_ENTRIES, DEEPEST = 64 << 20, 1 << 20, 64
 LOCAL_HEADER, LOCAL_MAGIC = 30, b"PK\x03\x04"
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """What in the pickle cannot be read, and why."""
 
 
@@ -92,7 +92,7 @@ def read_pth(path: Path) -> dict[str, Tensor]:
             data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
             entries = _entries(file, data)
         return _flat(_Machine(entries).run())
-    except (Refused, zipfile.BadZipFile, ValueError, OSError, struct.error) as error:
+    except (RefusedError, zipfile.BadZipFile, ValueError, OSError, struct.error) as error:
         raise InputError(
             f"{path} is not read: {error}. Only tensors in plain containers, as torch.save writes "
             "state dicts, are; resave the weights as such, or better as safetensors."
@@ -102,28 +102,30 @@ def read_pth(path: Path) -> dict[str, Tensor]:
 def _entries(file: Any, data: memoryview) -> dict[str, memoryview]:
     """The bytes of every entry, without the folder that they all lie in."""
     if bytes(data[:2]) != b"PK":
-        raise Refused("it is no zip; files from before torch 1.6 and bare pickles are not read")
+        raise RefusedError(
+            "it is no zip; files from before torch 1.6 and bare pickles are not read"
+        )
     with zipfile.ZipFile(file) as archive:
         listed = archive.infolist()
     if len(listed) > MOST_ENTRIES:
-        raise Refused(f"it has {len(listed)} entries, more than {MOST_ENTRIES}")
+        raise RefusedError(f"it has {len(listed)} entries, more than {MOST_ENTRIES}")
     if sum(entry.file_size for entry in listed) > len(data):
-        raise Refused("its entries are larger than the file")
+        raise RefusedError("its entries are larger than the file")
     found = {}
     for entry in listed:
         parts = entry.filename.split("/")
         if ".." in parts or entry.filename.startswith("/") or "\\" in entry.filename:
-            raise Refused(f"entry {entry.filename!r} points outside")
+            raise RefusedError(f"entry {entry.filename!r} points outside")
         if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-            raise Refused(f"entry {entry.filename!r} is compressed or encrypted")
+            raise RefusedError(f"entry {entry.filename!r} is compressed or encrypted")
         name = "/".join(parts[1:])
         if name in found:
-            raise Refused(f"entry {entry.filename!r} is there twice")
+            raise RefusedError(f"entry {entry.filename!r} is there twice")
         found[name] = _stored(entry, data)
     if found.get("byteorder", b"little") != b"little":
-        raise Refused("its numbers are big-endian")
+        raise RefusedError("its numbers are big-endian")
     if "data.pkl" not in found:
-        raise Refused("it has no data.pkl")
+        raise RefusedError("it has no data.pkl")
     return found
 
 
@@ -132,11 +134,11 @@ def _stored(entry: zipfile.ZipInfo, data: memoryview) -> memoryview:
     start = entry.header_offset
     header = bytes(data[start : start + LOCAL_HEADER])
     if len(header) < LOCAL_HEADER or header[:4] != LOCAL_MAGIC:
-        raise Refused(f"entry {entry.filename!r} has no header where the directory says")
+        raise RefusedError(f"entry {entry.filename!r} has no header where the directory says")
     name, extra = struct.unpack_from("<HH", header, 26)
     begin = start + LOCAL_HEADER + name + extra
     if begin + entry.file_size > len(data):
-        raise Refused(f"entry {entry.filename!r} goes on after the file's end")
+        raise RefusedError(f"entry {entry.filename!r} goes on after the file's end")
     return data[begin : begin + entry.file_size]
 
 
@@ -153,15 +155,15 @@ class _Machine:
         """What the pickle describes."""
         program = self.entries["data.pkl"]
         if len(program) > MOST_PICKLE:
-            raise Refused(f"its pickle has {len(program)} bytes, more than {MOST_PICKLE}")
+            raise RefusedError(f"its pickle has {len(program)} bytes, more than {MOST_PICKLE}")
         for opcode, argument, _ in pickletools.genops(bytes(program)):
             if opcode.name == "STOP":
                 return self._pop()
             action = ACTIONS.get(opcode.name)
             if action is None:
-                raise Refused(f"its pickle has the operation {opcode.name}")
+                raise RefusedError(f"its pickle has the operation {opcode.name}")
             action(self, argument)
-        raise Refused("its pickle does not stop")
+        raise RefusedError("its pickle does not stop")
 
     def push(self, value: Any) -> None:
         self.stack.append(value)
@@ -174,18 +176,18 @@ class _Machine:
 
     def recall(self, number: int) -> None:
         if number not in self.memo:
-            raise Refused(f"its pickle recalls {number}, which it has not made")
+            raise RefusedError(f"its pickle recalls {number}, which it has not made")
         self.push(self.memo[number])
 
     def name(self, text: str | None) -> None:
         if text is None:
             last, module = self._pop(), self._pop()
             if not (isinstance(last, str) and isinstance(module, str)):
-                raise Refused("its pickle makes up a name")
+                raise RefusedError("its pickle makes up a name")
             text = f"{module} {last}"
         full = text.replace(" ", ".", 1)
         if full not in KNOWN:
-            raise Refused(f"its pickle asks for {full}")
+            raise RefusedError(f"its pickle asks for {full}")
         self.push(Name(full))
 
     def tuple_of(self, count: int | None) -> None:
@@ -196,19 +198,19 @@ class _Machine:
         items = self._since_mark() if several else [self._pop()]
         target = self._top()
         if not isinstance(target, list):
-            raise Refused("its pickle appends to what is no list")
+            raise RefusedError("its pickle appends to what is no list")
         target += items
 
     def set_items(self, several: bool) -> None:
         items = self._since_mark() if several else [self._pop() for _ in range(2)][::-1]
         target = self._top()
         if not isinstance(target, dict) or len(items) % 2:
-            raise Refused("its pickle sets items of what is no dictionary")
+            raise RefusedError("its pickle sets items of what is no dictionary")
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, (str, int)):
-                raise Refused(f"a key is {type(key).__name__}, neither text nor a number")
+                raise RefusedError(f"a key is {type(key).__name__}, neither text nor a number")
             if key in target:
-                raise Refused(f"the key {key!r} is there twice")
+                raise RefusedError(f"the key {key!r} is there twice")
             target[key] = value
 
     def storage(self, _: None) -> None:
@@ -216,22 +218,22 @@ class _Machine:
             case ("storage", Name(kind), str(key), str(), int(count)):
                 pass
             case other:
-                raise Refused(f"its pickle refers to {other!r:.60}, which is no storage")
+                raise RefusedError(f"its pickle refers to {other!r:.60}, which is no storage")
         data = self.entries.get(f"data/{key}")
         if data is None:
-            raise Refused(f"the storage {key} is missing")
+            raise RefusedError(f"the storage {key} is missing")
         dtype = None if kind == UNTYPED else STORAGES.get(kind.removeprefix("torch."))
         if dtype is None and kind != UNTYPED:
-            raise Refused(f"{kind} is no storage")
+            raise RefusedError(f"{kind} is no storage")
         size = count * (1 if dtype is None else np.dtype(DTYPES[dtype]).itemsize)
         if count < 0 or size > len(data):
-            raise Refused(f"the storage {key} says {size} bytes and has {len(data)}")
+            raise RefusedError(f"the storage {key} says {size} bytes and has {len(data)}")
         self.push(Storage(data[:size], dtype))
 
     def call(self, _: None) -> None:
         arguments, name = self._pop(), self._pop()
         if not (isinstance(name, Name) and isinstance(arguments, tuple)):
-            raise Refused("its pickle calls what is no name")
+            raise RefusedError("its pickle calls what is no name")
         match (name.full, arguments):
             case ("collections.OrderedDict", ()):
                 self.push({})
@@ -253,27 +255,27 @@ class _Machine:
             ):  # fmt: skip
                 self.push(_tensor(storage, dtype.removeprefix("torch."), offset, size, stride))
             case _:
-                raise Refused(f"its pickle calls {name.full} with what it does not take")
+                raise RefusedError(f"its pickle calls {name.full} with what it does not take")
 
     def build(self, _: None) -> None:
         """A state dict's `_metadata` is left out; nothing else has a state."""
         state, target = self._pop(), self._top()
         if not (isinstance(state, dict) and isinstance(target, dict)):
-            raise Refused("its pickle sets the state of what is no dictionary")
+            raise RefusedError("its pickle sets the state of what is no dictionary")
 
     def _pop(self) -> Any:
         if not self.stack or (self.marks and len(self.stack) <= self.marks[-1]):
-            raise Refused("its pickle takes what it has not made")
+            raise RefusedError("its pickle takes what it has not made")
         return self.stack.pop()
 
     def _top(self) -> Any:
         if not self.stack:
-            raise Refused("its pickle uses what it has not made")
+            raise RefusedError("its pickle uses what it has not made")
         return self.stack[-1]
 
     def _since_mark(self) -> list[Any]:
         if not self.marks:
-            raise Refused("its pickle has no mark")
+            raise RefusedError("its pickle has no mark")
         begin = self.marks.pop()
         items = self.stack[begin:]
         del self.stack[begin:]
@@ -330,17 +332,19 @@ def _tensor(storage: Storage, dtype: str, offset: Any, size: tuple, stride: tupl
     """A tensor of a storage, if all its elements lie there."""
     numbers = (offset, *size, *stride)
     if len(size) != len(stride) or not all(type(n) is int and n >= 0 for n in numbers):
-        raise Refused(f"a tensor has offset {offset!r:.40}, size {size!r:.80}, stride {stride!r:.80}")
+        raise RefusedError(
+            f"a tensor has offset {offset!r:.40}, size {size!r:.80}, stride {stride!r:.80}"
+        )
     if dtype not in DTYPES:
-        raise Refused(f"a tensor is of {dtype}")
+        raise RefusedError(f"a tensor is of {dtype}")
     kind = np.dtype(DTYPES[dtype])
     count = math.prod(size)
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     here = len(storage.data) // kind.itemsize
     if count and last >= here:
-        raise Refused(f"a tensor of size {size} reaches element {last} of a storage of {here}")
+        raise RefusedError(f"a tensor of size {size} reaches element {last} of a storage of {here}")
     if count > max(here, 1):
-        raise Refused(f"a tensor of size {size} repeats the {here} elements of its storage")
+        raise RefusedError(f"a tensor of size {size} repeats the {here} elements of its storage")
     return Tensor(
         shape=tuple(size),
         dtype=kind,
@@ -358,17 +362,17 @@ def _flat(tree: Any) -> dict[str, Tensor]:
         node, name, depth = left.pop()
         visited += 1
         if visited > MOST_ENTRIES or depth > DEEPEST:
-            raise Refused("its containers are nested too deeply or repeat without end")
+            raise RefusedError("its containers are nested too deeply or repeat without end")
         if isinstance(node, Tensor):
             if name in found:
-                raise Refused(f"there are two tensors {name!r}")
+                raise RefusedError(f"there are two tensors {name!r}")
             found[name] = node
         elif isinstance(node, dict):
             left += [(v, f"{name}.{k}" if name else str(k), depth + 1) for k, v in node.items()]
         elif isinstance(node, (list, tuple)):
-            left += [
-                (v, f"{name}.{i}" if name else str(i), depth + 1) for i, v in enumerate(node)
-            ]
+            left += [(v, f"{name}.{i}" if name else str(i), depth + 1) for i, v in enumerate(node)]
         elif isinstance(node, (Name, Storage)):
-            raise Refused(f"{name or 'the whole'} is no tensor but {type(node).__name__.lower()}")
+            raise RefusedError(
+                f"{name or 'the whole'} is no tensor but {type(node).__name__.lower()}"
+            )
     return dict(reversed(found.items()))

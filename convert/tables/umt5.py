@@ -6,7 +6,7 @@ names, in any naming, that the network does not use.
 
 from __future__ import annotations
 
-from egosim_jax.io.weights import Rule
+from egosim_jax.convert.rules import Rule
 from egosim_jax.models.umt5 import UMT5Config
 
 

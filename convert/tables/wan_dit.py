@@ -7,7 +7,7 @@ use.
 
 from __future__ import annotations
 
-from egosim_jax.io.weights import Rule
+from egosim_jax.convert.rules import Rule
 from egosim_jax.models.wan_dit import WanDiTConfig
 
 PATCH_KERNEL = "o c 1 i j -> c i j o"

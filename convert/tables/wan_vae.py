@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 from flax import nnx
 
-from egosim_jax.io.weights import Rule, flat_shapes
+from egosim_jax.convert.rules import Rule
+from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 
 LEAVES = {"kernel": "weight", "bias": "bias", "scale": "gamma"}

@@ -1,69 +1,24 @@
-"""Weights in and out of safetensors, by a table of names.
+"""Weights in and out of safetensors, in our own names.
 
 A network's own format is one safetensors file whose keys are the dotted paths of its nnx state
-(`blocks.self_attn.q.kernel`); stacked blocks keep their leading `layers` axis. Foreign formats are
-read through a table of `Rule`s, each one pattern of a foreign name, the path it fills, and the
-transform between the two. The same table is used in both directions, and every difference is
-reported in one list.
+(`blocks.self_attn.q.kernel`); stacked blocks keep their leading `layers` axis. Every difference
+between a file and a network is reported in one list. Foreign formats are `convert`'s.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from fnmatch import fnmatchcase
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from einops import EinopsError, rearrange
 from flax import nnx
 
 from egosim_jax.io.digest import sha256
 from egosim_jax.types import InputError
 
-
-@dataclass(frozen=True)
-class Rule:
-    """One line of a name table.
-
-    `*` in `source` stands for the index of a stacked block; such a rule gathers all layers into
-    the leading axis of `target`. `transform` names an entry of `TRANSFORMS`, or is an einops
-    pattern itself. `part` (i, n) takes the i-th of n equal parts of the source's first axis: n
-    rules share a fused projection.
-    """
-
-    source: str
-    target: str
-    transform: str = "same"
-    part: tuple[int, int] = (0, 1)
-
-
-@dataclass(frozen=True)
-class Transform:
-    """A change of layout between a foreign tensor and ours, and its inverse."""
-
-    ours: Callable[[np.ndarray], np.ndarray]
-    theirs: Callable[[np.ndarray], np.ndarray]
-
-
-def _layout(ours: str) -> Transform:
-    """The transform of an einops pattern, theirs to ours, that names every axis by itself."""
-    left, right = ours.split("->")
-    return Transform(
-        lambda x: rearrange(x, ours),
-        lambda x: rearrange(x, f"{right} -> {left}"),
-    )
-
-
-TRANSFORMS: dict[str, Transform] = {
-    "same": Transform(lambda x: x, lambda x: x),
-    "linear": _layout("o i -> i o"),
-    "conv2d": _layout("o i h w -> h w i o"),
-    "conv3d": _layout("o i t h w -> t h w i o"),
-}
-"""Layout changes by name; a network's table may pass more of its own."""
+HASH = "sha256"
+"""Entry of a converted file's header: the hash of its weights, known without reading them."""
 
 
 class WeightsError(InputError):
@@ -85,94 +40,17 @@ def _leaves(module: nnx.Module) -> dict[str, nnx.Variable]:
     return {".".join(map(str, path)): leaf for path, leaf in nnx.to_flat_state(state)}
 
 
-def translate(
-    tensors: Mapping[str, np.ndarray],
-    rules: Sequence[Rule],
-    *,
-    ignore: Sequence[str] = (),
-    transforms: Mapping[str, Transform] = TRANSFORMS,
-    source: str = "the checkpoint",
-) -> dict[str, np.ndarray]:
-    """Foreign tensors under our paths.
-
-    Tensors whose name matches a pattern of `ignore` (`*` stands for anything) are left out, even
-    if a rule would read them. Raises `WeightsError` naming every other tensor that no rule reads
-    or whose shape does not fit its rule, every rule that found no tensor, and every gap in a
-    stack of layers.
-    """
-    found: dict[Rule, dict[int, np.ndarray]] = {}
-    unfit: set[Rule] = set()
-    patterns = [(rule, _regex(rule.source)) for rule in rules]
+def mismatches(have: Mapping[str, Any], want: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """Every path that is missing, unknown or of another shape; `have` holds what has a shape."""
     problems = []
-    for name, tensor in tensors.items():
-        if any(fnmatchcase(name, pattern) for pattern in ignore):
-            continue
-        matches = [(rule, hit) for rule, pattern in patterns if (hit := pattern.fullmatch(name))]
-        if matches:
-            for rule, hit in matches:
-                layer = int(hit.group(1)) if hit.groups() else 0
-                transform = _transform(rule, transforms)
-                try:
-                    fitted = transform.ours(_part(tensor, rule))
-                except (EinopsError, ValueError):
-                    want = f"a shape that {rule.transform!r} can bring to {rule.target}"
-                    problems.append(f"{name}: have {tensor.shape}, want {want}")
-                    unfit.add(rule)
-                else:
-                    found.setdefault(rule, {})[layer] = fitted
-        else:
-            problems.append(f"{name}: not known to this network's name table")
-    ours = {}
-    for rule in rules:
-        layers = found.get(rule, {})
-        if rule in unfit:
-            continue
-        if not layers:
-            problems.append(f"{rule.source}: missing (fills {rule.target})")
-        elif sorted(layers) != list(range(len(layers))):
-            gaps = sorted(set(range(max(layers))) - set(layers))
-            problems.append(f"{rule.source}: layers {gaps} are missing")
-        elif len({tensor.shape for tensor in layers.values()}) > 1:
-            problems.append(f"{rule.source}: the layers differ in shape")
-        elif "*" in rule.source:
-            ours[rule.target] = np.stack([layers[i] for i in range(len(layers))])
-        else:
-            ours[rule.target] = layers[0]
-    if problems:
-        raise WeightsError(problems, source=source)
-    return ours
-
-
-def translate_back(
-    ours: Mapping[str, np.ndarray],
-    rules: Sequence[Rule],
-    *,
-    transforms: Mapping[str, Transform] = TRANSFORMS,
-) -> dict[str, np.ndarray]:
-    """Our tensors under the foreign names: the inverse of `translate`."""
-    parts: dict[str, dict[int, np.ndarray]] = {}
-    for rule in rules:
-        tensor, transform = ours[rule.target], _transform(rule, transforms)
-        for layer, piece in enumerate(tensor if "*" in rule.source else [tensor]):
-            name = rule.source.replace("*", str(layer))
-            parts.setdefault(name, {})[rule.part[0]] = transform.theirs(piece)
-    return {
-        name: np.concatenate([found[i] for i in sorted(found)]) if len(found) > 1 else found[0]
-        for name, found in parts.items()
-    }
-
-
-def _transform(rule: Rule, transforms: Mapping[str, Transform]) -> Transform:
-    return transforms.get(rule.transform) or _layout(rule.transform)
-
-
-def _part(tensor: np.ndarray, rule: Rule) -> np.ndarray:
-    index, parts = rule.part
-    return np.split(tensor, parts)[index] if parts > 1 else tensor
-
-
-def _regex(pattern: str) -> re.Pattern[str]:
-    return re.compile(re.escape(pattern).replace(r"\*", r"(\d+)"))
+    for path in sorted(want.keys() | have.keys()):
+        if path not in have:
+            problems.append(f"{path}: have nothing, want {want[path]}")
+        elif path not in want:
+            problems.append(f"{path}: have {tuple(have[path].shape)}, want nothing")
+        elif tuple(have[path].shape) != want[path]:
+            problems.append(f"{path}: have {tuple(have[path].shape)}, want {want[path]}")
+    return problems
 
 
 def fill(
@@ -187,16 +65,7 @@ def fill(
     `dtype` casts floating tensors; by default they keep their own. Raises `WeightsError` naming
     every path that is missing, unknown or of another shape, before anything is changed.
     """
-    leaves = _leaves(module)
-    problems = []
-    for path in sorted(leaves.keys() | tensors.keys()):
-        if path not in tensors:
-            problems.append(f"{path}: have nothing, want {tuple(leaves[path].shape)}")
-        elif path not in leaves:
-            problems.append(f"{path}: have {tensors[path].shape}, want nothing")
-        elif tensors[path].shape != tuple(leaves[path].shape):
-            have, want = tensors[path].shape, tuple(leaves[path].shape)
-            problems.append(f"{path}: have {have}, want {want}")
+    problems = mismatches(tensors, flat_shapes(module))
     if problems:
         raise WeightsError(problems, source=source)
     import jax.numpy as jnp
@@ -209,10 +78,19 @@ def fill(
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file of a weights folder, by network."""
+    """What tells the files of a weights folder from others, by network.
+
+    The hash in a file's header, if it was converted; else the SHA-256 of the file.
+    """
+    from safetensors import safe_open
+
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of weights. (--weights)")
-    return {path.stem: sha256(path) for path in sorted(folder.glob("*.safetensors"))}
+    found = {}
+    for path in sorted(folder.glob("*.safetensors")):
+        with safe_open(path, framework="numpy") as file:
+            found[path.stem] = (file.metadata() or {}).get(HASH) or sha256(path)
+    return found
 
 
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:

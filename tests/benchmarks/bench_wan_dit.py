@@ -67,8 +67,9 @@ def programs() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
     from einops import rearrange
     from flax import nnx
 
+    from egosim_jax.convert.rules import translate
     from egosim_jax.convert.tables import wan_dit as table
-    from egosim_jax.io.weights import fill, translate
+    from egosim_jax.io.weights import fill
     from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 
     torch.set_num_threads(THREADS)

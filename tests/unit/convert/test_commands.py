@@ -1,61 +1,241 @@
-"""`egosim-convert`: a foreign checkpoint to a weights folder."""
+"""`egosim-convert`: checkpoints as they are released, to weights folders."""
+
+import importlib
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
+import torch
 from flax import nnx
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
+from safetensors.torch import save_file
 
 from egosim_jax import configs
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.tables import clip_vision
-from egosim_jax.io.weights import translate_back
-from egosim_jax.models.clip_vision import CLIPVision
+from egosim_jax.convert.commands import TABLES
+from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.rules import translate_back
+from egosim_jax.generator import Networks
+from egosim_jax.io.weights import flat_shapes, hashes
 
 CONFIG = configs.get("debug")
+NETWORKS = ("dit", "vae", "text", "image")
 
 
-@pytest.fixture(scope="module")
-def theirs() -> dict[str, np.ndarray]:
-    """The image encoder of `debug` in official names."""
-    shapes = nnx.state(nnx.eval_shape(lambda: CLIPVision(CONFIG.image, rngs=nnx.Rngs(0))))
-    rng = np.random.default_rng(0)
+def foreign(network, naming, dtype=torch.float32) -> dict[str, torch.Tensor]:
+    """A network of `debug` with random weights, in foreign names."""
+    parts = nnx.eval_shape(lambda: Networks(CONFIG, rngs=nnx.Rngs(0))).parts()
+    rng = np.random.default_rng(NETWORKS.index(network))
     ours = {
-        ".".join(map(str, path)): rng.normal(size=leaf.shape).astype(np.float32)
-        for path, leaf in nnx.to_flat_state(shapes)
+        path: rng.normal(size=shape).astype(np.float32)
+        for path, shape in flat_shapes(parts[network]).items()
     }
+    table = importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
+    theirs = translate_back(ours, getattr(table, naming)(getattr(CONFIG, network)))
     return {
-        name: np.ascontiguousarray(tensor)
-        for name, tensor in translate_back(ours, clip_vision.wan(CONFIG.image)).items()
+        name: torch.from_numpy(np.ascontiguousarray(tensor)).to(dtype)
+        for name, tensor in theirs.items()
     }
 
 
-def convert(source, out) -> int:
-    options = {"config": "debug", "network": "image", "layout": "wan", "source": source, "out": out}
-    return main(["weights", *(str(x) for k, v in options.items() for x in (f"--{k}", v))])
+def prefixed(tensors, prefix):
+    return {prefix + name: tensor for name, tensor in tensors.items()}
 
 
-def test_a_foreign_file_becomes_a_file_of_a_weights_folder(theirs, tmp_path):
-    save_file(theirs, tmp_path / "clip.safetensors")
-    assert convert(tmp_path / "clip.safetensors", tmp_path / "weights") == 0
-    ours = load_file(tmp_path / "weights" / "image.safetensors")
-    back = translate_back(ours, clip_vision.wan(CONFIG.image))
-    assert back.keys() == theirs.keys()
-    assert all(np.array_equal(back[name], theirs[name]) for name in theirs)
+def egosim(folder):
+    save_file(foreign("dit", "wan"), folder / "diffusion_pytorch_model.safetensors")
+    torch.save(foreign("vae", "wan"), folder / "Wan2.1_VAE.pth")
+    torch.save(foreign("text", "wan"), folder / "models_t5_umt5-xxl-enc-bf16.pth")
+    clip = foreign("image", "wan") | {"log_scale": torch.rand(()), "textual.a": torch.rand(2)}
+    torch.save(clip, folder / "models_clip_open-clip-xlm-roberta-large-vit-huge-14.pth")
 
 
-def test_a_file_that_lacks_tensors_is_refused_with_their_names(theirs, tmp_path, capsys):
-    less = {name: tensor for name, tensor in theirs.items() if "pre_norm" not in name}
+def sharded(folder, tensors, stem, shards=3):
+    """Sharded with an index, as the Wan releases are."""
+    names = sorted(tensors)
+    places = {
+        name: f"{stem}-{1 + number % shards:05d}-of-{shards:05d}.safetensors"
+        for number, name in enumerate(names)
+    }
+    for place in set(places.values()):
+        save_file({n: tensors[n] for n in names if places[n] == place}, folder / place)
+    index = folder / f"{stem}.safetensors.index.json"
+    index.write_text(json.dumps({"metadata": {}, "weight_map": places}), encoding="utf-8")
+
+
+def wan(folder):
+    sharded(folder, foreign("dit", "wan"), "diffusion_pytorch_model")
+    torch.save({"model_state": prefixed(foreign("vae", "wan"), "model.")}, folder / "vae.pth")
+    torch.save(foreign("text", "wan"), folder / "t5.pth")
+    torch.save(prefixed(foreign("image", "wan"), "model."), folder / "clip.pth")
+
+
+def diffusers(folder):
+    for name in ("transformer", "vae", "text_encoder", "image_encoder"):
+        (folder / name).mkdir()
+    sharded(folder / "transformer", foreign("dit", "diffusers"), "diffusion_pytorch_model")
+    save_file(foreign("vae", "diffusers"), folder / "vae" / "diffusion_pytorch_model.safetensors")
+    sharded(folder / "text_encoder", foreign("text", "transformers"), "model", 2)
+    clip = prefixed(foreign("image", "transformers"), "vision_model.")
+    save_file(clip, folder / "image_encoder" / "model.safetensors")
+
+
+def comfyui(folder):
+    dit = prefixed(foreign("dit", "wan"), "diffusion_model.")
+    save_file(dit, folder / "wan.safetensors")
+    save_file(foreign("vae", "wan"), folder / "vae.safetensors")
+    save_file(foreign("text", "transformers"), folder / "umt5.safetensors")
+    save_file(foreign("image", "transformers"), folder / "clip_vision.safetensors")
+
+
+LAYOUTS = {"EgoSim": egosim, "Wan": wan, "diffusers": diffusers, "ComfyUI": comfyui}
+
+
+@pytest.fixture(scope="module", params=LAYOUTS)
+def checkpoint(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    LAYOUTS[request.param](folder)
+    return folder
+
+
+def convert(source, out, *more):
+    return main(["weights", str(source), "--config", "debug", "--out", str(out), *more])
+
+
+def test_every_network_of_every_layout_is_converted_bit_for_bit(checkpoint, tmp_path, capsys):
+    assert convert(checkpoint, tmp_path / "out") == 0
+    for network in NETWORKS:
+        ours = load_file(tmp_path / "out" / f"{network}.safetensors")
+        table = importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
+        naming = next(n for n in ("wan", "transformers", "diffusers") if hasattr(table, n))
+        back = translate_back(ours, getattr(table, naming)(getattr(CONFIG, network)))
+        expected = foreign(network, naming)
+        assert back.keys() == expected.keys()
+        assert all(np.array_equal(back[name], expected[name].numpy()) for name in back)
+    Networks.load(CONFIG, tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {f"{network}.safetensors" for network in NETWORKS}
+    assert "GB/s" in capsys.readouterr().err
+
+
+def test_inspect_says_what_is_there_and_which_config_fits(checkpoint, capsys):
+    assert main(["inspect", str(checkpoint), "--tensors"]) == 0
+    said = capsys.readouterr().out
+    for network in NETWORKS:
+        line = next(line for line in said.splitlines() if f"│ {network} " in line)
+        assert "debug" in line
+        assert f"{sum(math.prod(t.shape) for t in of_any(checkpoint, network)):,}" in line
+    assert "missing networks: none" in said
+    assert sum("float32" in line for line in said.splitlines()) > 200
+
+
+def of_any(checkpoint, network):
+    return recognise(checkpoint).network(network).tensors.values()
+
+
+def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
+    tensors = foreign("image", "wan")
+    less = {name: tensor for name, tensor in tensors.items() if "pre_norm" not in name}
+    less["visual.cls_embedding"] = torch.rand(1, 1, 7)
+    less["surprise"] = torch.rand(1)
+    torch.save(foreign("vae", "wan"), tmp_path / "vae.pth")
     save_file(less, tmp_path / "clip.safetensors")
-    assert convert(tmp_path / "clip.safetensors", tmp_path / "weights") == 2
+    assert convert(tmp_path, tmp_path / "weights") == 2
     message = capsys.readouterr().err
-    assert "visual.pre_norm.weight" in message
-    assert "visual.pre_norm.bias" in message
+    for name in (
+        "visual.pre_norm.weight: missing", "visual.pre_norm.bias: missing", "surprise: not known",
+        "class_token: have (7,), want (32,)",
+    ):  # fmt: skip
+        assert name in message
+    assert "4 weights of clip.safetensors" in message
     assert not (tmp_path / "weights").exists()
 
 
-def test_inspect_lists_every_tensor(theirs, tmp_path, capsys):
-    save_file(theirs, tmp_path / "clip.safetensors")
-    assert main(["inspect", "--source", str(tmp_path)]) == 0
-    captured = capsys.readouterr()
-    assert len(captured.out.splitlines()) == len(theirs)
-    assert f"{sum(tensor.size for tensor in theirs.values()):,} weights" in captured.err
+def test_weights_are_stored_as_asked_and_half_precision_as_it_is(tmp_path):
+    save_file(foreign("dit", "wan", torch.bfloat16), tmp_path / "dit.safetensors")
+    assert convert(tmp_path, tmp_path / "same", "--only", "dit") == 0
+    assert convert(tmp_path, tmp_path / "wide", "--dtype", "float32") == 0
+    from safetensors.flax import load_file as load
+
+    same, wide = (load(tmp_path / name / "dit.safetensors") for name in ("same", "wide"))
+    for path in wide:
+        assert same[path].dtype == "bfloat16"
+        assert wide[path].dtype == "float32"
+        np.testing.assert_array_equal(same[path].astype("float32"), wide[path])
+
+
+def test_a_network_or_tokenizer_that_is_asked_for_must_be_there(tmp_path, capsys):
+    save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
+    assert convert(tmp_path, tmp_path / "out", "--only", "dit") == 2
+    assert "network dit" in capsys.readouterr().err
+    save_file({"a": torch.rand(1)}, tmp_path / "vae.safetensors")
+    assert convert(tmp_path, tmp_path / "out") == 2
+    assert "no network of ours" in capsys.readouterr().err
+
+
+def test_the_hash_in_the_header_tells_weights_apart(tmp_path):
+    save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
+    for name in ("a", "b"):
+        assert convert(tmp_path / "vae.safetensors", tmp_path / name) == 0
+    other = foreign("vae", "wan")
+    other["conv1.bias"] += 1
+    save_file(other, tmp_path / "vae.safetensors")
+    assert convert(tmp_path / "vae.safetensors", tmp_path / "c") == 0
+    a, b, c = (hashes(tmp_path / name)["vae"] for name in "abc")
+    assert a == b != c
+    assert len(a) == 64
+
+
+SLOW = """
+import sys, time
+from egosim_jax.convert import stream
+prepare = stream._prepare
+def slowly(piece):
+    time.sleep(0.02)
+    return prepare(piece)
+stream._prepare = slowly
+from egosim_jax.convert.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path):
+    save_file(foreign("dit", "wan"), tmp_path / "dit.safetensors")
+    assert convert(tmp_path / "dit.safetensors", tmp_path / "whole") == 0
+    out = tmp_path / "killed"
+    args = ["weights", str(tmp_path / "dit.safetensors"), "--config", "debug", "--out", str(out)]
+    log = out / "dit.safetensors.part.log"
+    process = subprocess.Popen([sys.executable, "-c", SLOW, *args], stderr=subprocess.DEVNULL)
+    while not (log.exists() and log.read_text("utf-8").count("\n") > 10):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert [path.name for path in sorted(out.iterdir())] == [
+        "dit.safetensors.part",
+        "dit.safetensors.part.log",
+    ]
+    done = log.read_text("utf-8").count("\n") - 1
+    log.write_text(log.read_text("utf-8") + "abc", encoding="utf-8")  # a torn line
+    assert convert(tmp_path / "dit.safetensors", out) == 0
+    assert 10 <= done < 60
+    whole, resumed = (folder / "dit.safetensors" for folder in (tmp_path / "whole", out))
+    assert whole.read_bytes() == resumed.read_bytes()
+    assert [path.name for path in out.iterdir()] == ["dit.safetensors"]
+
+
+def test_a_half_written_file_of_another_source_is_not_gone_on_with(tmp_path):
+    save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
+    out = tmp_path / "out"
+    assert convert(tmp_path, out) == 0
+    expected = (out / "vae.safetensors").read_bytes()
+    part = out / "vae.safetensors.part"
+    part.write_bytes(bytes(len(expected)))
+    (out / "vae.safetensors.part.log").write_text("another plan\n" + 5 * "0\n", encoding="utf-8")
+    assert convert(tmp_path / "vae.safetensors", out) == 0
+    assert (out / "vae.safetensors").read_bytes() == expected

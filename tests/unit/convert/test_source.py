@@ -1,0 +1,145 @@
+"""Foreign checkpoints are opened in every form that people download, and damage is named."""
+
+import json
+import struct
+
+import ml_dtypes
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.source import read_safetensors, sources
+from egosim_jax.types import InputError
+
+DTYPES = [
+    torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.float8_e4m3fn,
+    torch.float8_e5m2, torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_safetensors_keep_their_bits(tmp_path, dtype):
+    values = (10 * torch.rand(3, 5)).to(dtype)
+    save_file({"a": values, "b": torch.rand(2)}, tmp_path / "x.safetensors", {"format": "pt"})
+    found = read_safetensors(tmp_path / "x.safetensors")
+    assert found.keys() == {"a", "b"}
+    array = found["a"].array()
+    assert f"torch.{array.dtype.name}" == str(dtype)
+    np.testing.assert_array_equal(array.view(np.uint8), values.view(torch.uint8).numpy())
+    assert not array.flags.writeable
+
+
+def written(path, header, body=bytes(16), length=None):
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text + body)
+    return path
+
+
+def about(dtype="F32", shape=(4,), places=(0, 16)):
+    return {"dtype": dtype, "shape": list(shape), "data_offsets": list(places)}
+
+
+BROKEN = {
+    "header would have": lambda p: written(p, {"a": about()}, length=1 << 40),
+    "header would have ": lambda p: p.write_bytes(b"abc"),
+    "is there twice": lambda p: written(
+        p, b'{"a": %s, "a": %s}' % ((json.dumps(about()).encode(),) * 2)
+    ),
+    "no list of tensors": lambda p: written(p, []),
+    "is not described": lambda p: written(p, {"a": {"dtype": "F32"}}),
+    "is not described ": lambda p: written(p, {"a": about(places=(0, 1, 2))}),
+    "of F4, which": lambda p: written(p, {"a": about(dtype="F4")}),
+    "has shape": lambda p: written(p, {"a": about(shape=(-4,))}),
+    "has shape ": lambda p: written(p, {"a": about(shape=(4.0,))}),
+    "not in the file": lambda p: written(p, {"a": about(shape=(8,), places=(0, 32))}),
+    "not its size": lambda p: written(p, {"a": about(shape=(3,))}),
+    "not its size ": lambda p: written(p, {"a": about(places=(16, 0))}),
+    "Expecting property name": lambda p: written(p, b"{,}"),
+}
+
+
+@pytest.mark.parametrize("reason", BROKEN)
+def test_broken_safetensors_are_refused_with_the_reason(tmp_path, reason):
+    path = tmp_path / "x.safetensors"
+    BROKEN[reason](path)
+    with pytest.raises(InputError, match=reason.strip()) as error:
+        read_safetensors(path)
+    assert str(path) in str(error.value)
+
+
+def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
+    parts = [{"a": torch.rand(2)}, {"b": torch.rand(3)}]
+    for number, part in enumerate(parts, start=1):
+        save_file(part, tmp_path / f"model-{number:05d}-of-00002.safetensors")
+        save_file(part, tmp_path / f"odd_{number}.safetensors")
+    places = {"a": "odd_1.safetensors", "b": "odd_2.safetensors"}
+    index = tmp_path / "odd.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": places}), encoding="utf-8")
+    torch.save({"c": torch.rand(1)}, tmp_path / "other.pth")
+    found = {source.name: source for source in sources(tmp_path)}
+    assert found.keys() == {"odd", "model", "other.pth"}
+    assert found["odd"].tensors.keys() == found["model"].tensors.keys() == {"a", "b"}
+    assert found["model"].bytes == 20
+    (tmp_path / "odd_2.safetensors").unlink()
+    with pytest.raises(InputError, match="odd_2"):
+        list(sources(tmp_path))
+    index.unlink()
+    (tmp_path / "model-00001-of-00002.safetensors").unlink()
+    with pytest.raises(InputError, match="1 of the 2 files of model"):
+        list(sources(tmp_path))
+
+
+def test_a_name_in_two_files_and_an_index_of_something_else_are_refused(tmp_path):
+    for number in (1, 2):
+        save_file({"a": torch.rand(2)}, tmp_path / f"m-{number:05d}-of-00002.safetensors")
+    with pytest.raises(InputError, match="which another file of m has"):
+        list(sources(tmp_path))
+    for text in ("{}", "no json", '{"weight_map": {"a": "../m-00001-of-00002.safetensors"}}'):
+        (tmp_path / "m.safetensors.index.json").write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="index"):
+            list(sources(tmp_path))
+
+
+def test_networks_are_told_by_their_names_under_any_prefix(tmp_path):
+    names = {
+        ("dit", "wan", "diffusion_model."): "diffusion_model.blocks.0.self_attn.q.weight",
+        ("vae", "wan", "model."): "model.decoder.upsamples.0.residual.2.weight",
+        ("text", "transformers", ""): "encoder.block.0.layer.0.SelfAttention.q.weight",
+        ("image", "transformers", "vision_model."): "vision_model.embeddings.class_embedding",
+    }  # fmt: skip
+    for number, name in enumerate(names.values()):
+        folder = tmp_path / "deep" / str(number) if number else tmp_path
+        folder.mkdir(parents=True, exist_ok=True)
+        save_file({name: torch.rand(1)}, folder / f"{number}.safetensors")
+    save_file({"lora_A.weight": torch.rand(1)}, tmp_path / "z.safetensors")
+    (tmp_path / "google" / "umt5-xxl").mkdir(parents=True)
+    (tmp_path / "google" / "umt5-xxl" / "tokenizer.json").touch()
+    (tmp_path / ".cache").mkdir()
+    save_file({"x": torch.rand(1)}, tmp_path / ".cache" / "x.safetensors")
+    folder = recognise(tmp_path)
+    assert {(f.network, f.naming, f.prefix) for f in folder.found} == names.keys()
+    assert [source.name for source in folder.unknown] == ["z.safetensors"]
+    assert folder.tokenizer == tmp_path / "google" / "umt5-xxl"
+    assert list(folder.network("dit").tensors) == ["blocks.0.self_attn.q.weight"]
+
+
+def test_what_is_not_there_or_not_one_is_said(tmp_path):
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        recognise(tmp_path)
+    with pytest.raises(InputError, match="is not there"):
+        recognise(tmp_path / "none")
+    for name in "ab":
+        save_file({"visual.cls_embedding": torch.rand(1)}, tmp_path / f"{name}.safetensors")
+    with pytest.raises(InputError, match=r"2 checkpoints of the network image \(a\.s.*b\.s"):
+        recognise(tmp_path).network("image")
+    with pytest.raises(InputError, match="0 checkpoints of the network dit"):
+        recognise(tmp_path).network("dit")
+
+
+def test_bfloat16_is_read_as_such(tmp_path):
+    save_file({"a": torch.tensor([1.5, -2.25]).bfloat16()}, tmp_path / "x.safetensors")
+    array = read_safetensors(tmp_path / "x.safetensors")["a"].array()
+    assert array.dtype == ml_dtypes.bfloat16
+    assert array.astype(np.float32).tolist() == [1.5, -2.25]
