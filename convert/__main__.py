@@ -9,11 +9,13 @@ from typing import Annotated
 import tyro
 
 from egosim_jax import command
-from egosim_jax.convert.commands import Inspect, Weights
+from egosim_jax.convert.commands import Inspect, ToTorch, Verify, Weights
 
 Commands = (
     Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Weights, tyro.conf.subcommand("weights")]
+    | Annotated[ToTorch, tyro.conf.subcommand("to-torch")]
+    | Annotated[Verify, tyro.conf.subcommand("verify")]
 )
 
 

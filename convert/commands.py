@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from egosim_jax import command
-from egosim_jax.convert.layouts import Found, Network, recognise
+from egosim_jax.convert.layouts import Naming, Network, recognise
+from egosim_jax.convert.plan import TABLES, Widening, fits, to_ours, to_theirs
+from egosim_jax.convert.pth import Tensor
+from egosim_jax.convert.source import INDEX
+from egosim_jax.convert.stream import Weight, in_rows, write
+from egosim_jax.io.run import write_json
+from egosim_jax.io.weights import WeightsError, mismatches
+from egosim_jax.progress import track, track_bytes
 from egosim_jax.types import InputError
 
-if TYPE_CHECKING:
-    from flax import nnx
-
-    from egosim_jax.convert.rules import Leaf
-    from egosim_jax.generator import ModelConfig
-
-TABLES = {"dit": "wan_dit", "vae": "wan_vae", "text": "umt5", "image": "clip_vision"}
-"""Name table of each network of a model."""
+Dtype = Literal["float32", "bfloat16", "float16"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +42,8 @@ class Inspect:
         from rich.console import Console
         from rich.table import Table
 
+        from egosim_jax import configs
+
         folder = recognise(self.source)
         table = Table("network", "names of", "checkpoint", "weights", "dtype", "GB", "fits")
         for found in folder.found:
@@ -56,7 +56,7 @@ class Inspect:
                 f"{sum(math.prod(tensor.shape) for tensor in tensors):,}",
                 ", ".join(dtypes),
                 f"{found.source.bytes / 1e9:.2f}",
-                ", ".join(_fitting(found)) or "no config",
+                ", ".join(n for n in configs.names() if fits(found, configs.get(n))) or "none",
             )
         console = Console(width=160)
         console.print(table)
@@ -88,8 +88,12 @@ class Weights:
     """Weights folder; what it has of other networks stays."""
     only: tuple[Network, ...] = ()
     """Convert these networks alone."""
-    dtype: Literal["float32", "bfloat16", "float16"] | None = None
+    dtype: Dtype | None = None
     """Store floating weights as this; by default each keeps its own."""
+    widen: Widening | None = None
+    """Make a model of 52 channels from a base model of 36, whose kernel for the hands is 0: `copy`
+    keeps the rest as it is, `polarity` also turns the mask, which is 1 for the base where it is 0
+    for us."""
 
     def run(self) -> int:
         """Recognise, check, write."""
@@ -100,74 +104,165 @@ class Weights:
         names = self.only or tuple(dict.fromkeys(found.network for found in folder.found))
         if not names:
             raise InputError(f"{self.source} holds no network of ours. (egosim-convert inspect)")
-        planned = [(found, plan(found, config)) for found in map(folder.network, names)]
-        for found, leaves in planned:
-            self._write(found, leaves)
+        planned = []
+        for found in map(folder.network, names):
+            widen = self.widen if found.network == "dit" else None
+            planned.append((found, to_ours(found, config, dtype=self.dtype, widen=widen)))
+        for found, weights in planned:
+            target = self.out / f"{found.network}.safetensors"
+            about = {"format": "egosim_jax", "config": self.config, "source": found.source.name}
+            _write(target, weights, origin=found.source.files, about=about)
         if folder.tokenizer is not None and "text" in names and config.tokenizer.kind != "byt5":
             shutil.copytree(folder.tokenizer, self.out / config.tokenizer.kind, dirs_exist_ok=True)
         return command.DONE
 
-    def _write(self, found: Found, leaves: Mapping[str, Leaf]) -> None:
-        from egosim_jax.convert.stream import write
-        from egosim_jax.progress import track_bytes
 
-        target = self.out / f"{found.network}.safetensors"
-        about = {"format": "egosim_jax", "config": self.config, "source": found.source.name}
-        pieces = write(
-            target,
-            leaves,
-            found.tensors,
-            files=found.source.files,
-            dtype=self.dtype,
-            about=about,
+FOLDERS = {"dit": "transformer", "vae": "vae", "text": "text_encoder", "image": "image_encoder"}
+"""Of a network in diffusers' layout."""
+STEMS: dict[tuple[Network, Naming], str] = {
+    ("dit", "wan"): "diffusion_pytorch_model",
+    ("vae", "wan"): "Wan2.1_VAE",
+    ("text", "wan"): "models_t5_umt5-xxl-enc-bf16",
+    ("image", "wan"): "models_clip_open-clip-xlm-roberta-large-vit-huge-14",
+    ("dit", "diffusers"): "diffusion_pytorch_model",
+    ("vae", "diffusers"): "diffusion_pytorch_model",
+    ("text", "transformers"): "model",
+    ("image", "transformers"): "model",
+}
+"""What the files of a network in a naming are called."""
+LARGEST = 5_000_000_000
+"""Bytes of a file of several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToTorch:
+    """Write a weights folder as safetensors in PyTorch names, which the other projects load.
+
+    `wan` is the layout of the Wan and EgoSim releases; `diffusers` has a folder for each network.
+    Networks above 5 GB become several files with an index.
+    """
+
+    weights: Annotated[Path, tyro.conf.Positional]
+    """Weights folder."""
+    config: str
+    """Name of the model that they are of."""
+    out: Path
+    """Folder to write to."""
+    layout: Literal["wan", "diffusers"] = "wan"
+    """Whose names and files."""
+    only: tuple[Network, ...] = ()
+    """Write these networks alone."""
+    dtype: Dtype | None = None
+    """Store floating weights as this; by default each keeps its own."""
+
+    def run(self) -> int:
+        """Check, translate, write."""
+        from egosim_jax import configs
+        from egosim_jax.convert.source import read_safetensors
+
+        config = configs.get(self.config)
+        planned = []
+        here: list[Network] = [name for name in TABLES if getattr(config, name) is not None]
+        for network in self.only or here:
+            file = self.weights / f"{network}.safetensors"
+            naming = _naming(network, self.layout)
+            tensors = read_safetensors(file)
+            theirs = to_theirs(tensors, config, network, naming, dtype=self.dtype)
+            folder = self.out / FOLDERS[network] if self.layout == "diffusers" else self.out
+            planned.append((folder / STEMS[network, naming], file, theirs))
+        for stem, file, theirs in planned:
+            _write_sharded(stem, theirs, origin=[file])
+        return command.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Compare a weights folder with the checkpoint that it was made from, tensor by tensor.
+
+    Every value must be the source's, bit for bit, after the change of layout and dtype.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """A .safetensors or .pth file, or a folder of them."""
+    weights: Annotated[Path, tyro.conf.Positional]
+    """Weights folder."""
+    config: str
+    """Name of the model."""
+    widen: Widening | None = None
+    """As it was converted."""
+
+    def run(self) -> int:
+        """Compare; 1 if anything differs."""
+        from egosim_jax import configs
+        from egosim_jax.convert.source import read_safetensors
+
+        config = configs.get(self.config)
+        wrong = []
+        folder = recognise(self.source)
+        for found in folder.found:
+            file = self.weights / f"{found.network}.safetensors"
+            if not file.exists():
+                print(f"{found.network}: not converted")
+                continue
+            widen = self.widen if found.network == "dit" else None
+            weights = to_ours(found, config, widen=widen)
+            tensors = read_safetensors(file)
+            if problems := mismatches(tensors, {w.name: w.shape for w in weights}):
+                raise WeightsError(problems, source=str(file))
+            differ = [
+                weight.name
+                for weight in track(weights, f"comparing {found.network}", total=len(weights))
+                if not _same(weight, tensors[weight.name])
+            ]
+            print(f"{found.network}: {len(weights) - len(differ)} of {len(weights)} weights equal")
+            wrong += [f"{found.network}: {name} differs" for name in differ]
+        print("\n".join(wrong), end="\n" if wrong else "")
+        return command.FAILED if wrong else command.DONE
+
+
+def _same(weight: Weight, tensor: Tensor) -> bool:
+    """Whether all pieces are in the tensor, as its dtype."""
+    import numpy as np
+
+    places = tensor.array().reshape(len(weight.pieces), -1)
+    return all(
+        np.array_equal(
+            in_rows(piece().astype(tensor.dtype, copy=False)).reshape(-1).view(np.uint8),
+            place.view(np.uint8),
         )
-        total = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves.values())
-        for _ in track_bytes(pieces, f"writing {target.name}", total=total):
-            pass
-        print(target)
-
-
-def plan(found: Found, config: ModelConfig) -> dict[str, Leaf]:
-    """What fills each weight of the config's network; `WeightsError` with all that differs."""
-    from egosim_jax.convert.rules import assign
-    from egosim_jax.io.weights import flat_shapes
-
-    table, shape = _table(found.network), getattr(config, found.network)
-    if shape is None:
-        raise InputError(f"{config.name} has no network {found.network}. (--config, --only)")
-    return assign(
-        found.tensors,
-        getattr(table, found.naming)(shape),
-        ignore=table.ignored(shape),
-        want=flat_shapes(_skeleton(found.network, shape)),
-        source=found.source.name,
+        for place, piece in zip(places, weight.pieces, strict=True)
     )
 
 
-def _skeleton(network: Network, shape: Any) -> nnx.Module:
-    """The network without weights."""
-    from flax import nnx
-
-    from egosim_jax.models.clip_vision import CLIPVision
-    from egosim_jax.models.umt5 import UMT5
-    from egosim_jax.models.wan_dit import WanDiT
-    from egosim_jax.models.wan_vae import WanVAE
-
-    made = {"dit": WanDiT, "vae": WanVAE, "text": UMT5, "image": CLIPVision}[network]
-    return nnx.eval_shape(lambda: made(shape, rngs=nnx.Rngs(0)))
+def _naming(network: Network, layout: Literal["wan", "diffusers"]) -> Naming:
+    encoder = network in ("text", "image")
+    return "transformers" if encoder and layout == "diffusers" else layout
 
 
-def _table(network: Network) -> ModuleType:
-    return importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
+def _write(
+    target: Path, weights: Sequence[Weight], *, origin: Sequence[Path], about: Mapping[str, str]
+) -> None:
+    total = sum(weight.bytes for weight in weights)
+    pieces = write(target, weights, origin=origin, about=about)
+    for _ in track_bytes(pieces, f"writing {target.name}", total=total):
+        pass
+    print(target)
 
 
-def _fitting(found: Found) -> Iterator[str]:
-    """The configs whose network the checkpoint fills."""
-    from egosim_jax import configs
-
-    for name in configs.names():
-        try:
-            plan(found, configs.get(name))
-        except InputError:
-            continue
-        yield name
+def _write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Path]) -> None:
+    """One file or, above 5 GB, several and an index."""
+    shards: list[list[Weight]] = [[]]
+    for weight in weights:
+        if shards[-1] and sum(w.bytes for w in shards[-1]) + weight.bytes > LARGEST:
+            shards.append([])
+        shards[-1].append(weight)
+    places = {}
+    for number, shard in enumerate(shards, start=1):
+        end = f"-{number:05d}-of-{len(shards):05d}" if len(shards) > 1 else ""
+        target = stem.with_name(f"{stem.name}{end}.safetensors")
+        _write(target, shard, origin=origin, about={"format": "pt"})
+        places |= {weight.name: target.name for weight in shard}
+    if len(shards) > 1:
+        total = sum(weight.bytes for weight in weights)
+        index = {"metadata": {"total_size": total}, "weight_map": places}
+        write_json(stem.with_name(f"{stem.name}{INDEX}"), index)

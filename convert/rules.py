@@ -124,7 +124,7 @@ def assign(
             if other != name:
                 problems.append(f"{name}: is there twice, as {other}")
             try:
-                shape = rule.ours(_outline(tensor)).shape
+                shape = rule.ours(outline(tensor)).shape
             except (EinopsError, ValueError):
                 aim = f"a shape that {rule.transform!r} can bring to {rule.target}"
                 problems.append(f"{name}: have {tuple(tensor.shape)}, want {aim}")
@@ -182,7 +182,7 @@ def translate_back(ours: Mapping[str, np.ndarray], rules: Sequence[Rule]) -> dic
     }
 
 
-def _outline(tensor: Any) -> np.ndarray:
+def outline(tensor: Any) -> np.ndarray:
     """An array of the tensor's shape that takes no memory."""
     return np.broadcast_to(np.zeros((), np.uint8), tuple(tensor.shape))
 

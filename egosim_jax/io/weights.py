@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from flax import nnx
 
 from egosim_jax.io.digest import sha256
 from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from flax import nnx
 
 HASH = "sha256"
 """Entry of a converted file's header: the hash of its weights, known without reading them."""
@@ -36,6 +38,8 @@ def flat_shapes(module: nnx.Module) -> dict[str, tuple[int, ...]]:
 
 
 def _leaves(module: nnx.Module) -> dict[str, nnx.Variable]:
+    from flax import nnx
+
     state = nnx.state(module, nnx.Not(nnx.RngState))
     return {".".join(map(str, path)): leaf for path, leaf in nnx.to_flat_state(state)}
 
@@ -69,6 +73,7 @@ def fill(
     if problems:
         raise WeightsError(problems, source=source)
     import jax.numpy as jnp
+    from flax import nnx
 
     state = nnx.state(module, nnx.Not(nnx.RngState))
     for path, leaf in nnx.to_flat_state(state):

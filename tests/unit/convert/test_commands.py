@@ -3,25 +3,34 @@
 import importlib
 import json
 import math
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
 from flax import nnx
+from safetensors.flax import load_file as load_flax
 from safetensors.numpy import load_file
 from safetensors.torch import save_file
 
 from egosim_jax import configs
+from egosim_jax.convert import commands
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.commands import TABLES
 from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.plan import TABLES
 from egosim_jax.convert.rules import translate_back
+from egosim_jax.convert.tables import wan_dit
 from egosim_jax.generator import Networks
-from egosim_jax.io.weights import flat_shapes, hashes
+from egosim_jax.io.weights import flat_shapes, hashes, load
+from egosim_jax.models.wan_dit import WanDiT
 
 CONFIG = configs.get("debug")
 NETWORKS = ("dit", "vae", "text", "image")
@@ -160,9 +169,7 @@ def test_weights_are_stored_as_asked_and_half_precision_as_it_is(tmp_path):
     save_file(foreign("dit", "wan", torch.bfloat16), tmp_path / "dit.safetensors")
     assert convert(tmp_path, tmp_path / "same", "--only", "dit") == 0
     assert convert(tmp_path, tmp_path / "wide", "--dtype", "float32") == 0
-    from safetensors.flax import load_file as load
-
-    same, wide = (load(tmp_path / name / "dit.safetensors") for name in ("same", "wide"))
+    same, wide = (load_flax(tmp_path / name / "dit.safetensors") for name in ("same", "wide"))
     for path in wide:
         assert same[path].dtype == "bfloat16"
         assert wide[path].dtype == "float32"
@@ -239,3 +246,91 @@ def test_a_half_written_file_of_another_source_is_not_gone_on_with(tmp_path):
     (out / "vae.safetensors.part.log").write_text("another plan\n" + 5 * "0\n", encoding="utf-8")
     assert convert(tmp_path / "vae.safetensors", out) == 0
     assert (out / "vae.safetensors").read_bytes() == expected
+
+
+def back(weights, out, *more):
+    return main(["to-torch", str(weights), "--config", "debug", "--out", str(out), *more])
+
+
+@pytest.mark.parametrize("layout", ["wan", "diffusers"])
+def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, monkeypatch):
+    monkeypatch.setattr(commands, "LARGEST", 200_000)  # bytes, so that there is more than one
+    assert convert(checkpoint, tmp_path / "ours") == 0
+    assert back(tmp_path / "ours", tmp_path / "theirs", "--layout", layout) == 0
+    for network in NETWORKS:
+        found = recognise(tmp_path / "theirs").network(network)
+        expected = foreign(network, found.naming)
+        assert found.tensors.keys() == expected.keys()
+        for name, tensor in found.tensors.items():
+            np.testing.assert_array_equal(tensor.array(), expected[name].numpy())
+    dit = recognise(tmp_path / "theirs").network("dit").source.files
+    assert len(dit) > 1
+    assert all(file.stat().st_size < 250_000 for file in dit)
+    assert convert(tmp_path / "theirs", tmp_path / "again") == 0
+    for network in NETWORKS:
+        file = f"{network}.safetensors"
+        first, second = (load_file(tmp_path / name / file) for name in ("ours", "again"))
+        assert all(np.array_equal(first[path], second[path]) for path in first)
+
+
+def test_what_is_not_of_the_config_is_not_written_back(tmp_path, capsys):
+    save_file(foreign("vae", "wan"), tmp_path / "vae.pth.safetensors")
+    assert convert(tmp_path / "vae.pth.safetensors", tmp_path / "ours") == 0
+    args = ["--config", "tabletop", "--out", str(tmp_path / "out"), "--only", "vae"]
+    assert main(["to-torch", str(tmp_path / "ours"), *args]) == 2
+    assert "have" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_verify_finds_one_changed_value(tmp_path, capsys):
+    save_file(foreign("image", "wan"), tmp_path / "clip.safetensors")
+    save_file(foreign("dit", "wan"), tmp_path / "dit.safetensors")
+    out = tmp_path / "ours"
+    assert convert(tmp_path, out, "--dtype", "bfloat16") == 0
+    apart = Path(shutil.move(out, tmp_path.parent / "apart"))  # the source's folder is searched
+    check = ["verify", str(tmp_path), str(apart), "--config", "debug"]
+    assert main(check) == 0
+    assert "weights equal" in capsys.readouterr().out
+    file = apart / "dit.safetensors"
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(data)
+    assert main(check) == 1
+    assert "differs" in capsys.readouterr().out
+
+
+def test_a_wider_model_of_a_base_model_gives_the_same_velocity(tmp_path):
+    """The base's mask is 1 where ours is 0; the hands are not read yet."""
+    narrow = replace(CONFIG.dit, in_channels=36)
+    base = WanDiT(narrow, rngs=nnx.Rngs(0))
+    _, state = nnx.split(base)
+    rng = np.random.default_rng(0)
+    base = nnx.merge(
+        nnx.graphdef(base),
+        jax.tree.map(lambda x: jnp.asarray(0.2 * rng.normal(size=x.shape), x.dtype), state),
+    )
+    ours = {".".join(map(str, path)): np.asarray(leaf.get_value())
+            for path, leaf in nnx.to_flat_state(nnx.state(base, nnx.Param))}  # fmt: skip
+    theirs = translate_back(ours, wan_dit.wan(narrow))
+    tensors = {n: torch.tensor(np.ascontiguousarray(t)) for n, t in theirs.items()}
+    save_file(tensors, tmp_path / "base.safetensors")
+    shape = (1, 3, 4, 6)
+    noisy, clip, hands = (rng.normal(size=(*shape, 16)).astype(np.float32) for _ in range(3))
+    mask = rng.integers(0, 2, (*shape, 4)).astype(np.float32)
+    tokens = (rng.normal(size=(1, 5, dim)) for dim in (narrow.text_dim, narrow.image_dim))
+    rest = [jnp.array(x, jnp.float32) for x in ([400.0], *tokens)]
+    for how, ours_mask in (("copy", mask), ("polarity", 1 - mask)):
+        out = tmp_path / how
+        assert convert(tmp_path / "base.safetensors", out, "--widen", how) == 0
+        wide = nnx.eval_shape(lambda: WanDiT(CONFIG.dit, rngs=nnx.Rngs(0)))
+        load(out / "dit.safetensors", wide)
+        kernel = np.asarray(wide.patch.kernel[...])
+        assert not kernel[36:].any()
+        np.testing.assert_array_equal(kernel[:16], base.patch.kernel[...][:16])
+        expected = base(jnp.concatenate([noisy, mask, clip], axis=-1), *rest)
+        found = wide(jnp.concatenate([noisy, ours_mask, clip, hands], axis=-1), *rest)
+        scale = float(jnp.abs(expected).max())
+        np.testing.assert_allclose(found, expected, atol=1e-6 * scale)
+        args = ["verify", str(tmp_path / "base.safetensors"), str(out), "--config", "debug"]
+        assert main([*args, "--widen", how]) == 0
+    assert convert(tmp_path / "base.safetensors", tmp_path / "none") == 2
