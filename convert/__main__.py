@@ -9,11 +9,12 @@ from typing import Annotated
 import tyro
 
 from egosim_jax import command
-from egosim_jax.convert.commands import Inspect, ToTorch, Verify, Weights
+from egosim_jax.convert.commands import Inspect, Lora, ToTorch, Verify, Weights
 
 Commands = (
     Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Weights, tyro.conf.subcommand("weights")]
+    | Annotated[Lora, tyro.conf.subcommand("lora")]
     | Annotated[ToTorch, tyro.conf.subcommand("to-torch")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
 )

@@ -176,6 +176,50 @@ class ToTorch:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lora:
+    """Bring a LoRA into the names that ComfyUI and diffusers both read, or merge it into weights.
+
+    Reads PEFT's, diffusers', kohya's (VideoX-Fun, musubi) and ComfyUI's names, alpha honoured.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """The LoRA: a file, or PEFT's folder."""
+    config: str
+    """Name of the model that it is for."""
+    out: Path
+    """File to write or, with --merge, weights folder for the video transformer."""
+    merge: Path | None = None
+    """Weights folder that it is added to."""
+    scale: float = 1.0
+    """How strongly it counts in a merge."""
+
+    def run(self) -> int:
+        """Read, check, write."""
+        from egosim_jax import configs
+        from egosim_jax.convert.lora import about_lora, exported, read_lora
+        from egosim_jax.convert.plan import merged
+        from egosim_jax.convert.source import read_safetensors
+
+        config = configs.get(self.config).dit
+        deltas = read_lora(self.source, config)
+        origin = sorted(self.source.iterdir()) if self.source.is_dir() else [self.source]
+        if self.merge is None:
+            weights = [
+                Weight(
+                    name=name, shape=tensor.shape, dtype=tensor.dtype, pieces=(lambda t=tensor: t,)
+                )
+                for name, tensor in exported(deltas, config).items()
+            ]
+            _write(self.out, weights, origin=origin, about=about_lora(deltas))
+            return command.DONE
+        base = self.merge / "dit.safetensors"
+        weights = merged(read_safetensors(base), deltas, config, scale=self.scale)
+        about = {"format": "egosim_jax", "config": self.config, "lora": self.source.name}
+        _write(self.out / base.name, weights, origin=[base, *origin], about=about)
+        return command.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
 class Verify:
     """Compare a weights folder with the checkpoint that it was made from, tensor by tensor.
 

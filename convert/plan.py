@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from flax import nnx
 
     from egosim_jax.generator import ModelConfig
+    from egosim_jax.models.lora import Delta
+    from egosim_jax.models.wan_dit import WanDiTConfig
 
 TABLES: dict[Network, str] = {
     "dit": "wan_dit",
@@ -97,6 +99,36 @@ def to_theirs(
                 pieces=(partial(_theirs, group),),
             )
         )
+    return weights
+
+
+def merged(
+    tensors: Mapping[str, Tensor],
+    deltas: Mapping[str, Delta],
+    config: WanDiTConfig,
+    *,
+    scale: float,
+) -> list[Weight]:
+    """The weights of a video transformer with a LoRA in their kernels, in their own dtypes.
+
+    Raises `WeightsError` if the weights are not of the config.
+    """
+    if problems := mismatches(tensors, flat_shapes(_skeleton("dit", config))):
+        raise WeightsError(problems, source="dit.safetensors")
+
+    def piece(tensor: Tensor, delta: Delta | None, layer: int | None) -> np.ndarray:
+        kernel = tensor.array() if layer is None else tensor.array()[layer]
+        if delta is None:
+            return kernel
+        down, up = (x if layer is None else x[layer] for x in (delta.down, delta.up))
+        return kernel.astype(np.float32) + scale * (down @ up)
+
+    weights = []
+    for path, tensor in tensors.items():
+        layers = range(tensor.shape[0]) if path.startswith("blocks.") else (None,)
+        delta = deltas.get(path.removesuffix(".kernel")) if path.endswith(".kernel") else None
+        pieces = tuple(partial(piece, tensor, delta, layer) for layer in layers)
+        weights.append(Weight(name=path, shape=tensor.shape, dtype=tensor.dtype, pieces=pieces))
     return weights
 
 

@@ -48,6 +48,10 @@ class Generate:
     """Folder to write to; runs/CONFIG_SEED if not given."""
     weights: Path | None = None
     """Folder of weights; without, `tabletop` takes those it ships with and `debug` random ones."""
+    lora: Path | None = None
+    """LoRA of the video transformer, in PEFT's, diffusers', kohya's or ComfyUI's names."""
+    lora_scale: float = 1.0
+    """How strongly it counts."""
     video_id: tuple[str, ...] = ()
     """Take these clips alone."""
     where: str | None = None
@@ -141,6 +145,7 @@ class Generate:
         run = {
             "model": config,
             "weights": digests,
+            "lora": None if self.lora is None else [str(self.lora), self.lora_scale],
             "seed": self.seed,
             "policy": self._policy,
         }
@@ -195,7 +200,13 @@ class Generate:
         if self._weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(config, Networks.random(config, seed=self.seed))
-        return Generator(config, Networks.load(config, self._weights))
+        networks = Networks.load(config, self._weights)
+        if self.lora is not None:
+            from egosim_jax.convert.lora import read_lora
+            from egosim_jax.models import lora
+
+            lora.apply(networks.dit, read_lora(self.lora, config.dit), scale=self.lora_scale)
+        return Generator(config, networks)
 
     def _load(
         self, batch: Sequence[_Item], config: ModelConfig

@@ -27,8 +27,28 @@ zeros = nnx.initializers.zeros_init()
 ones = nnx.initializers.ones_init()
 
 
+class LowRankParam(nnx.Param):
+    """A weight of a `LowRank`, for training those alone."""
+
+
+class LowRank(nnx.Module):
+    """`(x @ down) @ up`, a summand of a linear layer's output (`models/lora.py`)."""
+
+    def __init__(self, down: jax.Array, up: jax.Array):
+        axes = ("layers",) * (down.ndim - 2)
+        self.down = LowRankParam(down, axes=(*axes, None, None))
+        self.up = LowRankParam(up, axes=(*axes, None, None))
+
+    def __call__(self, x: Float[Array, "*b i"]) -> Float[Array, "*b o"]:
+        """Map the last axis, in x's dtype."""
+        return x @ self.down[...].astype(x.dtype) @ self.up[...].astype(x.dtype)
+
+
 class Linear(nnx.Module):
     """`x @ kernel + bias`, kernel `[in, out]`, computed in `dtype`."""
+
+    low_rank: LowRank | None
+    """What a LoRA adds."""
 
     def __init__(
         self,
@@ -44,10 +64,14 @@ class Linear(nnx.Module):
         self.dtype = jnp.dtype(dtype)
         self.kernel = nnx.Param(kernel_init(rngs.params(), (in_dim, out_dim)), axes=axes)
         self.bias = nnx.Param(jnp.zeros(out_dim), axes=axes[1:]) if bias else None
+        self.low_rank = nnx.data(None)
 
     def __call__(self, x: Float[Array, "*b i"]) -> Float[Array, "*b o"]:
         """Project the last axis."""
-        y = x.astype(self.dtype) @ self.kernel[...].astype(self.dtype)
+        x = x.astype(self.dtype)
+        y = x @ self.kernel[...].astype(self.dtype)
+        if self.low_rank is not None:
+            y = y + self.low_rank(x)
         return y if self.bias is None else y + self.bias[...].astype(self.dtype)
 
 

@@ -1,0 +1,102 @@
+"""Low-rank additions to linear layers.
+
+A layer y = x W + b becomes y = x W + b + s (x A) B with A `[in, r]`, B `[r, out]` and s = alpha / r
+times what a user asks for. Merged, the same is W + s A B. Source: Hu et al. 2021, LoRA, section
+4.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Float
+
+from egosim_jax.models.layers import Linear, LowRank
+from egosim_jax.types import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delta:
+    """What is added to one linear layer, or to a layer of every block of a stack."""
+
+    down: Float[np.ndarray, "*l i r"]
+    """A."""
+    up: Float[np.ndarray, "*l r o"]
+    """B, with alpha / r in it."""
+
+
+def linears(network: nnx.Module) -> Iterator[tuple[str, Linear]]:
+    """The linear layers of a network by their dotted paths."""
+    for path, module in nnx.iter_modules(network):
+        if isinstance(module, Linear):
+            yield ".".join(map(str, path)), module
+
+
+def apply(network: nnx.Module, deltas: Mapping[str, Delta], *, scale: float = 1.0) -> None:
+    """Add low-rank summands to the layers of these paths, in place; the kernels stay.
+
+    Raises `InputError` naming all that are not layers of the network or do not fit.
+    """
+    layers = dict(linears(network))
+    _check(layers, deltas)
+    for path, delta in deltas.items():
+        layers[path].low_rank = LowRank(jnp.asarray(delta.down), jnp.asarray(scale * delta.up))
+
+
+def merge(network: nnx.Module, deltas: Mapping[str, Delta], *, scale: float = 1.0) -> None:
+    """Add the products to the kernels, in place, computed in float32; dtypes stay."""
+    layers = dict(linears(network))
+    _check(layers, deltas)
+    for path, delta in deltas.items():
+        kernel = layers[path].kernel
+        value = kernel.get_value()
+        product = jnp.asarray(delta.down, jnp.float32) @ jnp.asarray(delta.up, jnp.float32)
+        kernel.set_value((value.astype(jnp.float32) + scale * product).astype(value.dtype))
+
+
+def deltas_of(network: nnx.Module) -> dict[str, Delta]:
+    """What was added to the layers that have a summand."""
+    return {
+        path: Delta(
+            down=np.asarray(layer.low_rank.down.get_value()),
+            up=np.asarray(layer.low_rank.up.get_value()),
+        )
+        for path, layer in linears(network)
+        if layer.low_rank is not None
+    }
+
+
+def start(network: nnx.Module, rank: int, *, rngs: nnx.Rngs) -> None:
+    """Add summands of a rank to every linear layer of the blocks, in place, to train.
+
+    A is drawn as the paper does, from a normal distribution of deviation 1 / sqrt(in), and B is 0,
+    so that nothing changes before the first update.
+    """
+    if rank < 1:
+        raise InputError(f"A LoRA has a rank of at least 1, not {rank}.")
+    for path, layer in linears(network):
+        if path.startswith("blocks."):
+            *stacked, wide, out = layer.kernel.shape
+            down = jax.random.normal(rngs.params(), (*stacked, wide, rank)) / wide**0.5
+            layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
+
+
+def _check(layers: Mapping[str, Linear], deltas: Mapping[str, Delta]) -> None:
+    problems = []
+    for path, delta in deltas.items():
+        if path not in layers:
+            problems.append(f"{path} is no linear layer")
+            continue
+        *stacked, wide, out = layers[path].kernel.shape
+        rank = delta.down.shape[-1]
+        want = ((*stacked, wide, rank), (*stacked, rank, out))
+        if (delta.down.shape, delta.up.shape) != want:
+            problems.append(f"{path}: have {delta.down.shape} and {delta.up.shape}, want {want}")
+    if problems:
+        listing = "\n".join(f"  {line}" for line in problems)
+        raise InputError(f"The LoRA is not of this network:\n{listing}")
