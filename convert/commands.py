@@ -18,7 +18,7 @@ from egosim_jax.convert.pth import Tensor
 from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, in_rows, write
 from egosim_jax.io.run import write_json
-from egosim_jax.io.weights import WeightsError, mismatches
+from egosim_jax.io.weights import WeightsError, hashes, mismatches
 from egosim_jax.progress import track, track_bytes
 from egosim_jax.types import InputError
 
@@ -192,6 +192,8 @@ class Lora:
     """Weights folder that it is added to."""
     scale: float = 1.0
     """How strongly it counts in a merge."""
+    base: Path | None = None
+    """Weights folder that it was trained on, whose hash goes into the file's header."""
 
     def run(self) -> int:
         """Read, check, write."""
@@ -204,18 +206,19 @@ class Lora:
         deltas = read_lora(self.source, config)
         origin = sorted(self.source.iterdir()) if self.source.is_dir() else [self.source]
         if self.merge is None:
+            base = {} if self.base is None else {"base_sha256": hashes(self.base)["dit"]}
             weights = [
                 Weight(
                     name=name, shape=tensor.shape, dtype=tensor.dtype, pieces=(lambda t=tensor: t,)
                 )
                 for name, tensor in exported(deltas, config).items()
             ]
-            _write(self.out, weights, origin=origin, about=about_lora(deltas))
+            _write(self.out, weights, origin=origin, about=about_lora(deltas) | base)
             return command.DONE
-        base = self.merge / "dit.safetensors"
-        weights = merged(read_safetensors(base), deltas, config, scale=self.scale)
+        file = self.merge / "dit.safetensors"
+        weights = merged(read_safetensors(file), deltas, config, scale=self.scale)
         about = {"format": "egosim_jax", "config": self.config, "lora": self.source.name}
-        _write(self.out / base.name, weights, origin=[base, *origin], about=about)
+        _write(self.out / file.name, weights, origin=[file, *origin], about=about)
         return command.DONE
 
 

@@ -14,6 +14,7 @@ from egosim_jax.cli.ablation import Tabletop
 from egosim_jax.cli.accuracy import Update
 from egosim_jax.cli.continuous import Continuous
 from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
+from egosim_jax.cli.doctor import Doctor
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
@@ -63,6 +64,7 @@ Commands = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
 

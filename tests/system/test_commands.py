@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from egosim_jax import configs
+from egosim_jax.cli import doctor
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
 from egosim_jax.generator import Networks
@@ -161,3 +163,22 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(tmp_pa
     assert (out / "contact_sheet_human.png").exists()
     assert (out / "contact_sheet_robot.png").exists()
     assert "without hands" in capsys.readouterr().out
+
+
+def test_the_doctor_says_what_is_there_and_what_is_not(tmp_path, capsys, monkeypatch):
+    Networks.random(configs.get("debug"), seed=0).save(tmp_path / "mine")
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None)
+    assert main(["doctor", str(tmp_path / "mine")]) == 0
+    said = capsys.readouterr().out
+    assert "device 0: cpu" in said
+    assert "pip install 'egosim-jax[viewer]'" in said
+    assert re.search(r"egosim_14b .* 45\.6\d GB", said)
+    found = [line for line in said.splitlines() if "mine" in line.replace(" ", "")]
+    assert len(found) == 4
+
+
+def test_the_doctor_fails_where_a_library_is_missing(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "NATIVE", ("no_such_module",))
+    monkeypatch.setattr(doctor, "_print_models", lambda console, folders: None)
+    assert main(["doctor"]) == 1
+    assert "no_such_module cannot be imported" in capsys.readouterr().out

@@ -1,0 +1,132 @@
+"""`egosim doctor`: what this machine has, and what is missing."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from egosim_jax.command import DONE, FAILED
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from egosim_jax.generator import ModelConfig
+
+LIBRARIES = (
+    "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "open3d-cpu", "av",
+    "opencv-python-headless",
+)  # fmt: skip
+EXTRAS = {"rerun": "viewer", "OpenEXR": "recorded", "tensorboardX": "tensorboard", "wandb": "wandb"}
+"""Modules and the extras that bring them."""
+NATIVE = ("open3d", "cv2", "av")
+"""What needs libraries of the system."""
+HERE = Path("weights")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Report devices, versions, extras and weights, and what each model needs in memory.
+
+    Exit code 1 if anything that is needed cannot be imported.
+    """
+
+    weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Folders of weights to look at; if none is given, those in ./weights."""
+
+    def run(self) -> int:
+        """Look and print."""
+        import jax
+        from rich.console import Console
+
+        console = Console(width=120, markup=False)
+        console.print(f"egosim-jax {metadata.version('egosim-jax')}, {platform.platform()}")
+        console.print(f"Python {platform.python_version()}, {os.cpu_count()} CPUs")
+        console.print(", ".join(f"{name} {metadata.version(name)}" for name in LIBRARIES))
+        for device in jax.devices():
+            console.print(f"device {device.id}: {device.device_kind}{_memory(device)}")
+        for module, extra in EXTRAS.items():
+            if find_spec(module) is None:
+                console.print(f"{module}: not installed (pip install 'egosim-jax[{extra}]')")
+        broken = list(_broken())
+        for line in broken:
+            console.print(line)
+        _print_models(console, self._folders())
+        return FAILED if broken else DONE
+
+    def _folders(self) -> list[Path]:
+        from egosim_jax import configs
+
+        shipped = (configs.shipped_weights(name) for name in configs.names())
+        given = self.weights or (sorted(HERE.iterdir()) if HERE.is_dir() else ())
+        return [*(folder for folder in shipped if folder), *given]
+
+
+def _memory(device: object) -> str:
+    stats = getattr(device, "memory_stats", lambda: None)() or {}
+    limit = stats.get("bytes_limit")
+    return "" if limit is None else f", {limit / 1e9:.0f} GB"
+
+
+def _broken() -> Iterator[str]:
+    """What is installed and cannot be imported."""
+    for name in NATIVE:
+        try:
+            import_module(name)
+        except ImportError as error:
+            yield (
+                f"{name} cannot be imported: {error}. Install the system libraries that the README "
+                "lists."
+            )
+
+
+def _print_models(console: Console, folders: list[Path]) -> None:
+    from rich.table import Table
+
+    from egosim_jax import configs
+
+    table = Table("config", "clip", "weights in memory", title="models")
+    for name in configs.names():
+        config = configs.get(name)
+        video = config.video
+        clip = f"{video.frames} frames, {video.width}x{video.height}"
+        table.add_row(name, clip, f"{_bytes(config) / 1e9:.2f} GB")
+    console.print(table)
+    found = Table("folder", "config", "network", "GB", "hash", title="weights found")
+    for folder in folders:
+        for row in _rows(folder):
+            found.add_row(*row)
+    console.print(found if found.row_count else "no weights found in ./weights")
+
+
+def _bytes(config: ModelConfig) -> int:
+    """Of the weights, each as wide as its network computes."""
+    import jax.numpy as jnp
+    from flax import nnx
+
+    from egosim_jax.generator import Networks
+
+    parts = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0))).parts()
+    return sum(
+        leaf.size * jnp.dtype(getattr(config, network).dtype).itemsize
+        for network, part in parts.items()
+        for _, leaf in nnx.to_flat_state(nnx.state(part, nnx.Param))
+    )
+
+
+def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
+    """A row for each network of a folder of weights."""
+    from egosim_jax.convert.source import read_metadata
+    from egosim_jax.io.weights import hashes
+
+    for network, digest in hashes(folder).items():
+        file = folder / f"{network}.safetensors"
+        config = read_metadata(file).get("config", folder.name)
+        yield str(folder), config, network, f"{file.stat().st_size / 1e9:.3f}", digest[:16]
