@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import Backend, backend
+from egosim_jax.cli.spread import print_table, summarise
 from egosim_jax.command import DONE
 from egosim_jax.progress import track
 from egosim_jax.types import VideoSpec, check_counts
@@ -74,9 +75,9 @@ class Update:
         for seed in track(self._seeds(config.video), "scenes", total=self.scenes):
             for row, found in _rows(seed, config.video, generator):
                 table.setdefault(row, []).append(found)
-        summary = {row: _summarise(found) for row, found in table.items()}
+        summary = {row: summarise(found, MEASURES) for row, found in table.items()}
         write_json(self.out / "report.json", {"definitions": DEFINITIONS, "table": summary})
-        _print(summary)
+        print_table("state after", summary, MEASURES)
         return DONE
 
     def _seeds(self, spec: VideoSpec) -> Iterator[int]:
@@ -164,29 +165,3 @@ def _seen_before(clip: TabletopClip, after: SceneState) -> np.ndarray:
     row, column, inside = pixels_of(cameras, local)
     bare = np.where(np.isin(first.ids, list(clip.state.names)), np.inf, first.depth_m)
     return points[inside & (np.abs(bare[row, column] - local[:, 2]) <= NEAR_M)]
-
-
-def _summarise(found: Sequence[Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    import numpy as np
-
-    return {
-        name: {
-            "mean": float(np.mean([scene[name] for scene in found])),
-            "spread": float(np.std([scene[name] for scene in found], ddof=len(found) > 1)),
-        }
-        for name in MEASURES
-    }
-
-
-def _print(table: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    shown = Table("state after", *(name for name, _ in MEASURES.values()))
-    for row, line in table.items():
-        cells = []
-        for name, (_, form) in MEASURES.items():
-            mean, spread = (form.format(line[name][key]) for key in ("mean", "spread"))
-            cells.append(f"{mean} ± {spread}")
-        shown.add_row(row, *cells)
-    Console(width=140).print(shown)

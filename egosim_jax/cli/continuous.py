@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
+from egosim_jax.cli.spread import Line, print_table, summarise
 from egosim_jax.command import DONE
 from egosim_jax.io.whole import whole
 from egosim_jax.progress import track
@@ -63,10 +64,15 @@ class Continuous:
         scores: dict[str, list[Scores]] = {method: [] for method in METHODS}
         for method, seed in track(jobs, "sequences", total=len(jobs)):
             scores[method].append(self._simulate(generator, method, seed))
-        tables = {method: summarise(runs) for method, runs in scores.items()}
+        tables = {
+            method: [summarise(clips, MEASURES) for clips in zip(*runs, strict=True)]
+            for method, runs in scores.items()
+        }
         write_json(self.out / "report.json", {"definitions": DEFINITIONS, "tables": tables})
         for method, table in tables.items():
-            _print(method, table)
+            rows = {str(number): line for number, line in enumerate(table, start=1)}
+            title = f"{method}: mean ± spread over sequences"
+            print_table("clip", rows, MEASURES, title=title)
         draw(tables, self.out / "curves.png")
         print(self.out / "curves.png")
         return DONE
@@ -99,22 +105,7 @@ class Continuous:
         return scores
 
 
-def summarise(runs: Sequence[Scores]) -> list[dict[str, dict[str, float]]]:
-    """For each clip the mean of each measure and its standard deviation over sequences (n - 1)."""
-    import numpy as np
-
-    table = []
-    for clips in zip(*runs, strict=True):
-        line = {}
-        for name in MEASURES:
-            values = np.array([clip[name] for clip in clips], float)
-            spread = float(np.nanstd(values, ddof=1)) if len(values) > 1 else 0.0
-            line[name] = {"mean": float(np.nanmean(values)), "spread": spread}
-        table.append(line)
-    return table
-
-
-def draw(tables: Mapping[str, Sequence[Mapping[str, Mapping[str, float]]]], path: Path) -> None:
+def draw(tables: Mapping[str, Sequence[Line]], path: Path) -> None:
     """Each measure against the number of the clip, a line a method."""
     import matplotlib
 
@@ -136,18 +127,3 @@ def draw(tables: Mapping[str, Sequence[Mapping[str, Mapping[str, float]]]], path
     figure.axes[0].legend()
     with whole(path) as temporary:
         figure.savefig(temporary, dpi=100)
-
-
-def _print(method: str, table: Sequence[Mapping[str, Mapping[str, float]]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    title = f"{method}: mean ± spread over sequences"
-    shown = Table("clip", *(name for name, _ in MEASURES.values()), title=title)
-    for number, line in enumerate(table, start=1):
-        cells = []
-        for name, (_, form) in MEASURES.items():
-            mean, spread = (form.format(line[name][key]) for key in ("mean", "spread"))
-            cells.append(f"{mean} ± {spread}")
-        shown.add_row(str(number), *cells)
-    Console(width=140).print(shown)

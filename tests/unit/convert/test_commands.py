@@ -202,9 +202,9 @@ SLOW = """
 import sys, time
 from egosim_jax.convert import stream
 prepare = stream._prepare
-def slowly(piece):
+def slowly(weight, piece):
     time.sleep(0.02)
-    return prepare(piece)
+    return prepare(weight, piece)
 stream._prepare = slowly
 from egosim_jax.convert.__main__ import main
 sys.exit(main(sys.argv[1:]))
@@ -217,7 +217,7 @@ def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path):
     out = tmp_path / "killed"
     args = ["weights", str(tmp_path / "dit.safetensors"), "--config", "debug", "--out", str(out)]
     log = out / "dit.safetensors.part.log"
-    process = subprocess.Popen([sys.executable, "-c", SLOW, *args], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, "-c", SLOW, *args])
     while not (log.exists() and log.read_text("utf-8").count("\n") > 10):
         assert process.poll() is None
         time.sleep(0.01)
