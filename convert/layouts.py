@@ -23,7 +23,7 @@ TELLTALES: dict[tuple[Network, Naming], str] = {
     ("dit", "diffusers"): "condition_embedder.time_proj.weight",
     ("vae", "wan"): "decoder.upsamples.0.residual.2.weight",
     ("vae", "diffusers"): "decoder.up_blocks.0.resnets.0.conv1.weight",
-    ("text", "wan"): "token_embedding.weight",
+    ("text", "wan"): "blocks.0.ffn.gate.0.weight",
     ("text", "transformers"): "encoder.block.0.layer.0.SelfAttention.q.weight",
     ("image", "wan"): "visual.cls_embedding",
     ("image", "transformers"): "embeddings.class_embedding",

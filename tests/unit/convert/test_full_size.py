@@ -1,0 +1,181 @@
+"""Every name and shape of the released files at their real size, without their values."""
+
+import hashlib
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from diffusers import AutoencoderKLWan, WanTransformer3DModel
+from flax import nnx
+from transformers import CLIPVisionConfig, CLIPVisionModel, UMT5Config, UMT5EncoderModel
+
+from egosim_jax import configs
+from egosim_jax.convert.layouts import networks_of
+from egosim_jax.convert.plan import to_ours, to_theirs
+from egosim_jax.convert.pth import Tensor
+from egosim_jax.convert.source import Source
+from egosim_jax.io.weights import flat_shapes
+from egosim_jax.models.umt5 import UMT5
+from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.models.wan_vae import WanVAE
+
+EGOSIM_14B, EGOSIM_1_3B = configs.get("egosim_14b"), configs.get("egosim_1_3b")
+
+
+def changed(config, network, **changes):
+    """A config of one network."""
+    shape = replace(getattr(config, network), **changes)
+    return SimpleNamespace(name="changed", **{network: shape})
+
+
+def shaped(shapes):
+    """Tensors that have shapes alone."""
+    return {
+        name: Tensor(
+            shape=tuple(shape),
+            dtype=np.dtype(np.float32),
+            data=memoryview(b""),
+            strides=(0,) * len(shape),
+        )
+        for name, shape in shapes.items()
+    }
+
+
+def there_and_back(config, network, naming, theirs):
+    """The names and shapes that come back after a conversion of the given ones."""
+    (found,) = networks_of(Source(name="released", files=(), tensors=shaped(theirs)))
+    assert (found.network, found.naming) == (network, naming)
+    ours = shaped({weight.name: weight.shape for weight in to_ours(found, config)})
+    return {weight.name: weight.shape for weight in to_theirs(ours, config, network, naming)}
+
+
+def leaves(config, network, naming):
+    """What the network's table says that the foreign file holds."""
+    network_of = {"dit": WanDiT, "vae": WanVAE, "text": UMT5}[network]
+    made = nnx.eval_shape(lambda: network_of(getattr(config, network), rngs=nnx.Rngs(0)))
+    ours = shaped(flat_shapes(made))
+    return {weight.name: weight.shape for weight in to_theirs(ours, config, network, naming)}
+
+
+@pytest.mark.parametrize(
+    ("config", "network", "naming", "released", "tensors", "fingerprint"),
+    [
+        (
+            changed(EGOSIM_14B, "dit", in_channels=36), "dit", "wan",
+            "Wan2.1-I2V-14B", 1303, "6bfcfb3b342cb286ce886889d519a77e",
+        ),
+        (
+            changed(EGOSIM_14B, "dit", in_channels=16, image_dim=None), "dit", "wan",
+            "Wan2.1-T2V-14B", 1095, "aafcfd9672c3a2456dc46e1cb6e52c70",
+        ),
+        (
+            changed(EGOSIM_14B, "dit", in_channels=16, image_dim=None), "dit", "diffusers",
+            "Wan2.1-T2V-14B-Diffusers", 1095, "cb104773c6c2cb6df4f9529ad5c60d0b",
+        ),
+        (
+            changed(EGOSIM_1_3B, "dit", in_channels=36), "dit", "wan",
+            "Wan2.1-Fun-1.3B-InP", 983, "6d6ccde6845b95ad9114ab993d917893",
+        ),
+        (
+            changed(EGOSIM_1_3B, "dit", in_channels=16, image_dim=None), "dit", "wan",
+            "Wan2.1-T2V-1.3B", 825, "9269f8db9040a9d860eaca435be61814",
+        ),
+        (EGOSIM_14B, "vae", "wan", "Wan2.1_VAE", 194, "ccc42284ea13e1ad04693284c7a09be6"),
+        (EGOSIM_14B, "text", "wan", "umt5-xxl-enc", 242, "9c8818c2cbea55eca56c7b447df170da"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_names_and_shapes_are_those_of_the_released_files(
+    config, network, naming, released, tensors, fingerprint
+):
+    """The fingerprints by which DiffSynth-Studio knows the files: MD5 over names and shapes."""
+    theirs = leaves(config, network, naming)
+    assert len(theirs) == tensors
+    shapes = {name: "_".join(map(str, shape)) for name, shape in theirs.items()}
+    keys = sorted([*shapes, *(f"{name}:{shape}" for name, shape in shapes.items())])
+    assert hashlib.md5(",".join(keys).encode(), usedforsecurity=False).hexdigest() == fingerprint
+    assert there_and_back(config, network, naming, theirs) == theirs
+
+
+def test_the_released_egosim_transformer_reads_52_channels():
+    theirs = leaves(EGOSIM_14B, "dit", "wan")
+    assert theirs["patch_embedding.weight"] == (5120, 52, 1, 2, 2)
+    base = leaves(changed(EGOSIM_14B, "dit", in_channels=36), "dit", "wan")
+    assert {name for name in base if base[name] != theirs[name]} == {"patch_embedding.weight"}
+    assert there_and_back(EGOSIM_14B, "dit", "wan", theirs) == theirs
+
+
+def test_the_released_clip_has_what_we_use_and_what_we_name_as_unused():
+    """Names as in `models_clip_open-clip-xlm-roberta-large-vit-huge-14.pth`, of 32 layers."""
+    used = {
+        "cls_embedding": (1, 1, 1280),
+        "pos_embedding": (1, 257, 1280),
+        "patch_embedding.weight": (1280, 3, 14, 14),
+        "pre_norm.weight": (1280,),
+        "pre_norm.bias": (1280,),
+    }
+    layer = {
+        "norm1.weight": (1280,), "norm1.bias": (1280,),
+        "attn.to_qkv.weight": (3840, 1280), "attn.to_qkv.bias": (3840,),
+        "attn.proj.weight": (1280, 1280), "attn.proj.bias": (1280,),
+        "norm2.weight": (1280,), "norm2.bias": (1280,),
+        "mlp.0.weight": (5120, 1280), "mlp.0.bias": (5120,),
+        "mlp.2.weight": (1280, 5120), "mlp.2.bias": (1280,),
+    }  # fmt: skip
+    unused = {
+        "log_scale": (),
+        "visual.head": (1280, 1024),
+        "visual.post_norm.weight": (1280,),
+        "visual.post_norm.bias": (1280,),
+        # Names of the text half that umT5 has too.
+        "textual.token_embedding.weight": (250002, 1024),
+        "textual.blocks.0.attn.q.weight": (1024, 1024),
+        "textual.blocks.0.norm1.weight": (1024,),
+    } | {f"visual.transformer.31.{name}": shape for name, shape in layer.items()}
+    for index in range(31):
+        used |= {f"transformer.{index}.{name}": shape for name, shape in layer.items()}
+    used = {f"visual.{name}": shape for name, shape in used.items()}
+    released = {f"model.{name}": shape for name, shape in (used | unused).items()}
+    assert there_and_back(EGOSIM_14B, "image", "wan", released) == used
+
+
+def meta(network):
+    """The module of diffusers or transformers at full size, which takes no memory."""
+    dit, text, image = EGOSIM_14B.dit, EGOSIM_14B.text, EGOSIM_14B.image
+    with torch.device("meta"):
+        if network == "dit":
+            return WanTransformer3DModel(
+                num_attention_heads=40, attention_head_dim=128, in_channels=dit.in_channels,
+                out_channels=16, text_dim=4096, freq_dim=256, ffn_dim=13824, num_layers=40,
+                cross_attn_norm=True, image_dim=1280, added_kv_proj_dim=5120,
+            )  # fmt: skip
+        if network == "vae":
+            return AutoencoderKLWan()
+        if network == "text":
+            return UMT5EncoderModel(
+                UMT5Config(
+                    vocab_size=text.vocab, d_model=4096, d_kv=64, d_ff=10240, num_layers=24,
+                    num_heads=64, feed_forward_proj="gated-gelu",
+                )
+            )  # fmt: skip
+        return CLIPVisionModel(
+            CLIPVisionConfig(
+                hidden_size=1280, intermediate_size=5120, num_hidden_layers=image.layers,
+                num_attention_heads=16, image_size=224, patch_size=14, hidden_act="gelu",
+            )
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("network", ["dit", "vae", "text", "image"])
+def test_names_and_shapes_are_those_of_diffusers_and_transformers(network):
+    naming = "diffusers" if network in ("dit", "vae") else "transformers"
+    theirs = {name: tuple(t.shape) for name, t in meta(network).named_parameters()}
+    back = there_and_back(EGOSIM_14B, network, naming, theirs)
+    unused = theirs.keys() - back.keys()
+    assert back.items() <= theirs.items()
+    if network == "image":  # the last layer's output is not used, nor what follows it
+        assert all(".layers.31." in name or "post_layernorm" in name for name in unused)
+    else:
+        assert not unused
