@@ -226,7 +226,8 @@ class Lora:
 class Verify:
     """Compare a weights folder with the checkpoint that it was made from, tensor by tensor.
 
-    Every value must be the source's, bit for bit, after the change of layout and dtype.
+    Every value must be the source's, bit for bit, after the change of layout and dtype. Where
+    torch, diffusers and transformers are installed, one forward of each network is compared, too.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -241,6 +242,7 @@ class Verify:
     def run(self) -> int:
         """Compare; 1 if anything differs."""
         from egosim_jax import configs
+        from egosim_jax.convert import forward
         from egosim_jax.convert.source import read_safetensors
 
         config = configs.get(self.config)
@@ -263,6 +265,13 @@ class Verify:
             ]
             print(f"{found.network}: {len(weights) - len(differ)} of {len(weights)} weights equal")
             wrong += [f"{found.network}: {name} differs" for name in differ]
+            if forward.possible():
+                error = forward.difference(found, file, config, widen=widen)
+                print(f"{found.network}: forward differs from PyTorch's by {error:.1e}")
+                if not error <= forward.TOLERANCE:
+                    wrong.append(f"{found.network}: forward differs by more than rounding")
+        if not forward.possible():
+            print(f"no forward compared: that takes {', '.join(forward.MODULES)}")
         print("\n".join(wrong), end="\n" if wrong else "")
         return command.FAILED if wrong else command.DONE
 

@@ -79,7 +79,7 @@ def to_theirs(
     that the network does not have.
     """
     shape = _shape(config, network)
-    if problems := mismatches(tensors, flat_shapes(_skeleton(network, shape))):
+    if problems := mismatches(tensors, flat_shapes(skeleton(network, shape))):
         raise WeightsError(problems, source=f"{network}.safetensors")
     parts: dict[str, dict[int, _Part]] = {}
     for rule in _rules(network, naming, shape):
@@ -113,7 +113,7 @@ def merged(
 
     Raises `WeightsError` if the weights are not of the config.
     """
-    if problems := mismatches(tensors, flat_shapes(_skeleton("dit", config))):
+    if problems := mismatches(tensors, flat_shapes(skeleton("dit", config))):
         raise WeightsError(problems, source="dit.safetensors")
 
     def piece(tensor: Tensor, delta: Delta | None, layer: int | None) -> np.ndarray:
@@ -177,7 +177,7 @@ def _leaves(found: Found, shape: Any) -> dict[str, Leaf]:
         found.tensors,
         _rules(found.network, found.naming, shape),
         ignore=_table(found.network).ignored(shape),
-        want=flat_shapes(_skeleton(found.network, shape)),
+        want=flat_shapes(skeleton(found.network, shape)),
         source=found.source.name,
     )
 
@@ -201,8 +201,8 @@ def _table(network: Network) -> ModuleType:
     return importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
 
 
-def _skeleton(network: Network, shape: Any) -> nnx.Module:
-    """The network without weights."""
+def skeleton(network: Network, shape: Any) -> nnx.Module:
+    """The network of a config, without weights."""
     from flax import nnx
 
     from egosim_jax.models.clip_vision import CLIPVision

@@ -3,6 +3,7 @@
 import importlib
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -280,6 +281,35 @@ def test_what_is_not_of_the_config_is_not_written_back(tmp_path, capsys):
     assert main(["to-torch", str(tmp_path / "ours"), *args]) == 2
     assert "have" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_forward_of_each_network_is_that_of_pytorch(checkpoint, tmp_path, capsys):
+    assert convert(checkpoint, tmp_path) == 0
+    assert main(["verify", str(checkpoint), str(tmp_path), "--config", "debug"]) == 0
+    errors = re.findall(r"(\w+): forward differs from PyTorch's by (\S+)", capsys.readouterr().out)
+    assert {network for network, _ in errors} == set(NETWORKS)
+    assert all(float(error) < 2e-5 for _, error in errors)
+
+
+@pytest.mark.parametrize("widen", ["copy", "polarity"])
+def test_a_widened_model_is_verified_with_its_base(tmp_path, capsys, widen):
+    narrow = replace(CONFIG.dit, in_channels=36)
+    shapes = flat_shapes(nnx.eval_shape(lambda: WanDiT(narrow, rngs=nnx.Rngs(0))))
+    rng = np.random.default_rng(0)
+    ours = {path: 0.2 * rng.normal(size=shape) for path, shape in shapes.items()}
+    base = translate_back(ours, wan_dit.wan(narrow))
+    tensors = {name: torch.tensor(np.ascontiguousarray(x)).float() for name, x in base.items()}
+    save_file(tensors, tmp_path / "base.safetensors")
+    args = [str(tmp_path / "base.safetensors"), "--config", "debug", "--widen", widen]
+    assert main(["weights", *args, "--out", str(tmp_path / "out")]) == 0
+    verify = ["verify", args[0], str(tmp_path / "out"), *args[1:]]
+    assert main(verify) == 0
+    assert "dit: forward differs from PyTorch's by" in capsys.readouterr().out
+    other = {"copy": "polarity", "polarity": "copy"}[widen]
+    assert main([*verify[:-1], other]) == 1
+    said = capsys.readouterr().out
+    assert "patch.kernel differs" in said
+    assert "dit: forward differs by more than rounding" in said
 
 
 def test_verify_finds_one_changed_value(tmp_path, capsys):
