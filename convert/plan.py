@@ -50,13 +50,13 @@ def to_ours(
     """
     shape = _shape(config, found.network)
     read = _narrow(config, found) if widen else shape
-    leaves = _leaves(found, read)
+    leaves, tensors = _leaves(found, read), found.tensors
     weights = {
         path: Weight(
             name=path,
             shape=leaf.shape,
             dtype=stored_as(leaf.dtype, dtype),
-            pieces=tuple(partial(_ours, leaf.rule, found.tensors[name]) for name in leaf.names),
+            pieces=tuple(partial(_ours, leaf.rule, tensors[name]) for name in leaf.names),
         )
         for path, leaf in leaves.items()
     }

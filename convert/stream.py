@@ -11,10 +11,12 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import mmap
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -68,12 +70,9 @@ def write(
     before = sum(sizes[: len(done)])
     yield before
     with part.open("r+b") as file, log.open("a", encoding="utf-8") as journal:
-        file.seek(len(header) + before)
-        for size, (data, digest) in zip(
-            sizes[len(done) :], _prepared(pieces[len(done) :]), strict=True
-        ):
-            file.write(data)
-            file.flush()
+        places = accumulate(sizes, initial=len(header))
+        left = list(zip(places, pieces, strict=False))[len(done) :]
+        for size, digest in zip(sizes[len(done) :], _put(left, file.fileno()), strict=True):
             journal.write(digest + "\n")
             journal.flush()
             done.append(digest)
@@ -120,24 +119,25 @@ def _resume(part: Path, log: Path, plan: str, *, size: int) -> list[str]:
     return whole
 
 
-def _prepared(
-    pieces: Sequence[tuple[Weight, Callable[[], np.ndarray]]],
-) -> Iterator[tuple[memoryview, str]]:
-    """The bytes of each piece and their hash, a few ahead of the one that is written."""
+def _put(pieces: Iterable, file: int) -> Iterator[str]:
+    """Write the pieces at their places, a few at once; the hash of each when it is written."""
     with ThreadPoolExecutor(WORKERS) as pool:
-        waiting: list[Future[tuple[memoryview, str]]] = []
-        for weight, piece in pieces:
-            waiting.append(pool.submit(_prepare, weight, piece))
+        waiting: list[Future[str]] = []
+        for place, piece in pieces:
+            waiting.append(pool.submit(_put_one, file, place, *piece))
             if len(waiting) == AHEAD:
                 yield waiting.pop(0).result()
         for future in waiting:
             yield future.result()
 
 
-def _prepare(weight: Weight, piece: Callable[[], np.ndarray]) -> tuple[memoryview, str]:
+def _put_one(file: int, place: int, weight: Weight, piece: Callable[[], np.ndarray]) -> str:
     array = in_rows(piece().astype(weight.dtype, copy=False))
     data = array.reshape(-1).view(np.uint8).data
-    return data, hashlib.sha256(data).hexdigest()
+    written = 0
+    while written < len(data):  # at most 2 GiB at once
+        written += os.pwrite(file, data[written:], place + written)
+    return hashlib.sha256(data).hexdigest()
 
 
 def in_rows(x: np.ndarray) -> np.ndarray:
@@ -146,6 +146,8 @@ def in_rows(x: np.ndarray) -> np.ndarray:
 
     bits = {1: np.uint8, 2: np.uint16, 4: np.float32}.get(x.itemsize)
     if x.ndim == 2 and bits and x.T.flags.c_contiguous and not x.flags.c_contiguous:
+        # First a byte of each page, in order: a disk can read ahead of that, not of columns.
+        x.T.reshape(-1).view(np.uint8)[:: mmap.PAGESIZE].max()
         return cv2.transpose(x.T.view(bits)).view(x.dtype)
     return np.ascontiguousarray(x)
 
