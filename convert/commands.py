@@ -14,9 +14,9 @@ import tyro
 from egosim_jax import command
 from egosim_jax.convert.layouts import Naming, Network, recognise
 from egosim_jax.convert.plan import TABLES, Widening, fits, to_ours, to_theirs
-from egosim_jax.convert.pth import Tensor
 from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, in_rows, write
+from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.run import write_json
 from egosim_jax.io.weights import WeightsError, hashes, mismatches
 from egosim_jax.progress import track, track_bytes
@@ -158,7 +158,7 @@ class ToTorch:
     def run(self) -> int:
         """Check, translate, write."""
         from egosim_jax import configs
-        from egosim_jax.convert.source import read_safetensors
+        from egosim_jax.io.mapped import read_safetensors
 
         config = configs.get(self.config)
         planned = []
@@ -200,7 +200,7 @@ class Lora:
         from egosim_jax import configs
         from egosim_jax.convert.lora import about_lora, exported, read_lora
         from egosim_jax.convert.plan import merged
-        from egosim_jax.convert.source import read_safetensors
+        from egosim_jax.io.mapped import read_safetensors
 
         config = configs.get(self.config).dit
         deltas = read_lora(self.source, config)
@@ -243,7 +243,7 @@ class Verify:
         """Compare; 1 if anything differs."""
         from egosim_jax import configs
         from egosim_jax.convert import forward
-        from egosim_jax.convert.source import read_safetensors
+        from egosim_jax.io.mapped import read_safetensors
 
         config = configs.get(self.config)
         wrong = []

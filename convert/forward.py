@@ -18,9 +18,8 @@ from einops import rearrange
 
 from egosim_jax.convert.layouts import Found
 from egosim_jax.convert.plan import BASE_CHANNELS, MASK, Widening, skeleton, to_theirs
-from egosim_jax.convert.pth import Tensor
-from egosim_jax.convert.source import read_safetensors
 from egosim_jax.generator import ModelConfig
+from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import fill, flat_shapes
 from egosim_jax.models.clip_vision import CLIPVisionConfig
 from egosim_jax.models.umt5 import UMT5Config

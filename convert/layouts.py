@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from egosim_jax.convert.pth import Tensor
 from egosim_jax.convert.source import Source, sources
+from egosim_jax.io.mapped import Tensor
 from egosim_jax.types import InputError
 
 Network = Literal["dit", "vae", "text", "image"]

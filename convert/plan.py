@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from egosim_jax.convert.layouts import Found, Naming, Network
-from egosim_jax.convert.pth import Tensor
 from egosim_jax.convert.rules import Leaf, Rule, assign, outline
 from egosim_jax.convert.stream import Weight, stored_as
+from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
 from egosim_jax.types import InputError
 

@@ -20,20 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import ml_dtypes
 import numpy as np
 
+from egosim_jax.io.mapped import DTYPES, Tensor
 from egosim_jax.types import InputError
 
-DTYPES = {
-    "float64": np.float64, "float32": np.float32, "float16": np.float16,
-    "bfloat16": ml_dtypes.bfloat16, "float8_e4m3fn": ml_dtypes.float8_e4m3fn,
-    "float8_e5m2": ml_dtypes.float8_e5m2, "float8_e4m3fnuz": ml_dtypes.float8_e4m3fnuz,
-    "float8_e5m2fnuz": ml_dtypes.float8_e5m2fnuz, "int64": np.int64, "int32": np.int32,
-    "int16": np.int16, "int8": np.int8, "uint8": np.uint8, "uint16": np.uint16,
-    "uint32": np.uint32, "uint64": np.uint64, "bool": np.bool_,
-}  # fmt: skip
-"""By their names in torch."""
 STORAGES = {
     "DoubleStorage": "float64", "FloatStorage": "float32", "HalfStorage": "float16",
     "BFloat16Storage": "bfloat16", "LongStorage": "int64", "IntStorage": "int32",
@@ -63,22 +54,6 @@ class Storage:
     data: memoryview
     dtype: str | None
     """None: the tensors say."""
-
-
-@dataclass(frozen=True)
-class Tensor:
-    """A tensor in a file: what it is, and how to look at it."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    data: memoryview
-    """From its first element on."""
-    strides: tuple[int, ...]
-    """In bytes."""
-
-    def array(self) -> np.ndarray:
-        """Its values, read-only, as they lie in the file."""
-        return np.ndarray(self.shape, self.dtype, buffer=self.data, strides=self.strides)
 
 
 def read_pth(path: Path) -> dict[str, Tensor]:

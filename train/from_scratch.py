@@ -1,6 +1,7 @@
 """A small model from nothing: the autoencoder, then the denoiser with its encoders on its latents.
 
-Every stage lies in a folder of its own under the run's and resumes.
+Or from weights: then the autoencoder is theirs. Every stage lies in a folder of its own under the
+run's and resumes.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ class FromScratch:
     """Of the weights that are written."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """How often each condition is hidden from the denoiser."""
+    weights: Path | None = None
+    """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
     def run(self) -> Path:
         """Autoencoder, latents, denoiser; the folder of the weights."""
@@ -66,6 +69,7 @@ class FromScratch:
             data=latents["train"],
             validation=latents["test"],
             out=self.out / "denoiser",
+            weights=self.weights,
         )
         networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
         networks.save(self.out / "weights", dtype=self.dtype)
@@ -74,10 +78,13 @@ class FromScratch:
     def _autoencoder(self) -> WanVAE:
         """The VAE, trained, with latents of mean 0 and deviation 1."""
         path = self.out / "weights" / "vae.safetensors"
-        if not path.exists():
+        vae = nnx.eval_shape(lambda: WanVAE(self.config.vae, rngs=nnx.Rngs(0)))
+        if not path.exists() and self.weights is not None:
+            weights.load(self.weights / path.name, vae)
+            weights.save(path, vae)
+        elif not path.exists():
             weights.save(path, self._train_autoencoder(), dtype=self.dtype)
         # What was written is what encodes, in a run that was interrupted and in one that was not.
-        vae = nnx.eval_shape(lambda: WanVAE(self.config.vae, rngs=nnx.Rngs(0)))
         weights.load(path, vae)
         return vae
 

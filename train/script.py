@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.run import open_folder
+from egosim_jax.io.weights import hashes, place
 from egosim_jax.logging import Console, JsonLines, Writers
 from egosim_jax.models.layers import initialise
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
@@ -69,13 +71,16 @@ def train(
     data: Path,
     validation: Path | None,
     out: Path,
+    weights: Path | None = None,
 ) -> Any:
     """Train `task` on the shards in `data`, resuming what `out` holds; the trained networks.
 
-    `validation` names shards whose loss is measured at fixed times and with fixed noise. The run
-    folder holds config.json, environment.json, metrics.jsonl and checkpoints/.
+    `validation` names shards whose loss is measured at fixed times and with fixed noise; `weights`
+    a folder to start from instead of random weights. The run folder holds config.json,
+    environment.json, metrics.jsonl and checkpoints/.
     """
-    open_folder(out, {"task": task, "training": training})
+    digests = None if weights is None else hashes(weights)
+    open_folder(out, {"task": task, "training": training, "weights": digests})
     mesh = make_mesh(training.mesh)
     placed = batch_sharding(mesh)
 
@@ -100,12 +105,18 @@ def train(
     sharding = state_sharding(mesh, abstract)
 
     checkpoints = Checkpoints(out / "checkpoints")
-    if checkpoints.latest is None:
+    if checkpoints.latest is not None:
+        state = checkpoints.restore(_placed(abstract, sharding), batches)
+    elif weights is None:
         state = initialise(create, out_shardings=sharding)
     else:
-        state = checkpoints.restore(_placed(abstract, sharding), batches)
+        params = place(weights, abstract.params, sharding.params)
+        begin = partial(TrainState.create, optimizer=optimizer)
+        state = jax.jit(begin, out_shardings=sharding, donate_argnums=0)(params)
     start = int(state.step)
     print(_greeting(state, start, training, out), file=sys.stderr, flush=True)
+    for name, digest in (digests or {}).items():
+        print(f"{out}: from {name} sha256 {digest[:16]}", file=sys.stderr, flush=True)
 
     update = jax.jit(
         make_update(task, graph, optimizer, training.seed),

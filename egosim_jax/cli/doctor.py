@@ -123,7 +123,7 @@ def _bytes(config: ModelConfig) -> int:
 
 def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
     """A row for each network of a folder of weights."""
-    from egosim_jax.convert.source import read_metadata
+    from egosim_jax.io.mapped import read_metadata
     from egosim_jax.io.weights import hashes
 
     for network, digest in hashes(folder).items():

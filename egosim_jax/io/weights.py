@@ -8,12 +8,14 @@ between a file and a network is reported in one list. Foreign formats are `conve
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.mapped import Tensor, read_metadata, read_safetensors
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -77,7 +79,7 @@ def fill(
 
     state = nnx.state(module, nnx.Not(nnx.RngState))
     for path, leaf in nnx.to_flat_state(state):
-        tensor = jnp.asarray(tensors[".".join(map(str, path))])
+        tensor = jnp.array(tensors[".".join(map(str, path))])  # a copy: the file may be mapped
         leaf.set_value(tensor.astype(dtype) if dtype is not None else tensor)
     nnx.update(module, state)
 
@@ -87,15 +89,10 @@ def hashes(folder: Path) -> dict[str, str]:
 
     The hash in a file's header, if it was converted; else the SHA-256 of the file.
     """
-    from safetensors import safe_open
-
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of weights. (--weights)")
-    found = {}
-    for path in sorted(folder.glob("*.safetensors")):
-        with safe_open(path, framework="numpy") as file:
-            found[path.stem] = (file.metadata() or {}).get(HASH) or sha256(path)
-    return found
+    files = sorted(folder.glob("*.safetensors"))
+    return {path.stem: read_metadata(path).get(HASH) or sha256(path) for path in files}
 
 
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
@@ -118,14 +115,42 @@ def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
 
 
 def load(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
-    """Fill a module from a file that `save` wrote."""
+    """Fill a module from a file that `save` or a conversion wrote."""
+    tensors = _read(path)
+    arrays = {name: tensor.array() for name, tensor in tensors.items()}
+    fill(module, arrays, dtype=dtype, source=str(path))
+
+
+def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
+    """The parameters of a weights folder on the devices, each of which reads its own part.
+
+    `abstract` holds, under the name of each network, what its parameters are to be; floats are cast
+    to that. Raises `WeightsError` naming every path that is missing, unknown or of another shape.
+    """
+    import jax
+    from flax import nnx
+
+    where = dict(nnx.to_flat_state(shardings))
+    placed = []
+    for network, leaves in groupby(nnx.to_flat_state(abstract), key=lambda item: item[0][0]):
+        file = folder / f"{network}.safetensors"
+        wanted = {".".join(map(str, path[1:])): (path, leaf) for path, leaf in leaves}
+        tensors = _read(file)
+        shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}
+        if problems := mismatches(tensors, shapes):
+            raise WeightsError(problems, source=str(file))
+        for name, (path, leaf) in wanted.items():
+            array, dtype = tensors[name].array(), leaf.dtype
+            value = jax.make_array_from_callback(
+                array.shape,
+                where[path].get_value(),
+                lambda part, array=array, dtype=dtype: array[part].astype(dtype),
+            )
+            placed.append((path, leaf.replace(value)))
+    return nnx.from_flat_state(placed)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError(f"No weights at {path}. (--weights must name a folder that holds it.)")
-    from safetensors import SafetensorError
-    from safetensors.flax import load_file
-
-    try:
-        tensors = load_file(path)
-    except SafetensorError as error:
-        raise InputError(f"{path} is not a readable safetensors file: {error}.") from error
-    fill(module, tensors, dtype=dtype, source=str(path))
+    return read_safetensors(path)

@@ -39,8 +39,7 @@ from egosim_jax import configs
 from egosim_jax.convert.commands import STEMS
 from egosim_jax.convert.layouts import Network
 from egosim_jax.convert.plan import TABLES, skeleton, to_theirs
-from egosim_jax.convert.pth import Tensor
-from egosim_jax.convert.source import read_safetensors
+from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import flat_shapes
 
 DTYPES: dict[Network, torch.dtype] = {

@@ -10,6 +10,7 @@ from safetensors.numpy import load_file
 
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.io.weights import hashes
 from egosim_jax.train.__main__ import main as egosim_train
 
 STEPS = ["--vae.steps", "2", "--denoiser.steps", "2"]
@@ -73,6 +74,18 @@ def test_the_recipe_finds_everything_done(run):
     before = (run / "weights" / "dit.safetensors").read_bytes()
     assert egosim_train(["debug", "--out", str(run), *STEPS]) == 0
     assert (run / "weights" / "dit.safetensors").read_bytes() == before
+
+
+def test_a_recipe_goes_on_from_weights(run, tmp_path, capsys):
+    weights, out = run / "weights", tmp_path / "on"
+    assert egosim_train(["debug", "--weights", str(weights), "--out", str(out), *STEPS]) == 0
+    digest = hashes(weights)["dit"]
+    assert f"denoiser: from dit sha256 {digest[:16]}" in capsys.readouterr().err
+    first, on = (load_file(folder / "weights" / "vae.safetensors") for folder in (run, out))
+    assert all(np.array_equal(first[name], on[name]) for name in first)
+    trained = load_file(out / "weights" / "dit.safetensors")["patch.kernel"]
+    given = load_file(weights / "dit.safetensors")["patch.kernel"]
+    assert 0 < np.abs(trained - given).max() < 0.1 * np.abs(given).max()
 
 
 def test_encode_makes_the_latents_of_the_recipe_again(run, tmp_path):

@@ -38,6 +38,8 @@ class Debug:
     """Training of the autoencoder."""
     denoiser: Training = field(default_factory=lambda: _training(20))
     """Training of the denoiser and its encoders."""
+    weights: Path | None = None
+    """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
     @property
     def metadata(self) -> Path:
@@ -63,4 +65,5 @@ class Debug:
             stride=8,
             vae=self.vae,
             denoiser=self.denoiser,
+            weights=self.weights,
         ).run()

@@ -61,6 +61,8 @@ class RealTiny:
         )
     )
     """Training of the denoiser and its encoders."""
+    weights: Path | None = None
+    """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
     def run(self) -> int:
         """Frames, autoencoder, latents, denoiser, weights."""
@@ -76,6 +78,7 @@ class RealTiny:
             out=self.out,
             vae=self.vae,
             denoiser=self.denoiser,
+            weights=self.weights,
             stride=self.stride,
         )
         print(stages.run())

@@ -59,6 +59,8 @@ class Tabletop:
         )
     )
     """Training of the denoiser and its encoders."""
+    weights: Path | None = None
+    """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
     def run(self) -> int:
         """Clips, autoencoder, latents, denoiser, weights."""
@@ -77,6 +79,7 @@ class Tabletop:
             out=self.out,
             vae=self.vae,
             denoiser=self.denoiser,
+            weights=self.weights,
             dtype="float16",
             dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
         )

@@ -14,8 +14,8 @@ from transformers import CLIPVisionConfig, CLIPVisionModel, UMT5Config, UMT5Enco
 from egosim_jax import configs
 from egosim_jax.convert.layouts import networks_of
 from egosim_jax.convert.plan import to_ours, to_theirs
-from egosim_jax.convert.pth import Tensor
 from egosim_jax.convert.source import Source
+from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.umt5 import UMT5
 from egosim_jax.models.wan_dit import WanDiT

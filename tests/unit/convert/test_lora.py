@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 from egosim_jax import configs
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.lora import read_lora
-from egosim_jax.convert.source import read_metadata
 from egosim_jax.io import weights
+from egosim_jax.io.mapped import read_metadata
 from egosim_jax.models import lora
 from egosim_jax.models.wan_dit import WanDiT
 from egosim_jax.types import InputError

@@ -1,6 +1,8 @@
 """Weights in our own format."""
 
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -52,7 +54,7 @@ def test_a_truncated_file_is_refused(tmp_path):
     path = tmp_path / "net.safetensors"
     weights.save(path, Net(rngs=nnx.Rngs(0)))
     path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(InputError, match="not a readable safetensors file"):
+    with pytest.raises(InputError, match="no readable safetensors file"):
         weights.load(path, skeleton())
 
 
@@ -68,3 +70,38 @@ def test_weights_can_be_read_by_whoever_the_umask_allows(tmp_path):
     finally:
         os.umask(umask)
     assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o644
+
+
+def test_each_device_reads_its_part_of_a_folder(tmp_path):
+    """Eight devices share the width of a kernel; the file has half the precision."""
+    code = """
+import sys
+from pathlib import Path
+import jax, numpy as np
+from flax import nnx
+from egosim_jax.io import weights
+from egosim_jax.models.layers import Linear
+from egosim_jax.sharding import MeshConfig, make_mesh, state_sharding
+
+class Net(nnx.Module):
+    def __init__(self):
+        self.dit = Linear(16, 4, axes=("embed", "mlp"), rngs=nnx.Rngs(0))
+
+folder = Path(sys.argv[1])
+net = Net()
+weights.save(folder / "dit.safetensors", net.dit, dtype="float16")
+abstract = nnx.state(nnx.eval_shape(Net), nnx.Param)
+sharding = state_sharding(make_mesh(MeshConfig()), abstract)
+placed = weights.place(folder, abstract, sharding)
+kernel = placed["dit"]["kernel"].get_value()
+assert kernel.dtype == np.float32
+assert {shard.data.shape for shard in kernel.addressable_shards} == {(2, 4)}
+np.testing.assert_array_equal(kernel, np.float16(net.dit.kernel.get_value()))
+assert jax.tree.structure(placed) == jax.tree.structure(abstract)
+"""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=os.environ | flags, check=True)
+    weights.save(tmp_path / "dit.safetensors", Net(rngs=nnx.Rngs(0)))
+    other = nnx.State({"dit": nnx.state(skeleton().blocks)})
+    with pytest.raises(WeightsError, match=r"head\.kernel: have \(3, 2\), want nothing"):
+        weights.place(tmp_path, other, other)
