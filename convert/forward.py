@@ -188,7 +188,8 @@ def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, n
     have = jax.jit(lambda x: ours.decode(ours.encode(x)))(video)
     with torch.no_grad():
         seen = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
-        decoded = module.decode(module.encode(seen).latent_dist.mode()).sample
+        (posterior,) = module.encode(seen, return_dict=False)
+        (decoded,) = module.decode(posterior.mode(), return_dict=False)
     return np.asarray(have), rearrange(decoded.numpy(), "b c f h w -> b f h w c")
 
 

@@ -19,9 +19,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from egosim_jax.convert.source import read_metadata, sources
+from egosim_jax.convert.source import sources
 from egosim_jax.convert.tables import wan_dit
-from egosim_jax.io.mapped import Tensor
+from egosim_jax.io.mapped import Tensor, read_metadata
 from egosim_jax.models.lora import Delta
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.types import InputError

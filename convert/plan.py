@@ -111,10 +111,14 @@ def merged(
 ) -> list[Weight]:
     """The weights of a video transformer with a LoRA in their kernels, in their own dtypes.
 
-    Raises `WeightsError` if the weights are not of the config.
+    Raises `InputError` if the weights or the LoRA are not of the config.
     """
-    if problems := mismatches(tensors, flat_shapes(skeleton("dit", config))):
+    from egosim_jax.models import lora
+
+    network = skeleton("dit", config)
+    if problems := mismatches(tensors, flat_shapes(network)):
         raise WeightsError(problems, source="dit.safetensors")
+    lora.check(network, deltas)
 
     def piece(tensor: Tensor, delta: Delta | None, layer: int | None) -> np.ndarray:
         kernel = tensor.array() if layer is None else tensor.array()[layer]

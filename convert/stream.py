@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.convert.source import CODES
+from egosim_jax.io.mapped import CODES
 from egosim_jax.io.weights import HASH
 
 WORKERS, AHEAD = 2, 3

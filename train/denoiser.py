@@ -6,13 +6,10 @@ from which prior, mask, hands and text are dropped at random (`conditioning/drop
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import grain
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
@@ -68,9 +65,8 @@ class Denoising:
         """The trained networks with random weights."""
         return Denoiser(self.model, rngs=rngs)
 
-    def examples(self) -> grain.transforms.Map:
-        """Drop what is not an array of the batch."""
-        return _Arrays()
+    def examples(self) -> None:
+        """A record of latents is an example as it is."""
 
     def loss(self, networks: Denoiser, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
         """The flow-matching loss of a batch under dropped conditions."""
@@ -90,13 +86,7 @@ class Denoising:
             ).mean()
             for time in VALIDATION_TIMES
         }
-        return {"loss": sum(errors.values()) / len(errors), **errors}
-
-
-class _Arrays(grain.transforms.Map):
-    def map(self, element: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The arrays of a record."""
-        return dict(element)
+        return {"loss": jnp.mean(jnp.stack(list(errors.values()))), **errors}
 
 
 def _velocity(networks: Denoiser, condition: Condition) -> VelocityFn:

@@ -40,23 +40,12 @@ def linears(network: nnx.Module) -> Iterator[tuple[str, Linear]]:
 def apply(network: nnx.Module, deltas: Mapping[str, Delta], *, scale: float = 1.0) -> None:
     """Add low-rank summands to the layers of these paths, in place; the kernels stay.
 
-    Raises `InputError` naming all that are not layers of the network or do not fit.
+    Raises what `check` raises.
     """
+    check(network, deltas)
     layers = dict(linears(network))
-    _check(layers, deltas)
     for path, delta in deltas.items():
         layers[path].low_rank = LowRank(jnp.asarray(delta.down), jnp.asarray(scale * delta.up))
-
-
-def merge(network: nnx.Module, deltas: Mapping[str, Delta], *, scale: float = 1.0) -> None:
-    """Add the products to the kernels, in place, computed in float32; dtypes stay."""
-    layers = dict(linears(network))
-    _check(layers, deltas)
-    for path, delta in deltas.items():
-        kernel = layers[path].kernel
-        value = kernel.get_value()
-        product = jnp.asarray(delta.down, jnp.float32) @ jnp.asarray(delta.up, jnp.float32)
-        kernel.set_value((value.astype(jnp.float32) + scale * product).astype(value.dtype))
 
 
 def deltas_of(network: nnx.Module) -> dict[str, Delta]:
@@ -86,7 +75,9 @@ def start(network: nnx.Module, rank: int, *, rngs: nnx.Rngs) -> None:
             layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
 
 
-def _check(layers: Mapping[str, Linear], deltas: Mapping[str, Delta]) -> None:
+def check(network: nnx.Module, deltas: Mapping[str, Delta]) -> None:
+    """Raise `InputError` naming every summand that is not of a layer or does not fit it."""
+    layers = dict(linears(network))
     problems = []
     for path, delta in deltas.items():
         if path not in layers:

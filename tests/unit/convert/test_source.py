@@ -10,7 +10,8 @@ import torch
 from safetensors.torch import save_file
 
 from egosim_jax.convert.layouts import recognise
-from egosim_jax.convert.source import read_safetensors, sources
+from egosim_jax.convert.source import sources
+from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.types import InputError
 
 DTYPES = [
