@@ -253,6 +253,22 @@ def back(weights, out, *more):
     return main(["to-torch", str(weights), "--config", "debug", "--out", str(out), *more])
 
 
+def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
+    for network, folder in (("text", "umt5"), ("image", "clip")):
+        (tmp_path / "theirs" / folder).mkdir(parents=True)
+        sharded(tmp_path / "theirs" / folder, foreign(network, "transformers"), "model", 2)
+    assert convert(tmp_path / "theirs", tmp_path / "ours") == 0
+    args = ["--config", "debug"]
+    assert main(["verify", str(tmp_path / "theirs"), str(tmp_path / "ours"), *args]) == 0
+    only = ["--layout", "diffusers", "--only", "text", "image"]
+    assert back(tmp_path / "ours", tmp_path / "back", *only) == 0
+    for network in ("text", "image"):
+        tensors = recognise(tmp_path / "back").network(network).tensors
+        expected = foreign(network, "transformers")
+        assert tensors.keys() == expected.keys()
+        assert all(np.array_equal(t.array(), expected[n].numpy()) for n, t in tensors.items())
+
+
 @pytest.mark.parametrize("layout", ["wan", "diffusers"])
 def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, monkeypatch):
     monkeypatch.setattr(commands, "LARGEST", 200_000)  # bytes, so that there is more than one
@@ -291,15 +307,18 @@ def test_a_forward_of_each_network_is_that_of_pytorch(checkpoint, tmp_path, caps
     assert all(float(error) < 2e-5 for _, error in errors)
 
 
-@pytest.mark.parametrize("widen", ["copy", "polarity"])
-def test_a_widened_model_is_verified_with_its_base(tmp_path, capsys, widen):
+@pytest.mark.parametrize(
+    ("naming", "prefix", "widen"),
+    [("wan", "", "polarity"), ("diffusers", "", "copy"), ("wan", "diffusion_model.", "polarity")],
+)
+def test_a_widened_model_is_verified_with_its_base(tmp_path, capsys, naming, prefix, widen):
     narrow = replace(CONFIG.dit, in_channels=36)
     shapes = flat_shapes(nnx.eval_shape(lambda: WanDiT(narrow, rngs=nnx.Rngs(0))))
     rng = np.random.default_rng(0)
     ours = {path: 0.2 * rng.normal(size=shape) for path, shape in shapes.items()}
-    base = translate_back(ours, wan_dit.wan(narrow))
+    base = translate_back(ours, getattr(wan_dit, naming)(narrow))
     tensors = {name: torch.tensor(np.ascontiguousarray(x)).float() for name, x in base.items()}
-    save_file(tensors, tmp_path / "base.safetensors")
+    save_file(prefixed(tensors, prefix), tmp_path / "base.safetensors")
     args = [str(tmp_path / "base.safetensors"), "--config", "debug", "--widen", widen]
     assert main(["weights", *args, "--out", str(tmp_path / "out")]) == 0
     verify = ["verify", args[0], str(tmp_path / "out"), *args[1:]]
