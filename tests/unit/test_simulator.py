@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -72,6 +72,14 @@ def test_each_clip_starts_from_the_state_that_the_last_one_left(tmp_path):
     np.testing.assert_allclose(
         first.state.world_from_object[target], moved[-1] @ np.linalg.inv(moved[0]), atol=1e-12
     )
+
+
+def test_a_state_that_no_camera_looks_at_is_refused(tmp_path):
+    state = clips()[0].state
+    behind = replace(state, points_m=state.points_m + np.float32([0, -50, 0]))
+    with pytest.raises(InputError, match=r"None of the .* points of the scene is seen"):
+        list(simulator().run(behind, [to_action(clips()[0])], out=tmp_path, seed=0))
+    assert not any(tmp_path.rglob("*.npz"))
 
 
 def test_without_perception_the_state_stays(tmp_path):

@@ -78,3 +78,17 @@ def test_without_hands_nothing_is_found(clip):
     found = Classical()(Clip(frames=clip.frames, fps=8), missing, clip.state)
     assert not found.world_from_object
     assert not np.isfinite(found.depth_m).any()
+
+
+def test_of_two_hands_on_one_thing_one_moved_it(clip, found):
+    """A second hand beside the first, that goes with it."""
+    action = to_action(clip)
+    beside = action.joints_m + [0.02, 0, 0]
+    both = replace(action, joints_m=np.concatenate([beside, action.joints_m], axis=1))
+    twice = Classical()(Clip(frames=clip.frames, fps=8), both, clip.state)
+    assert twice.world_from_object.keys() == found.world_from_object.keys()
+    target = clip.body_ids[clip.target]
+    points = clip.state.points_m[clip.state.object_ids == target].astype(float).mean(axis=0)
+    ends = [transform(path[target][-1], points[None]) for path in
+            (found.world_from_object, twice.world_from_object)]  # fmt: skip
+    assert np.linalg.norm(ends[0] - ends[1]) < 0.02

@@ -183,6 +183,39 @@ def test_hands_never_enter_the_state():
     assert (state.object_ids >= 0).all()
 
 
+def test_a_thing_that_leaves_the_view_is_where_it_was_carried():
+    shares, aside = np.array([0, 0.2, 0.5, 1, 1, 1]), np.array([0.9, 0])
+    poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
+    poses[:, :2, 3] = shares[:, None] * aside
+    plates = [HERE + share * aside for share in shares]
+    state = fuse(start(), perceived(plates, world_from_object={1: poses}), fusion=COARSE)
+    assert at(state, HERE) == 0
+    assert at(state, HERE + aside) > 100
+
+
+@pytest.mark.parametrize("how", ["tracked", "touched", "neither"])
+def test_an_empty_mask_where_depth_sees_through_takes_the_thing_away(how):
+    """No pixel is the thing's, and the table is seen where it was and where it should be now."""
+    poses, _ = path()
+    moved = {
+        "tracked": {"world_from_object": {1: poses}},
+        "touched": {"touched": {1: np.arange(FRAMES) < 3}},
+        "neither": {},
+    }[how]
+    state = fuse(start(), perceived([None] * FRAMES, **moved), fusion=COARSE)
+    assert at(state, HERE) == at(state, THERE) == 0
+    assert not (state.object_ids == 1).any()
+
+
+def test_an_empty_mask_without_depth_moves_what_is_remembered():
+    poses, _ = path()
+    unknown = np.full((FRAMES, HEIGHT, WIDTH), np.inf, np.float32)
+    clip = perceived([None] * FRAMES, depth_m=unknown, world_from_object={1: poses})
+    state = fuse(start(), clip, fusion=COARSE)
+    assert at(state, HERE) == 0
+    assert at(state, THERE) > 100
+
+
 def test_a_clip_in_which_nothing_is_known_leaves_the_points():
     before = start()
     nothing = perceived([None] * FRAMES, depth_m=np.full((FRAMES, HEIGHT, WIDTH), np.inf, "f4"))
