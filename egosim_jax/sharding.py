@@ -1,14 +1,23 @@
-"""Where arrays live: the device mesh, the logical axes of weights, and the rules between them.
+"""Where arrays live: the device mesh, the logical axes of arrays, and the rules between them.
 
-Networks know no mesh. Each weight names its logical axes (`models/layers.py`); the one table here
-maps them to mesh axes. A batch is split over `data` and `fsdp` together; weights, gradients and
-optimiser state are split over `fsdp` along their model width and repeated over `data`.
+The mesh is data x fsdp x context. Networks do not know it: each weight names its logical axes
+(`models/layers.py`), activations are named where they must lie in a certain way (`constrain`), and
+the two tables here map them.
+
+    data      copies of the weights, each with samples of its own; with hosts along it, this is HSDP
+    fsdp      devices that share a copy of the weights, each with samples of its own
+    context   devices that share samples, too, each with a part of the tokens; in self-attention
+              each has all tokens of a part of the heads (Ulysses: Jacobs et al. 2023, section 3)
+
+Weights, gradients and optimiser state are split over fsdp and context together, along the model
+width.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import jax
@@ -17,11 +26,14 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from egosim_jax.types import InputError
 
-RULES: Mapping[str, str] = {"embed": "fsdp"}
-"""Logical axis to mesh axis; an axis that is not listed is never split."""
-
-BATCH = PartitionSpec(("data", "fsdp"))
-"""How every array with a leading batch axis is split."""
+WEIGHTS: Mapping[str, tuple[str, ...]] = {"embed": ("fsdp", "context")}
+"""Logical axis of a weight to mesh axes; an axis that is not listed is never split."""
+ACTIVATIONS: Mapping[str, tuple[str, ...]] = {
+    "batch": ("data", "fsdp"),
+    "tokens": ("context",),
+    "heads": ("context",),
+}
+"""Logical axis of an activation to mesh axes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,31 +44,56 @@ class MeshConfig:
     """Copies of the weights, each with its own part of the batch."""
     fsdp: int = -1
     """Devices that share one copy of the weights; -1 takes all that are left."""
+    context: int = 1
+    """Devices that share one sample, each with a part of its tokens."""
 
 
 def make_mesh(config: MeshConfig) -> Mesh:
-    """Lay the devices out as data x fsdp, or say how many there are."""
+    """Lay the devices out as data x fsdp x context, or say how many there are."""
     devices = jax.device_count()
-    fsdp = devices // config.data if config.fsdp == -1 else config.fsdp
-    if config.data < 1 or fsdp < 1 or config.data * fsdp != devices:
+    taken = config.data * config.context
+    fsdp = devices // max(1, taken) if config.fsdp == -1 else config.fsdp
+    if min(config.data, fsdp, config.context) < 1 or taken * fsdp != devices:
         raise InputError(
-            f"A mesh of data {config.data} x fsdp {config.fsdp} does not fit {devices} devices: "
-            "the product of the axes must be the number of devices. (--training.mesh.data, "
-            "--training.mesh.fsdp)"
+            f"A mesh of data {config.data} x fsdp {config.fsdp} x context {config.context} does "
+            f"not fit {devices} devices: the product of the axes must be the number of devices. "
+            "(--training.mesh.data, --training.mesh.fsdp, --training.mesh.context)"
         )
-    return jax.make_mesh((config.data, fsdp), ("data", "fsdp"), axis_types=(AxisType.Auto,) * 2)
+    shape = (config.data, fsdp, config.context)
+    return jax.make_mesh(shape, ("data", "fsdp", "context"), axis_types=(AxisType.Auto,) * 3)
+
+
+def several_devices() -> bool:
+    """Whether what is traced is for a mesh of more than one device."""
+    return jax.sharding.get_abstract_mesh().size > 1
+
+
+def constrain(x: jax.Array, axes: tuple[str | None, ...]) -> jax.Array:
+    """Place an activation as its logical axes say; on one device nothing happens."""
+    return jax.lax.with_sharding_constraint(x, spec(*axes)) if several_devices() else x
+
+
+def spec(*axes: str | None) -> PartitionSpec:
+    """The mesh axes of an activation's logical axes."""
+    return PartitionSpec(*(ACTIVATIONS[axis] if axis else None for axis in axes))
+
+
+def parts(axis: str) -> int:
+    """Into how many parts the mesh splits a logical axis of activations."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return prod(mesh.shape[name] for name in ACTIVATIONS[axis])
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
     """The sharding of arrays with a leading batch axis."""
-    return NamedSharding(mesh, BATCH)
+    return NamedSharding(mesh, spec("batch"))
 
 
 def state_sharding(mesh: Mesh, tree: Any) -> Any:
     """The sharding of every leaf of a pytree that may hold nnx variables (params, moments).
 
     A variable is split by the logical axes that it names; other leaves are repeated. An axis
-    whose size the mesh axis does not divide is repeated too, so that tiny models run anywhere.
+    whose size the mesh axes do not divide is repeated too, so that tiny models run anywhere.
     """
 
     def place(leaf: Any) -> Any:
@@ -64,20 +101,21 @@ def state_sharding(mesh: Mesh, tree: Any) -> Any:
             return NamedSharding(mesh, PartitionSpec())
         if not jax.tree.leaves(leaf):  # where optax masks a variable out of its moments
             return leaf
-        spec = _spec(mesh, tuple(leaf.shape), leaf.get_metadata().get("axes"))
-        return leaf.replace(NamedSharding(mesh, spec))
+        axes = leaf.get_metadata().get("axes") or (None,) * len(leaf.shape)
+        return leaf.replace(NamedSharding(mesh, _fitting(mesh, tuple(leaf.shape), axes)))
 
     return jax.tree.map(place, tree, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
 
 
-def _spec(mesh: Mesh, shape: tuple[int, ...], axes: tuple[str | None, ...] | None) -> PartitionSpec:
+def _fitting(mesh: Mesh, shape: tuple[int, ...], axes: tuple[str | None, ...]) -> PartitionSpec:
+    """The rules' mesh axes, each used once, where they divide the array."""
     used: set[str] = set()
-    spec: list[str | None] = []
-    for size, axis in zip(shape, axes or (None,) * len(shape), strict=True):
-        target = RULES.get(axis) if axis else None
-        if target is None or target in used or size % mesh.shape[target]:
-            spec.append(None)
+    found: list[tuple[str, ...] | None] = []
+    for size, axis in zip(shape, axes, strict=True):
+        rule = WEIGHTS.get(axis, ()) if axis else ()
+        if not rule or used & set(rule) or size % prod(mesh.shape[name] for name in rule):
+            found.append(None)
         else:
-            used.add(target)
-            spec.append(target)
-    return PartitionSpec(*spec)
+            used |= set(rule)
+            found.append(rule)
+    return PartitionSpec(*found)

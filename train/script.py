@@ -130,21 +130,22 @@ def train(
     rate = learning_rate(training.optimizer, training.steps)
     clock = _Clock(start, training.steps)
     pending: dict[int, Mapping[str, jax.Array]] = {}
-    for step in range(start + 1, training.steps + 1):
-        last = step == training.steps
-        batch = _to_devices(next(batches), placed)
-        state, metrics = update(state, batch)
-        pending[step] = metrics
-        if step % training.log_every == 0 or last:
-            numbers = _mean(pending)
-            pending = {}
-            writer.write(
-                step, {**numbers, "rate": float(np.asarray(rate(step - 1))), **clock.tick(step)}
-            )
-        if validation is not None and (step % training.validate_every == 0 or last):
-            writer.write(step, _validate(validate, state, validation, task, training, placed))
-        if step % training.save_every == 0 or last:
-            checkpoints.save(step, state, batches)
+    with jax.set_mesh(mesh):
+        for step in range(start + 1, training.steps + 1):
+            last = step == training.steps
+            batch = _to_devices(next(batches), placed)
+            state, metrics = update(state, batch)
+            pending[step] = metrics
+            if step % training.log_every == 0 or last:
+                numbers = _mean(pending)
+                pending = {}
+                writer.write(
+                    step, {**numbers, "rate": float(np.asarray(rate(step - 1))), **clock.tick(step)}
+                )
+            if validation is not None and (step % training.validate_every == 0 or last):
+                writer.write(step, _validate(validate, state, validation, task, training, placed))
+            if step % training.save_every == 0 or last:
+                checkpoints.save(step, state, batches)
     checkpoints.close()
     return nnx.merge(graph, state.params)
 

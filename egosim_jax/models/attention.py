@@ -19,6 +19,9 @@ from einops import rearrange
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
+from egosim_jax.sharding import ACTIVATIONS, constrain, parts, several_devices, spec
+from egosim_jax.types import InputError
+
 Kernel = Literal["xla", "cudnn"]
 """`xla` runs anywhere, one head at a time, so that the scores of a single head are in memory;
 `cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only)."""
@@ -36,17 +39,52 @@ def attention(
     bias: Float[Array, "#b h n m"] | None = None,
     scale: float | None = None,
     kernel: Kernel = "xla",
+    over: Literal["heads", "queries"] | None = None,
 ) -> Float[Array, "b n h k"]:
     """Attend without a mask; scores and softmax are float32 in both kernels.
 
     `bias` is added to the scores; `scale` is 1/sqrt(k) unless given. A dense bias keeps the flash
-    kernels from being used well, so that only the text encoder passes one.
+    kernels from being used well, so that only the text encoder passes one. `over` says what the
+    devices that share a sample divide among them, on a mesh that has such: heads, if there are as
+    many keys as queries, or queries, if there are few keys. Each then runs the kernel by itself.
     """
+    if over is not None and several_devices():
+        _check_parts(q.shape, over)
+        queries = {
+            "heads": spec("batch", None, "heads", None),
+            "queries": spec("batch", "tokens", None, None),
+        }[over]
+        keys = queries if over == "heads" else spec("batch", None, None, None)
+        shared = jax.shard_map(
+            partial(attention, scale=scale, kernel=kernel),
+            in_specs=(queries, keys, keys),
+            out_specs=queries,
+            check_vma=False,
+        )
+        # Said outright, or the compiler would split the weights of q, k and v by heads, too.
+        tokens = partial(constrain, axes=("batch", "tokens", None, None))
+        if over == "heads":
+            k, v = tokens(k), tokens(v)
+        return tokens(shared(tokens(q), k, v))
     if bias is not None or kernel == "cudnn":
         return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation=kernel)
     scale = q.shape[-1] ** -0.5 if scale is None else scale
     heads = (rearrange(x, "b n h k -> h b n k") for x in (q, k, v))
     return rearrange(_by_head(*heads, scale), "h b n k -> b n h k")
+
+
+def _check_parts(shape: tuple[int, ...], over: Literal["heads", "queries"]) -> None:
+    batch, tokens, heads, _ = shape
+    for name, size, axis in (
+        ("samples", batch, "batch"),
+        ("tokens", tokens, "tokens"),
+        *([("heads", heads, "heads")] if over == "heads" else []),
+    ):
+        if size % parts(axis):
+            raise InputError(
+                f"{size} {name} do not divide into the mesh's {parts(axis)} parts: the "
+                f"{name} must be a multiple of the product of {' and '.join(ACTIVATIONS[axis])}."
+            )
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))

@@ -39,7 +39,11 @@ from egosim_jax.models.wan_layers import (
     gelu_tanh,
     normal,
 )
+from egosim_jax.sharding import constrain
 from egosim_jax.types import InputError
+
+TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
+"""Logical axes of the residual stream, and of what is the same for all tokens."""
 
 
 @no_type_check
@@ -103,12 +107,13 @@ class WanDiT(nnx.Module):
     ) -> Float[Array, "b f h w c"]:
         """Velocity, in float32, of noisy latents at times in [0, 1000]."""
         _, _, h, w, _ = noisy.shape
-        time, modulation = self.time(t)
+        time, modulation = (constrain(x, VECTORS) for x in self.time(t))
 
         def step(block: Block, x: jax.Array, sources: tuple[KeysValues, ...]) -> tuple:
-            return block(x, modulation, context.rotation, sources), None
+            x = block(x, modulation, context.rotation, sources)
+            return constrain(x, TOKENS), None
 
-        x = self.patch.noisy(noisy) + context.patches
+        x = constrain(self.patch.noisy(noisy) + context.patches, TOKENS)
         x, _ = scan_blocks(step, self.blocks, x, context.sources, remat=self._remat)
         return rearrange(
             self.head(x, time),

@@ -254,10 +254,15 @@ class Attention(KeyValue):
         return self._by_head(self.norm_q(self.q(x)))
 
     def attend(
-        self, q: Float[Array, "b n h k"], k: Float[Array, "b m h k"], v: Float[Array, "b m h k"]
+        self,
+        q: Float[Array, "b n h k"],
+        k: Float[Array, "b m h k"],
+        v: Float[Array, "b m h k"],
+        over: Literal["heads", "queries"],
     ) -> Float[Array, "b n d"]:
         """Attend in the compute dtype and join the heads."""
-        out = attention(q.astype(self.dtype), k.astype(self.dtype), v, kernel=self.kernel)
+        q, k = q.astype(self.dtype), k.astype(self.dtype)
+        out = attention(q, k, v, kernel=self.kernel, over=over)
         return rearrange(out, "b n h k -> b n (h k)")
 
 
@@ -269,7 +274,7 @@ class SelfAttention(Attention):
     ) -> Float[Array, "b n d"]:
         """Attend."""
         q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
-        return self.o(self.attend(q, k, self.values(x)))
+        return self.o(self.attend(q, k, self.values(x), "heads"))
 
 
 class CrossAttention(Attention):
@@ -289,7 +294,8 @@ class CrossAttention(Attention):
     ) -> Float[Array, "b n d"]:
         """Attend to each source by itself and add the results."""
         q = self.queries(x)
-        return self.o(reduce(jnp.add, (self.attend(q, *keys_values) for keys_values in sources)))
+        attended = (self.attend(q, *keys_values, "queries") for keys_values in sources)
+        return self.o(reduce(jnp.add, attended))
 
 
 class Block(nnx.Module):

@@ -1,0 +1,102 @@
+"""Loss, gradients and 20 updates of a tiny model on a mesh: DATA FSDP CONTEXT OUT.npz."""
+
+import dataclasses
+import sys
+
+import jax
+import numpy as np
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.models.layers import initialise
+from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
+from egosim_jax.train.denoiser import Denoising
+from egosim_jax.train.optimizer import OptimizerConfig, make_optimizer
+from egosim_jax.train.state import TrainState
+from egosim_jax.train.step import make_update
+from egosim_jax.types import VideoSpec
+
+STEPS, BATCH = 20, 8
+DEBUG = configs.get("debug")
+# 2 x 2 x 4 tokens, and widths that eight devices divide.
+MODEL = dataclasses.replace(
+    DEBUG,
+    video=VideoSpec(frames=5, height=32, width=64),
+    encoders="frozen",
+    dit=WanDiTConfig(
+        dim=64, ffn_dim=96, heads=4, layers=2, text_dim=64, image_dim=32, remat="attention"
+    ),
+)
+TASK = Denoising(model=MODEL, dropout=ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2))
+
+
+def batch(seed: int) -> dict[str, np.ndarray]:
+    """Random latents and embeddings."""
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape: int) -> np.ndarray:
+        return rng.normal(size=(BATCH, *shape)).astype(np.float32)
+
+    shape, dit = MODEL.video.latent_shape, MODEL.dit
+    return {
+        **{name: draw(*shape, 16) for name in ("truth", "prior", "hands")},
+        "mask": rng.integers(0, 2, (BATCH, *shape, 4)).astype(np.uint8),
+        "text": draw(7, dit.text_dim),
+        "image": draw(5, dit.image_dim),
+    }
+
+
+def main(data: int, fsdp: int, context: int, out: str) -> None:
+    """Compute and write everything that must not depend on the mesh."""
+    mesh = make_mesh(MeshConfig(data=data, fsdp=fsdp, context=context))
+    optimizer = make_optimizer(OptimizerConfig(learning_rate=1e-3), STEPS)
+
+    def create() -> TrainState:
+        params = nnx.state(TASK.networks(nnx.Rngs(0)), nnx.Param)
+        # Zeros, as the head begins with, would hide errors.
+        leaves, tree = jax.tree.flatten(params)
+        keys = jax.random.split(jax.random.key(1), len(leaves))
+        noisy = [
+            x + 0.05 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)
+        ]
+        return TrainState.create(jax.tree.unflatten(tree, noisy), optimizer)
+
+    graph = nnx.graphdef(nnx.eval_shape(lambda: TASK.networks(nnx.Rngs(0))))
+    sharding = state_sharding(mesh, jax.eval_shape(create))
+    placed = batch_sharding(mesh)
+    state = initialise(create, out_shardings=sharding)
+    key = jax.random.key(0)
+
+    def loss(params, batch):
+        return TASK.loss(nnx.merge(graph, params), batch, key)[0]
+
+    def put(seed: int):
+        return jax.device_put(batch(seed), placed)
+
+    with jax.set_mesh(mesh):
+        gradient = jax.jit(
+            jax.value_and_grad(loss),
+            in_shardings=(sharding.params, placed),
+            out_shardings=(None, sharding.params),
+        )
+        value, gradients = gradient(state.params, put(0))
+        update = jax.jit(
+            make_update(TASK, graph, optimizer, 0),
+            in_shardings=(sharding, placed),
+            out_shardings=(sharding, None),
+        )
+        curve = []
+        for step in range(STEPS):
+            state, metrics = update(state, put(step))
+            curve.append(float(metrics["loss"]))
+    leaves = {
+        ".".join(map(str, path)): np.asarray(leaf.get_value())
+        for path, leaf in nnx.to_flat_state(gradients)
+    }
+    np.savez(out, loss=np.asarray(value), curve=np.array(curve), **leaves)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:4]), sys.argv[4])

@@ -1,0 +1,46 @@
+"""What is computed does not depend on how it is shared among devices."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MESHES = [(1, 8, 1), (4, 2, 1), (1, 4, 2), (2, 2, 2)]
+"""Data, fsdp, context."""
+QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+"""Compiling is what takes time here."""
+
+
+def run(mesh: tuple[int, int, int], out: Path) -> tuple[dict[str, np.ndarray], str]:
+    """The numbers of a mesh, and what the compiler said."""
+    flags = f"--xla_force_host_platform_device_count={np.prod(mesh)} {QUICK}"
+    command = [sys.executable, "-m", "tests.training.run_mesh", *map(str, mesh), str(out)]
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return dict(np.load(out)), done.stderr
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    return run((1, 1, 1), tmp_path_factory.mktemp("mesh") / "alone.npz")[0]
+
+
+@pytest.mark.parametrize("mesh", MESHES, ids=str)
+def test_loss_gradients_and_losses_of_20_updates_are_those_of_one_device(alone, mesh, tmp_path):
+    """In float32: sums are taken in another order."""
+    shared, said = run(mesh, tmp_path / "shared.npz")
+    assert "full rematerialization" not in said
+    np.testing.assert_allclose(shared["loss"], alone["loss"], rtol=1e-6)
+    np.testing.assert_allclose(shared["curve"], alone["curve"], rtol=1e-5)
+    leaves = alone.keys() - {"loss", "curve"}
+    assert len(leaves) > 40
+    square = {name: np.square(alone[name], dtype=float).sum() for name in leaves}
+    apart = {name: np.square(shared[name].astype(float) - alone[name]).sum() for name in leaves}
+    assert np.sqrt(sum(apart.values()) / sum(square.values())) <= 1e-6
+    worst = max(leaves, key=lambda name: apart[name] / square[name])
+    assert np.sqrt(apart[worst] / square[worst]) <= 1e-5, worst
