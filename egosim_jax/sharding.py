@@ -22,7 +22,7 @@ from typing import Any
 
 import jax
 from flax import nnx
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from egosim_jax.types import InputError
 
@@ -89,7 +89,7 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, spec("batch"))
 
 
-def state_sharding(mesh: Mesh, tree: Any) -> Any:
+def state_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
     """The sharding of every leaf of a pytree that may hold nnx variables (params, moments).
 
     A variable is split by the logical axes that it names; other leaves are repeated. An axis
@@ -107,7 +107,9 @@ def state_sharding(mesh: Mesh, tree: Any) -> Any:
     return jax.tree.map(place, tree, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
 
 
-def _fitting(mesh: Mesh, shape: tuple[int, ...], axes: tuple[str | None, ...]) -> PartitionSpec:
+def _fitting(
+    mesh: Mesh | AbstractMesh, shape: tuple[int, ...], axes: tuple[str | None, ...]
+) -> PartitionSpec:
     """The rules' mesh axes, each used once, where they divide the array."""
     used: set[str] = set()
     found: list[tuple[str, ...] | None] = []

@@ -29,7 +29,7 @@ def test_every_weight_of_every_network_names_its_axes(params):
 def test_the_model_width_is_split_over_fsdp_and_layers_are_not(params):
     placed = state_sharding(make_mesh(MeshConfig()), params)
     spec = placed["dit"]["blocks"]["self_attn"]["q"]["kernel"].get_value().spec
-    assert spec == PartitionSpec(None, "fsdp", None)
+    assert spec == PartitionSpec(None, ("fsdp", "context"), None)
 
 
 def test_a_mesh_that_does_not_fit_the_devices_is_refused():

@@ -202,11 +202,11 @@ def test_the_hash_in_the_header_tells_weights_apart(tmp_path):
 SLOW = """
 import sys, time
 from egosim_jax.convert import stream
-prepare = stream._prepare
-def slowly(weight, piece):
+in_rows = stream.in_rows
+def slowly(array):
     time.sleep(0.02)
-    return prepare(weight, piece)
-stream._prepare = slowly
+    return in_rows(array)
+stream.in_rows = slowly
 from egosim_jax.convert.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
