@@ -25,6 +25,7 @@ from egosim_jax.models.clip_vision import CLIPVisionConfig
 from egosim_jax.models.umt5 import UMT5Config
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.types import InputError
 
 LAYERS, VOCAB = 2, 512
 """Layers and rows of the token table that are computed: the others' values are compared anyway."""
@@ -34,6 +35,8 @@ TEXT_TOKENS, IMAGE_TOKENS = 512, 257
 """diffusers' transformer parts the two by these numbers."""
 RES_BLOCKS = 2
 """Of a level of the released VAE's encoder."""
+UNUSED = "post_layernorm"
+"""What follows the last block that we use of CLIP, and may be missing."""
 MODULES = ("torch", "diffusers", "transformers")
 """What it takes; the extra `test` has them."""
 
@@ -70,6 +73,15 @@ def difference(
     return float(np.linalg.norm(have - want) / np.linalg.norm(want))
 
 
+def _run(network: Any, *inputs: Any) -> np.ndarray:
+    """What a network gives; its weights are arguments of the program, not constants in it."""
+    import jax
+    from flax import nnx
+
+    graph, state = nnx.split(network)
+    return np.asarray(jax.jit(lambda state, *x: nnx.merge(graph, state)(*x))(state, *inputs))
+
+
 class _Theirs:
     """A checkpoint in the names of diffusers or transformers."""
 
@@ -77,15 +89,19 @@ class _Theirs:
         self.arrays, self.cast = arrays, cast
 
     def load(self, module: Any) -> Any:
-        """Fill a module of PyTorch's. What the checkpoint lacks stays random, and will show."""
+        """Fill a module of PyTorch's. Raises `InputError` naming what the checkpoint lacks."""
         import torch
 
-        state = {}
-        for name, parameter in module.state_dict().items():
+        state, lacking = {}, []
+        for name, parameter in module.named_parameters():
             read = self.arrays.get(name.removeprefix("vision_model."))
             if read is not None:
                 values = _values(read(), tuple(parameter.shape), cast=self.cast)
                 state[name] = torch.from_numpy(values)
+            elif UNUSED not in name:
+                lacking.append(name)
+        if lacking:
+            raise InputError(f"The checkpoint has no {', '.join(lacking)}, which PyTorch needs.")
         module.load_state_dict(state, strict=False)
         return module.eval()
 
@@ -104,6 +120,8 @@ def _short(shape: Any) -> Any:
 
 def _values(array: np.ndarray, shape: tuple[int, ...], cast: np.dtype | None = None) -> np.ndarray:
     """The first values along each axis, in float32."""
+    if array.ndim != len(shape) or any(n < m for n, m in zip(array.shape, shape, strict=True)):
+        raise InputError(f"The checkpoint has {array.shape} where PyTorch needs {shape}.")
     part = array[tuple(map(slice, shape))]
     return np.array(part if cast is None else part.astype(cast), np.float32)
 
@@ -131,7 +149,6 @@ def _dit(
     ours: Any, shape: WanDiTConfig, theirs: _Theirs, widen: Widening | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The velocities of one small clip."""
-    import jax
     import torch
     from diffusers import WanTransformer3DModel
 
@@ -155,7 +172,7 @@ def _dit(
     text = draw((1, TEXT_TOKENS, shape.text_dim), np.float32)
     image = shape.image_dim and draw((1, IMAGE_TOKENS, shape.image_dim), np.float32)
     t = np.full(1, 500, np.float32)
-    have = jax.jit(ours)(latents, t, text, image)
+    have = _run(ours, latents, t, text, image)
     seen = latents[..., :channels].copy()
     if widen == "polarity":
         seen[..., MASK] = 1 - seen[..., MASK]
@@ -167,7 +184,7 @@ def _dit(
             None if image is None else torch.from_numpy(image),
             return_dict=False,
         )[0]
-    return np.asarray(have), rearrange(velocity.numpy(), "b c f h w -> b f h w c")
+    return have, rearrange(velocity.numpy(), "b c f h w -> b f h w c")
 
 
 def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, np.ndarray]:
@@ -175,6 +192,7 @@ def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, n
     import jax
     import torch
     from diffusers import AutoencoderKLWan
+    from flax import nnx
 
     module = AutoencoderKLWan(
         base_dim=shape.dim,
@@ -185,7 +203,14 @@ def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, n
     )
     theirs.load(module)
     video = np.random.default_rng(0).uniform(-1, 1, (1, 5, 32, 32, 3)).astype(np.float32)
-    have = jax.jit(lambda x: ours.decode(ours.encode(x)))(video)
+    graph, params = nnx.split(ours)
+
+    @jax.jit
+    def through(params: Any, video: Any) -> Any:
+        vae = nnx.merge(graph, params)
+        return vae.decode(vae.encode(video))
+
+    have = through(params, video)
     with torch.no_grad():
         seen = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
         (posterior,) = module.encode(seen, return_dict=False)
@@ -195,7 +220,6 @@ def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, n
 
 def _text(ours: Any, shape: UMT5Config, theirs: _Theirs) -> tuple[np.ndarray, np.ndarray]:
     """The embeddings of random tokens."""
-    import jax
     import torch
     from transformers import UMT5Config as TheirConfig
     from transformers import UMT5EncoderModel
@@ -214,16 +238,15 @@ def _text(ours: Any, shape: UMT5Config, theirs: _Theirs) -> tuple[np.ndarray, np
     )
     ids = np.random.default_rng(0).integers(0, shape.vocab, (1, TEXT_TOKENS // 4), np.int32)
     mask = np.ones(ids.shape, bool)
-    have = jax.jit(ours)(ids, mask)
+    have = _run(ours, ids, mask)
     with torch.no_grad():
         module = theirs.load(UMT5EncoderModel(config))
         want = module(torch.from_numpy(ids).long(), torch.from_numpy(mask).long())
-    return np.asarray(have), want.last_hidden_state.numpy()
+    return have, want.last_hidden_state.numpy()
 
 
 def _image(ours: Any, shape: CLIPVisionConfig, theirs: _Theirs) -> tuple[np.ndarray, np.ndarray]:
     """The tokens of a random picture."""
-    import jax
     import torch
     from transformers import CLIPVisionConfig as TheirConfig
     from transformers import CLIPVisionModel
@@ -240,8 +263,8 @@ def _image(ours: Any, shape: CLIPVisionConfig, theirs: _Theirs) -> tuple[np.ndar
     )
     size = (1, shape.image_size, shape.image_size, 3)
     pixels = np.random.default_rng(0).standard_normal(size, np.float32)
-    have = jax.jit(ours)(pixels)
+    have = _run(ours, pixels)
     with torch.no_grad():
         seen = torch.from_numpy(rearrange(pixels, "b h w c -> b c h w").copy())
         states = theirs.load(CLIPVisionModel(config))(seen, output_hidden_states=True)
-    return np.asarray(have), states.hidden_states[-1].numpy()
+    return have, states.hidden_states[-1].numpy()

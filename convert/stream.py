@@ -62,8 +62,9 @@ def write(
     sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
     part, log = (target.with_name(target.name + end) for end in (".part", ".part.log"))
     plan = _plan(header, origin)
-    done = _resume(part, log, plan, size=len(header) + sum(sizes))
+    done = _resume(part, log, plan, start=len(header), sizes=sizes)
     if not done:
+        log.unlink(missing_ok=True)  # first, so that no old log stands beside the new file
         part.write_bytes(header)
         os.truncate(part, len(header) + sum(sizes))
         log.write_text(plan + "\n", encoding="utf-8")
@@ -107,14 +108,23 @@ def _plan(header: bytes, origin: Sequence[Path]) -> str:
     return hashlib.sha256(header + repr(files).encode()).hexdigest()
 
 
-def _resume(part: Path, log: Path, plan: str, *, size: int) -> list[str]:
-    """The hashes of the pieces that a file of the same plan already has."""
-    if not (part.exists() and log.exists() and part.stat().st_size == size):
+def _resume(part: Path, log: Path, plan: str, *, start: int, sizes: Sequence[int]) -> list[str]:
+    """The hashes of the pieces that a file of the same plan has, and that still are what they were.
+
+    After a crash of the machine the log may know of pieces that never reached the disk.
+    """
+    if not (part.exists() and log.exists() and part.stat().st_size == start + sum(sizes)):
         return []
     first, *lines = log.read_text(encoding="utf-8").split("\n")
     if first != plan:
         return []
-    whole = lines[:-1]  # the last line may be torn, or is empty
+    whole = []
+    with part.open("rb") as file:
+        file.seek(start)
+        for size, digest in zip(sizes, lines[:-1], strict=False):  # the last is torn, or empty
+            if hashlib.sha256(file.read(size)).hexdigest() != digest:
+                break
+            whole.append(digest)
     log.write_text("\n".join([plan, *whole, ""]), encoding="utf-8")
     return whole
 

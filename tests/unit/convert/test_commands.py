@@ -212,7 +212,8 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path):
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path, lost):
     save_file(foreign("dit", "wan"), tmp_path / "dit.safetensors")
     assert convert(tmp_path / "dit.safetensors", tmp_path / "whole") == 0
     out = tmp_path / "killed"
@@ -230,6 +231,12 @@ def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path):
     ]
     done = log.read_text("utf-8").count("\n") - 1
     log.write_text(log.read_text("utf-8") + "abc", encoding="utf-8")  # a torn line
+    if lost:  # a page did not reach the disk
+        part = out / "dit.safetensors.part"
+        written = bytearray(part.read_bytes())
+        start = 8 + int.from_bytes(written[:8], "little")
+        written[start : start + 4] = b"lost"
+        part.write_bytes(written)
     assert convert(tmp_path / "dit.safetensors", out) == 0
     assert 10 <= done < 60
     whole, resumed = (folder / "dit.safetensors" for folder in (tmp_path / "whole", out))
