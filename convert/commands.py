@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from egosim_jax import command
-from egosim_jax.convert.layouts import Naming, Network, recognise
+from egosim_jax.convert.layouts import Naming, Network, naming_in, recognise
 from egosim_jax.convert.plan import TABLES, Widening, fits, to_ours, to_theirs
 from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, in_rows, write
@@ -165,7 +165,7 @@ class ToTorch:
         here: list[Network] = [name for name in TABLES if getattr(config, name) is not None]
         for network in self.only or here:
             file = self.weights / f"{network}.safetensors"
-            naming = _naming(network, self.layout)
+            naming = naming_in(self.layout, network)
             tensors = read_safetensors(file)
             theirs = to_theirs(tensors, config, network, naming, dtype=self.dtype)
             folder = self.out / FOLDERS[network] if self.layout == "diffusers" else self.out
@@ -288,11 +288,6 @@ def _same(weight: Weight, tensor: Tensor) -> bool:
         )
         for place, piece in zip(places, weight.pieces, strict=True)
     )
-
-
-def _naming(network: Network, layout: Literal["wan", "diffusers"]) -> Naming:
-    encoder = network in ("text", "image")
-    return "transformers" if encoder and layout == "diffusers" else layout
 
 
 def _write(

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from einops import rearrange
 
-from egosim_jax.convert.layouts import Found
+from egosim_jax.convert.layouts import Found, naming_in
 from egosim_jax.convert.plan import BASE_CHANNELS, MASK, Widening, skeleton, to_theirs
-from egosim_jax.generator import ModelConfig
+from egosim_jax.generator import ModelConfig, Program
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import fill, flat_shapes
 from egosim_jax.models.clip_vision import CLIPVisionConfig
@@ -74,12 +74,8 @@ def difference(
 
 
 def _run(network: Any, *inputs: Any) -> np.ndarray:
-    """What a network gives; its weights are arguments of the program, not constants in it."""
-    import jax
-    from flax import nnx
-
-    graph, state = nnx.split(network)
-    return np.asarray(jax.jit(lambda state, *x: nnx.merge(graph, state)(*x))(state, *inputs))
+    """What a network gives."""
+    return np.asarray(Program(lambda network, *x: network(*x), network)(*inputs))
 
 
 class _Theirs:
@@ -140,8 +136,7 @@ def _arrays(
     # Its VAE's names are written out for the released one's blocks.
     if found.network == "vae" and config.vae.res_blocks == RES_BLOCKS:
         return single_file_utils.convert_wan_vae_to_diffusers(arrays)
-    naming = "diffusers" if found.network == "vae" else "transformers"
-    theirs = to_theirs(converted, config, found.network, naming)
+    theirs = to_theirs(converted, config, found.network, naming_in("diffusers", found.network))
     return {weight.name: weight.pieces[0] for weight in theirs}
 
 
@@ -189,10 +184,8 @@ def _dit(
 
 def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, np.ndarray]:
     """A small video, encoded and decoded."""
-    import jax
     import torch
     from diffusers import AutoencoderKLWan
-    from flax import nnx
 
     module = AutoencoderKLWan(
         base_dim=shape.dim,
@@ -203,14 +196,7 @@ def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, n
     )
     theirs.load(module)
     video = np.random.default_rng(0).uniform(-1, 1, (1, 5, 32, 32, 3)).astype(np.float32)
-    graph, params = nnx.split(ours)
-
-    @jax.jit
-    def through(params: Any, video: Any) -> Any:
-        vae = nnx.merge(graph, params)
-        return vae.decode(vae.encode(video))
-
-    have = through(params, video)
+    have = Program(lambda vae, x: vae.decode(vae.encode(x)), ours)(video)
     with torch.no_grad():
         seen = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
         (posterior,) = module.encode(seen, return_dict=False)

@@ -95,6 +95,12 @@ def recognise(path: Path) -> Folder:
     return Folder(path=path, found=tuple(found), unknown=tuple(unknown), tokenizer=tokenizer)
 
 
+def naming_in(layout: Literal["wan", "diffusers"], network: Network) -> Naming:
+    """Whose names a network has in a layout: diffusers' takes its encoders from transformers."""
+    encoder = network in ("text", "image")
+    return "transformers" if encoder and layout == "diffusers" else layout
+
+
 def networks_of(source: Source) -> list[Found]:
     """The networks of a checkpoint; a ComfyUI file may hold several under their prefixes."""
     found = []
