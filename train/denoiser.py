@@ -60,6 +60,9 @@ class Denoising:
     """How noise levels are drawn and errors weighted."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """How often each condition is hidden."""
+    change: float = 0.0
+    """How much more a place counts where the clip is unlike its prior: at hands, at what they move
+    and at what was not observed, which is little of a picture and all that has to be learnt."""
 
     def networks(self, rngs: nnx.Rngs) -> Denoiser:
         """The trained networks with random weights."""
@@ -72,7 +75,9 @@ class Denoising:
         """The flow-matching loss of a batch under dropped conditions."""
         drop, draw = jax.random.split(key)
         condition = self.dropout.apply(networks.condition(batch), drop)
-        loss, _ = self.objective.loss(_velocity(networks, condition), batch["truth"], draw)
+        velocity = _velocity(networks, condition)
+        places = changed_places(batch["truth"], batch["prior"], self.change)
+        loss, _ = self.objective.loss(velocity, batch["truth"], draw, places=places)
         return loss, {}
 
     def validate(self, networks: Denoiser, batch: Batch) -> Metrics:
@@ -87,6 +92,18 @@ class Denoising:
             for time in VALIDATION_TIMES
         }
         return {"loss": jnp.mean(jnp.stack(list(errors.values()))), **errors}
+
+
+def changed_places(
+    truth: Float[Array, "b f h w c"], prior: Float[Array, "b f h w c"], change: float
+) -> Float[Array, "b f h w 1"]:
+    """Weight of each place, 1 on average: 1 + change where the latents differ by 1 or more.
+
+    Less where they differ by less; the latents of a channel have a deviation of 1.
+    """
+    difference = jnp.square(truth - prior).mean(axis=-1, keepdims=True)
+    weight = 1 + change * jnp.minimum(difference, 1)
+    return weight / weight.mean(axis=(1, 2, 3), keepdims=True)
 
 
 def _velocity(networks: Denoiser, condition: Condition) -> VelocityFn:

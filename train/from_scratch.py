@@ -51,6 +51,8 @@ class FromScratch:
     """Of the weights that are written."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """How often each condition is hidden from the denoiser."""
+    change: float = 0.0
+    """How much more a place counts for the denoiser where the clip is unlike its prior."""
     weights: Path | None = None
     """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
@@ -64,6 +66,7 @@ class FromScratch:
                 model=self.config,
                 objective=Objective(schedule=self.config.schedule),
                 dropout=self.dropout,
+                change=self.change,
             ),
             self.denoiser,
             data=latents["train"],

@@ -15,7 +15,7 @@ and the loss is E[w(sigma) L(sigma)] over e ~ N(0, 1) and one of these draws of 
                   minimum and mean over the 1000 levels (the training schedule of DiffSynth, on
                   which the EgoSim release is built)
 
-where sigma(u) is the schedule's shift.
+where sigma(u) is the schedule's shift. The mean of L may give some places more weight than others.
 """
 
 from __future__ import annotations
@@ -78,17 +78,23 @@ class Objective:
         return (jnp.exp(-2 * (sigma - 0.5) ** 2) - floor) / (bells - floor).mean()
 
     def loss(
-        self, velocity_fn: VelocityFn, x0: Float[Array, "b f h w c"], key: Key[Array, " *keys"]
+        self,
+        velocity_fn: VelocityFn,
+        x0: Float[Array, "b f h w c"],
+        key: Key[Array, " *keys"],
+        *,
+        places: Float[Array, "b f h w 1"] | float = 1.0,
     ) -> tuple[Float[Array, ""], Sampled]:
         """The weighted error at random noise levels, averaged over the batch.
 
         `key` is one key, or one for each sample: a sample's draws depend on its own key only, so
-        a batch with given keys draws what its samples would draw alone.
+        a batch with given keys draws what its samples would draw alone. `places` weights the
+        places of each sample, 1 on average.
         """
         keys = jax.vmap(jax.random.split)(sample_keys(key, x0.shape[0]))
         sigma = self.sample_sigma(keys[:, 0], x0.shape[0])
         noise = jax.vmap(lambda k: jax.random.normal(k, x0.shape[1:]))(keys[:, 1])
-        error = self.loss_at(velocity_fn, x0, noise, sigma)
+        error = self.loss_at(velocity_fn, x0, noise, sigma, places=places)
         return (self.weight(sigma) * error).mean(), Sampled(sigma, error)
 
     def loss_at(
@@ -97,13 +103,18 @@ class Objective:
         x0: Float[Array, "b f h w c"],
         noise: Float[Array, "b f h w c"],
         sigma: Float[Array, " b"],
+        *,
+        places: Float[Array, "b f h w 1"] | float = 1.0,
     ) -> Float[Array, " b"]:
-        """Each sample's unweighted error at a given noise and noise level, in float32."""
+        """Each sample's error at a given noise and noise level, in float32.
+
+        Not weighted, but for the `places` of a sample.
+        """
         x0, noise = x0.astype(jnp.float32), noise.astype(jnp.float32)
         level = sigma[:, None, None, None, None]
         velocity = velocity_fn((1 - level) * x0 + level * noise, self.schedule.timesteps(sigma))
         difference = velocity.astype(jnp.float32) - (noise - x0)
-        return jnp.square(difference).mean(axis=(1, 2, 3, 4))
+        return (places * jnp.square(difference)).mean(axis=(1, 2, 3, 4))
 
     @property
     def _levels(self) -> Float[np.ndarray, " levels"]:

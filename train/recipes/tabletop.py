@@ -59,6 +59,9 @@ class Tabletop:
         )
     )
     """Training of the denoiser and its encoders."""
+    change: float = 0.0
+    """How much more a place counts for the denoiser where the clip is unlike its prior: at hands
+    and at what they move."""
     weights: Path | None = None
     """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
@@ -81,6 +84,7 @@ class Tabletop:
             denoiser=self.denoiser,
             weights=self.weights,
             dtype="float16",
+            change=self.change,
             dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
         )
         print(stages.run())

@@ -67,6 +67,18 @@ def test_the_loss_is_the_weighted_mean_of_the_errors(x0, times):
     assert float(loss) == pytest.approx(expected, rel=1e-6)  # float32 sums
 
 
+def test_places_weigh_the_error_of_each_sample(x0):
+    noise, sigma = jax.random.normal(jax.random.key(6), SHAPE), jnp.array([0.1, 0.5, 0.9])
+    objective = Objective()
+    places = jnp.zeros((*SHAPE[:-1], 1)).at[:, 0].set(2.0)
+    half = objective.loss_at(velocity, x0, noise, sigma, places=places)
+    first = objective.loss_at(velocity, x0[:, :1], noise[:, :1], sigma)
+    np.testing.assert_allclose(half, first, rtol=1e-6)
+    key = jax.random.key(3)
+    ones, _ = objective.loss(velocity, x0, key, places=jnp.ones((*SHAPE[:-1], 1)))
+    assert ones == objective.loss(velocity, x0, key)[0]
+
+
 @pytest.mark.parametrize("times", TIMES)
 def test_a_batch_with_its_own_keys_equals_batches_of_one(x0, times):
     objective = Objective(times=times)
