@@ -212,20 +212,27 @@ def _baselines(
 def summarise(runs: Sequence[Sequence[Mapping[str, float]]]) -> dict[str, Summary]:
     """Mean and spreads of each measure; `runs` has a list of scenes for each seed.
 
-    Scenes in which a measure is NaN, because there was nothing to measure, do not count.
+    Where a measure is NaN, because there was nothing to measure, it does not count.
     """
     import numpy as np
 
-    def deviation(values: np.ndarray) -> float:
-        return float(np.nanstd(values, ddof=1)) if len(values) > 1 else 0.0
+    def known(values: Sequence[float]) -> np.ndarray:
+        return np.array([value for value in values if np.isfinite(value)])
+
+    def mean(values: Sequence[float]) -> float:
+        return float(known(values).mean()) if len(known(values)) else float("nan")
+
+    def deviation(values: Sequence[float]) -> float:
+        return float(known(values).std(ddof=1)) if len(known(values)) > 1 else 0.0
 
     summaries = {}
     for name in MEASURES:
-        values = np.array([[scene[name] for scene in run] for run in runs])
+        by_seed = [[scene[name] for scene in run] for run in runs]
+        by_scene = list(zip(*by_seed, strict=True))
         summaries[name] = {
-            "mean": float(np.nanmean(values)),
-            "over_scenes": deviation(values.mean(axis=0)),
-            "over_seeds": deviation(np.nanmean(values, axis=1)),
+            "mean": mean([mean(values) for values in by_scene]),
+            "over_scenes": deviation([mean(values) for values in by_scene]),
+            "over_seeds": deviation([mean(values) for values in by_seed]),
         }
     return summaries
 
