@@ -34,7 +34,6 @@ MEASURES = {
     "region_psnr": ("region PSNR dB", "{:.2f}"),
     "hand_iou": ("hand IoU", "{:.3f}"),
     "object_error": ("object error %", "{:.2f}"),
-    "object_found": ("object found %", "{:.1f}"),
 }
 DEFINITIONS = {
     "psnr, ssim": "as in evaluate, frames 1 to the last",
@@ -43,9 +42,7 @@ DEFINITIONS = {
     "hand_iou": "silhouette of hands and arms, read off by colour and opened by 3 x 3, against the "
     "true ids; mean over frames",
     "object_error": "distance between the centroids of the thing acted on, read off by colour, and "
-    "its true one, in percent of the width; mean over the frames in which it is seen and found",
-    "object_found": "share of the frames in which it is seen where it is found, in percent: at "
-    "least 5 pixels of its colour",
+    "its true one, in percent of the width; mean over the frames in which it is seen",
     "spread": "standard deviation over scenes, each a mean over seeds; and over seeds, each a mean "
     "over scenes (n - 1)",
 }
@@ -168,16 +165,12 @@ class _Scene:
         seen = region.label(video[1:], self.background[1:], movers)
         whole = score(video[1:], truth)
         errors = region.centroid_errors(seen == target, thing)
-        found = np.isfinite(errors)
         return {
             "psnr": whole.psnr,
             "ssim": whole.ssim,
             "region_psnr": region.region_psnr(video[1:], truth, hands | thing),
             "hand_iou": region.silhouette_iou(region.opened(seen >= FIRST_HAND), hands),
-            "object_error": 100 * float(errors[found].mean()) / ids.shape[2]
-            if found.any()
-            else np.nan,
-            "object_found": 100 * float(found.mean()) if len(errors) else np.nan,
+            "object_error": 100 * float(np.mean(errors)) / ids.shape[2] if len(errors) else np.nan,
         }
 
     def block(self, video: np.ndarray) -> Block:

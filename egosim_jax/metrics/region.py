@@ -21,8 +21,6 @@ SHADES = (0.45, 1.15)
 """Least and greatest light on a surface."""
 LEAST_SEEN_PX = 20
 """Frames in which fewer pixels of a thing are visible say nothing about where it is."""
-LEAST_FOUND_PX = 5
-"""A thing of which fewer pixels are made out is not found."""
 NEAR = 0.12
 """Share of the width around the median pixel of a thing in which its pixels count."""
 
@@ -84,13 +82,15 @@ def centroid_errors(
 ) -> Float[np.ndarray, " g"]:
     """Distances in pixels between the centroids of two silhouettes.
 
-    One for each frame in which the truth is seen well; NaN where the thing is not found.
+    One for each frame in which the truth is seen well; a thing that is not found at all counts as
+    a picture's width away.
     """
+    width = truth.shape[2]
     errors = []
     for here, there in zip(found, truth, strict=True):
         if there.sum() >= LEAST_SEEN_PX:
-            lost = here.sum() < LEAST_FOUND_PX
-            errors.append(np.nan if lost else np.hypot(*(_centroid(here) - _centroid(there))))
+            gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
+            errors.append(np.hypot(*gap))
     return np.array(errors)
 
 
