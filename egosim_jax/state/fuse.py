@@ -5,7 +5,9 @@
 2. What the memory knows of a tracked thing moves with it.
 3. Free space is carved: a remembered point goes if the last frames that could have seen it look
    through it. (The original does not, and a moved thing leaves a ghost.)
-4. New points replace remembered ones within 5 mm.
+4. New points replace remembered ones within 5 mm, and take over the colours of the nearest of the
+   same thing: what was seen once is not painted again from a generated clip, whose colours drift
+   from clip to clip. (The original paints again.)
 
 Fusing the same again changes nothing, clips that see different places may be fused in either order,
 and the points come out in one order, so that equal states are equal arrays.
@@ -54,6 +56,7 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
     new = _observed(perceived, sure, lost, fusion or Fusion())
     old = _moved(state, perceived, lost)
     old = _carved(old, perceived, sure)
+    new = replace(new, colours=_remembered(new, old))
     old = old[~_near(old.points_m, new.points_m, REPLACE_M)]
     everything = _ordered(_together([old, new]))
     poses = {n: path[-1] for n, path in perceived.world_from_object.items()}
@@ -180,6 +183,22 @@ def _near(
         return np.zeros(len(points_m), bool)
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points_m, others_m)]
     return np.asarray(clouds[0].compute_point_cloud_distance(clouds[1])) <= radius_m
+
+
+def _remembered(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
+    """The colours of new points: of the nearest remembered one that they replace, or their own."""
+    import open3d as o3d
+
+    colours = new.colours.copy()
+    for number in np.intersect1d(new.object_ids, old.object_ids):
+        here = np.flatnonzero(new.object_ids == number)
+        there = np.flatnonzero(old.object_ids == number)
+        index = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(old.points_m[there]))
+        index.knn_index()
+        nearest, square = (x.numpy() for x in index.knn_search(new.points_m[here], 1))
+        near = square[:, 0] <= REPLACE_M**2
+        colours[here[near]] = old.colours[there[nearest[near, 0]]]
+    return colours
 
 
 def _together(pieces: list[_Points]) -> _Points:

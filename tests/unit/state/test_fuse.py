@@ -121,6 +121,22 @@ def test_fusing_the_same_again_changes_nothing():
     assert fingerprint(twice) == fingerprint(once)
 
 
+def test_what_was_seen_keeps_its_colours_and_what_is_new_has_those_of_the_clip():
+    clip = tracked()
+    drifted = replace(clip, frames=255 - clip.frames)
+    state = fuse(start(), drifted, fusion=COARSE)
+    plate, table = state.object_ids == 1, state.object_ids == 0
+    np.testing.assert_array_equal(state.colours[plate], np.tile([200, 30, 30], (plate.sum(), 1)))
+    # The table where the plate lay had not been seen before.
+    places = state.points_m[:, :2] - HERE
+    bared = table & ((places > 0.02) & (places < 0.06)).all(axis=1)
+    np.testing.assert_array_equal(state.colours[bared], np.tile([135, 145, 165], (bared.sum(), 1)))
+    assert bared.sum() > 30
+    far = table & (state.points_m[:, 2] < 1) & ((places < -0.03) | (places > 0.11)).any(axis=1)
+    painted = (state.colours[far] == [120, 110, 90]).all(axis=1)
+    assert painted.mean() > 0.95
+
+
 def test_a_thing_comes_back_by_the_way_it_went():
     poses, plates = path()
     there = fuse(start(), tracked(), fusion=COARSE)
