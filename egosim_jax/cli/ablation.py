@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from egosim_jax.cli.sheet import Block, draw_sheet
+from egosim_jax.cli.spread import mean_and_spread
 from egosim_jax.command import DONE
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
@@ -207,26 +208,13 @@ def summarise(runs: Sequence[Sequence[Mapping[str, float]]]) -> dict[str, Summar
 
     Where a measure is NaN, because there was nothing to measure, it does not count.
     """
-    import numpy as np
-
-    def known(values: Sequence[float]) -> np.ndarray:
-        return np.array([value for value in values if np.isfinite(value)])
-
-    def mean(values: Sequence[float]) -> float:
-        return float(known(values).mean()) if len(known(values)) else float("nan")
-
-    def deviation(values: Sequence[float]) -> float:
-        return float(known(values).std(ddof=1)) if len(known(values)) > 1 else 0.0
-
     summaries = {}
     for name in MEASURES:
         by_seed = [[scene[name] for scene in run] for run in runs]
-        by_scene = list(zip(*by_seed, strict=True))
-        summaries[name] = {
-            "mean": mean([mean(values) for values in by_scene]),
-            "over_scenes": deviation([mean(values) for values in by_scene]),
-            "over_seeds": deviation([mean(values) for values in by_seed]),
-        }
+        scenes = [mean_and_spread(values)[0] for values in zip(*by_seed, strict=True)]
+        mean, over_scenes = mean_and_spread(scenes)
+        _, over_seeds = mean_and_spread([mean_and_spread(values)[0] for values in by_seed])
+        summaries[name] = {"mean": mean, "over_scenes": over_scenes, "over_seeds": over_seeds}
     return summaries
 
 

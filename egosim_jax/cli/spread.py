@@ -10,15 +10,24 @@ Line = Mapping[str, Mapping[str, float]]
 """Mean and spread of each measure."""
 
 
-def summarise(found: Sequence[Mapping[str, float]], measures: Measures) -> Line:
-    """Mean of each measure and its standard deviation (n - 1); NaN does not count."""
+def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and standard deviation (n - 1) of values; NaN, where nothing was measured, not counted.
+
+    The mean of nothing is NaN, the deviation of fewer than two values 0.
+    """
     import numpy as np
 
+    known = [value for value in values if not np.isnan(value)]
+    mean = float(np.mean(known)) if known else float("nan")
+    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
+
+
+def summarise(found: Sequence[Mapping[str, float]], measures: Measures) -> Line:
+    """Mean and spread of each measure."""
     line = {}
     for name in measures:
-        values = np.array([one[name] for one in found], float)
-        spread = float(np.nanstd(values, ddof=1)) if len(values) > 1 else 0.0
-        line[name] = {"mean": float(np.nanmean(values)), "spread": spread}
+        mean, spread = mean_and_spread([one[name] for one in found])
+        line[name] = {"mean": mean, "spread": spread}
     return line
 
 
