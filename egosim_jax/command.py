@@ -19,6 +19,14 @@ from egosim_jax.types import InputError
 DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = 0, 1, 2, 3, 70, 75
 
 
+class Stop(Exception):  # noqa: N818 - that a command ends early need not be an error
+    """Ends a command with an exit code, after printing why."""
+
+    def __init__(self, why: str, code: int):
+        super().__init__(why)
+        self.code = code
+
+
 @runtime_checkable
 class Command(Protocol):
     """A parsed command line."""
@@ -63,6 +71,9 @@ def guarded(run: Callable[[], int]) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return USAGE
+    except Stop as stop:
+        print(stop, file=sys.stderr)
+        return stop.code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return FAILED

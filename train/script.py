@@ -105,7 +105,7 @@ def train(
     sharding = state_sharding(mesh, abstract)
 
     checkpoints = Checkpoints(out / "checkpoints")
-    if checkpoints.latest is not None:
+    if checkpoints.steps:
         state = checkpoints.restore(_placed(abstract, sharding), batches)
     elif weights is None:
         state = initialise(create, out_shardings=sharding)

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from fractions import Fraction
 from importlib import metadata
 from pathlib import Path
@@ -71,39 +71,52 @@ def _commit() -> str | None:
     return answer.stdout.strip()
 
 
-def open_folder(folder: Path, config: Any) -> None:
+def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) -> None:
     """Make a run folder and record config and environment, or continue in one of equal config.
 
-    A folder that was moved stays the same run: `out` may differ. Raises `InputError` when the
-    folder cannot be written or holds a run of another config, naming the fields that differ.
+    A folder that was moved stays the same run: `out` may differ, and so may the fields whose dotted
+    paths are given, with all below them. Of several processes the first one writes. Raises
+    `InputError` when the folder cannot be written or holds a run of another config, naming the
+    fields that differ.
     """
+    import jax
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
+        probe = folder / f".writable-{jax.process_index()}"
         probe.touch()
         probe.unlink()
     except OSError as error:
         raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
     path, wanted = folder / "config.json", plain(config)
     if path.is_file():
-        have = json.loads(path.read_text("utf-8"))
-        differing = sorted(_differences({**have, "out": None}, {**wanted, "out": None}))
-        if differing:
-            listing = "\n".join(f"  {line}" for line in differing)
-            raise InputError(
-                f"{folder} holds a run of another config; choose another --out or the same "
-                f"config:\n{listing}"
-            )
-    else:
-        write_json(path, config)
-    write_json(folder / "environment.json", environment())
-
-
-def _differences(have: Any, want: Any, path: str = "") -> list[str]:
-    if isinstance(have, dict) and isinstance(want, dict):
-        return [
-            line
-            for key in have.keys() | want.keys()
-            for line in _differences(have.get(key), want.get(key), f"{path}.{key}" if path else key)
+        found = _differences(json.loads(path.read_text("utf-8")), wanted)
+        differing = [
+            f"  {field}: {what}"
+            for field, what in sorted(found.items())
+            if not any(f"{field}.".startswith(f"{free}.") for free in ("out", *may_differ))
         ]
-    return [] if have == want else [f"{path}: the folder has {have}, this run has {want}"]
+        if differing:
+            raise InputError(
+                "\n".join(
+                    [
+                        f"{folder} holds a run of another config; choose another --out or the "
+                        "same config:",
+                        *differing,
+                    ]
+                )
+            )
+    if jax.process_index() == 0:
+        write_json(path, config)
+        write_json(folder / "environment.json", environment())
+
+
+def _differences(have: Any, want: Any, path: str = "") -> dict[str, str]:
+    """What differs, by the dotted path of its field."""
+    if isinstance(have, dict) and isinstance(want, dict):
+        found = {}
+        for key in have.keys() | want.keys():
+            below = f"{path}.{key}" if path else key
+            found |= _differences(have.get(key), want.get(key), below)
+        return found
+    return {} if have == want else {path: f"the folder has {have}, this run has {want}"}

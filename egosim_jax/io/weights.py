@@ -7,7 +7,7 @@ between a file and a network is reported in one list. Foreign formats are `conve
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from flax import nnx
+    from jax.sharding import Mesh
 
 HASH = "sha256"
 """Entry of a converted file's header: the hash of its weights, known without reading them."""
@@ -65,33 +66,49 @@ def fill(
     *,
     dtype: np.dtype | str | None = None,
     source: str = "the checkpoint",
+    mesh: Mesh | None = None,
 ) -> None:
     """Put tensors, keyed by our dotted paths, into a module made for real or by `nnx.eval_shape`.
 
-    `dtype` casts floating tensors; by default they keep their own. Raises `WeightsError` naming
-    every path that is missing, unknown or of another shape, before anything is changed.
+    `dtype` casts floating tensors; by default they keep their own. On a mesh each device gets its
+    own part. Raises `WeightsError` naming every path that is missing, unknown or of another shape,
+    before anything is changed.
     """
     problems = mismatches(tensors, flat_shapes(module))
     if problems:
         raise WeightsError(problems, source=source)
+    import jax
     import jax.numpy as jnp
     from flax import nnx
 
+    from egosim_jax.sharding import state_sharding
+
     state = nnx.state(module, nnx.Not(nnx.RngState))
+    where = {} if mesh is None else dict(nnx.to_flat_state(state_sharding(mesh, state)))
     for path, leaf in nnx.to_flat_state(state):
-        tensor = jnp.array(tensors[".".join(map(str, path))])  # a copy: the file may be mapped
-        leaf.set_value(tensor.astype(dtype) if dtype is not None else tensor)
+        tensor = tensors[".".join(map(str, path))]
+        if mesh is None:
+            value = jnp.array(tensor)  # a copy: the file may be mapped
+        else:
+            value = jax.make_array_from_callback(
+                tensor.shape, where[path].get_value(), lambda part, t=tensor: np.array(t[part])
+            )
+        leaf.set_value(value.astype(dtype) if dtype is not None else value)
     nnx.update(module, state)
 
 
-def hashes(folder: Path) -> dict[str, str]:
-    """What tells the files of a weights folder from others, by network.
+def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, str]:
+    """What tells the files of a weights folder from others, by network, or `only` of some.
 
     The hash in a file's header, if it was converted; else the SHA-256 of the file.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of weights. (--weights)")
-    files = sorted(folder.glob("*.safetensors"))
+    files = [
+        path
+        for path in sorted(folder.glob("*.safetensors"))
+        if only is None or path.stem in only
+    ]
     return {path.stem: read_metadata(path).get(HASH) or sha256(path) for path in files}
 
 
@@ -114,11 +131,13 @@ def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
     temporary.replace(path)
 
 
-def load(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
-    """Fill a module from a file that `save` or a conversion wrote."""
+def load(
+    path: Path, module: nnx.Module, *, dtype: str | None = None, mesh: Mesh | None = None
+) -> None:
+    """Fill a module from a file that `save` or a conversion wrote (`fill`)."""
     tensors = _read(path)
     arrays = {name: tensor.array() for name, tensor in tensors.items()}
-    fill(module, arrays, dtype=dtype, source=str(path))
+    fill(module, arrays, dtype=dtype, source=str(path), mesh=mesh)
 
 
 def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:

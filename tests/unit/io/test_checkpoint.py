@@ -1,6 +1,9 @@
 """Checkpoints: state and data position together, or nothing."""
 
+import errno
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import grain
 import jax
@@ -9,7 +12,7 @@ import numpy as np
 import pytest
 from jax.sharding import SingleDeviceSharding
 
-from egosim_jax.io.checkpoint import Checkpoints
+from egosim_jax.io.checkpoint import HASHES, Checkpoints
 from egosim_jax.types import InputError
 
 
@@ -44,7 +47,7 @@ def test_state_and_data_position_come_back_together(tmp_path):
     again, checkpoints = numbers(), Checkpoints(tmp_path)
     loaded = checkpoints.restore(abstract(state()), again)
     np.testing.assert_array_equal(loaded["weights"], state()["weights"])
-    assert checkpoints.latest == 7
+    assert checkpoints.steps == [7]
     assert [next(again) for _ in range(100)] == rest
     assert set(seen) != set(rest[:5])
 
@@ -57,12 +60,102 @@ def test_a_checkpoint_of_another_model_is_refused_path_by_path(tmp_path):
 
 def test_an_empty_folder_has_no_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path)
-    assert checkpoints.latest is None
-    with pytest.raises(InputError, match="no checkpoint"):
+    assert checkpoints.steps == []
+    with pytest.raises(InputError, match="no sound checkpoint"):
         checkpoints.restore(abstract(state()), numbers())
 
 
 def test_what_a_kill_left_half_written_is_not_a_checkpoint(tmp_path):
     save(tmp_path, numbers())
     (tmp_path / "9.orbax-checkpoint-tmp").mkdir()
-    assert Checkpoints(tmp_path).latest == 7
+    assert Checkpoints(tmp_path).steps == [7]
+
+
+def test_the_newest_stay_and_those_of_every_so_many_steps(tmp_path):
+    data, checkpoints = numbers(), Checkpoints(tmp_path, keep=2, keep_every=4)
+    for step in range(1, 8):
+        checkpoints.save(step, state(), data)
+    checkpoints.close()
+    assert Checkpoints(tmp_path).steps == [4, 6, 7]
+
+
+def saved_twice(folder: Path) -> list[Path]:
+    """Two checkpoints, and the files of values of the second, largest first."""
+    data, checkpoints = numbers(), Checkpoints(folder)
+    for step in (7, 8):
+        checkpoints.save(step, state(1000), data)
+    checkpoints.close()
+    files = [f for f in (folder / "8").rglob("*") if f.is_file() and f.name != HASHES]
+    return sorted(files, key=lambda file: file.stat().st_size, reverse=True)
+
+
+def flip(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+
+
+def truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+@pytest.mark.parametrize("damage", [flip, truncate, Path.unlink], ids=lambda f: f.__name__)
+def test_a_damaged_file_is_named_and_the_checkpoint_before_taken_only_when_asked(
+    tmp_path, damage, capsys
+):
+    folder = tmp_path / "checkpoints"
+    file = saved_twice(folder)[0]
+    damage(file)
+    with pytest.raises(InputError, match=rf"step 8(?s:.*){file.name}(?s:.*)--training.fallback"):
+        Checkpoints(folder).restore(abstract(state(1000)), numbers())
+    checkpoints = Checkpoints(folder)
+    loaded = checkpoints.restore(abstract(state(1000)), numbers(), fallback=True)
+    np.testing.assert_array_equal(loaded["weights"], state(1000)["weights"])
+    assert checkpoints.steps == [7]
+    assert str(file) in capsys.readouterr().err
+    checkpoints.save(8, state(1000), numbers())  # the run comes to that step again
+    checkpoints.close()
+    assert Checkpoints(folder).steps == [7, 8]
+
+
+def test_a_changed_byte_in_any_file_is_found(tmp_path):
+    for file in saved_twice(tmp_path):
+        before = file.read_bytes()
+        if not before:
+            continue
+        flip(file)
+        with pytest.raises(InputError, match=file.name):
+            Checkpoints(tmp_path).restore(abstract(state(1000)), numbers())
+        file.write_bytes(before)
+    Checkpoints(tmp_path).restore(abstract(state(1000)), numbers())
+
+
+def test_hashes_that_cannot_be_read_are_damage(tmp_path):
+    saved_twice(tmp_path)
+    truncate(tmp_path / "8" / HASHES)
+    truncate(tmp_path / "8" / HASHES)
+    with pytest.raises(InputError, match=rf"{HASHES} cannot be read"):
+        Checkpoints(tmp_path).restore(abstract(state(1000)), numbers())
+
+
+def test_a_disk_without_room_is_refused_before_anything_is_saved(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=12_000))
+    checkpoints = Checkpoints(tmp_path, keep=2)
+    with pytest.raises(InputError, match=r"--training.keep"):
+        checkpoints.check_room(abstract(state(1024)))
+    checkpoints.check_room(abstract(state(900)))
+    checkpoints.close()
+
+
+def test_a_disk_that_fills_up_while_saving_says_what_stands(tmp_path, monkeypatch):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(7, state(), numbers())
+    checkpoints.wait()
+
+    def full(path: Path, value: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr("egosim_jax.io.checkpoint.write_json", full)
+    checkpoints.save(8, state(), numbers())
+    with pytest.raises(InputError, match=r"step 8 was not saved, that of step 7 stands"):
+        checkpoints.close()
