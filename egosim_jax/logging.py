@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.run import write_text
+from egosim_jax.types import InputError
 
 
 @runtime_checkable
@@ -19,14 +22,39 @@ class Writer(Protocol):
         """Record `values` after `step` finished updates."""
         ...
 
+    def close(self) -> None:
+        """Record what has not been yet."""
+        ...
+
 
 class Console:
-    """One plain line a step on stderr."""
+    """Numbers on stderr: a live line below the last ones on a terminal, plain lines otherwise."""
+
+    def __init__(self, steps: int):
+        from rich.console import Console as Terminal
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+        terminal = Terminal(file=sys.stderr)
+        self._live = Progress(*columns, console=terminal) if terminal.is_terminal else None
+        if self._live is not None:
+            self._task = self._live.add_task("", total=steps)
+            self._live.start()
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Print the numbers."""
+        """Print the numbers; those of validations stay on a terminal."""
         numbers = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
-        print(f"step {step:>6}  {numbers}", file=sys.stderr, flush=True)
+        if self._live is None:
+            print(f"step {step:>6}  {numbers}", file=sys.stderr, flush=True)
+        elif "loss" in values:
+            self._live.update(self._task, completed=step, description=numbers)
+        else:
+            self._live.print(f"step {step:>6}  {numbers}")
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._live is not None:
+            self._live.stop()
 
 
 class JsonLines:
@@ -43,6 +71,51 @@ class JsonLines:
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
 
+    def close(self) -> None:
+        """Nothing is left: every line is written at once."""
+
+
+class TensorBoard:
+    """Scalars for TensorBoard, by tensorboardX; a resumed run hides what it is going to repeat."""
+
+    def __init__(self, folder: Path, *, resume_after: int = 0):
+        module = _optional("tensorboardX", extra="tensorboard")
+        self._writer = module.SummaryWriter(str(folder), purge_step=resume_after + 1)
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Add a scalar for each number."""
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Write out."""
+        self._writer.close()
+
+
+class WandB:
+    """A run of Weights & Biases; its id lies in the run's folder, so that resuming goes on in it.
+
+    Where it goes and how one logs in is for W&B's own environment variables to say.
+    """
+
+    def __init__(self, folder: Path, *, project: str, name: str):
+        module = _optional("wandb", extra="wandb")
+        path = folder / "wandb_id.txt"
+        if not path.exists():
+            write_text(path, module.util.generate_id())
+        known = path.read_text("utf-8")
+        self._run = module.init(
+            project=project, name=name, id=known, resume="allow", dir=str(folder)
+        )
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Log the numbers."""
+        self._run.log(dict(values), step=step)
+
+    def close(self) -> None:
+        """Finish the upload."""
+        self._run.finish()
+
 
 class Writers:
     """Several writers as one."""
@@ -54,3 +127,17 @@ class Writers:
         """Pass the numbers on to each."""
         for writer in self.writers:
             writer.write(step, values)
+
+    def close(self) -> None:
+        """Close each."""
+        for writer in self.writers:
+            writer.close()
+
+
+def _optional(module: str, *, extra: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise InputError(
+            f"{module} is not installed: pip install 'egosim-jax[{extra}]'. (--training.{extra})"
+        ) from error

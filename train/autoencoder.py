@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.transforms import COLOURS, DecodeWindow
@@ -62,21 +62,42 @@ class Autoencoding:
         """The VAE with random weights."""
         return WanVAE(self.vae, rngs=rngs)
 
+    @property
+    def trained(self) -> Any:
+        """All weights."""
+        return nnx.Param
+
+    @property
+    def frozen_dtype(self) -> str:
+        """Of nothing."""
+        return "float32"
+
     def examples(self) -> grain.transforms.RandomMap:
         """Cut one random piece out of a record."""
         return _RandomPiece(self)
 
-    def loss(self, networks: WanVAE, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
+    def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " b"]:
+        """A key of each sample, of which the first one's draws the noise of all."""
+        others = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(1, batch))
+        return jnp.concatenate([key[None], others])
+
+    def loss(
+        self, networks: WanVAE, batch: Batch, keys: Key[Array, " b"]
+    ) -> tuple[jax.Array, Metrics]:
         """The loss above, for sampled latents."""
         video = to_model(batch["video"])
         mean, logvar = networks.moments(video)
-        latents = mean + jnp.exp(logvar / 2) * jax.random.normal(key, mean.shape)
+        latents = mean + jnp.exp(logvar / 2) * jax.random.normal(keys[0], mean.shape)
         decoded = networks.decode_whole(latents)
         squared = jnp.square(decoded - video).mean()
         edges = _edge_error(decoded, video)
         kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
         metrics = {"squared": squared, "edges": edges, "kl": kl, "psnr": _psnr(decoded, video)}
         return squared + self.edges * edges + self.kl * kl, metrics
+
+    def flops(self, batch: Batch) -> float:
+        """Not counted."""
+        return float("nan")
 
     def validate(self, networks: WanVAE, batch: Batch) -> Metrics:
         """Reconstruction of the mean latents."""

@@ -7,20 +7,24 @@ from which prior, mask, hands and text are dropped at random (`conditioning/drop
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning import assemble
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.schedule import VelocityFn
 from egosim_jax.generator import ModelConfig
+from egosim_jax.models import lora
 from egosim_jax.models.clip_vision import CLIPVision
+from egosim_jax.models.layers import LowRankParam
 from egosim_jax.models.umt5 import UMT5
 from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.train.flops import count_forward
 from egosim_jax.train.step import Batch, Metrics
 from egosim_jax.types import Condition
 
@@ -63,21 +67,42 @@ class Denoising:
     change: float = 0.0
     """How much more a place counts where the clip is unlike its prior: at hands, at what they move
     and at what was not observed, which is little of a picture and all that has to be learnt."""
+    rank: int | None = None
+    """Of a LoRA on the linear layers of the blocks, which is then all that is trained."""
+
+    @property
+    def trained(self) -> Any:
+        """All weights, or those of the LoRA."""
+        return nnx.Param if self.rank is None else LowRankParam
+
+    @property
+    def frozen_dtype(self) -> str:
+        """That in which the transformer computes."""
+        return self.model.dit.dtype
 
     def networks(self, rngs: nnx.Rngs) -> Denoiser:
-        """The trained networks with random weights."""
-        return Denoiser(self.model, rngs=rngs)
+        """The networks with random weights."""
+        networks = Denoiser(self.model, rngs=rngs)
+        if self.rank is not None:
+            lora.start(networks.dit, self.rank, rngs=rngs)
+        return networks
 
     def examples(self) -> None:
         """A record of latents is an example as it is."""
 
-    def loss(self, networks: Denoiser, batch: Batch, key: jax.Array) -> tuple[jax.Array, Metrics]:
-        """The flow-matching loss of a batch under dropped conditions."""
+    def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, "b 2"]:
+        """For each sample, what drops its conditions and what draws its noise."""
         drop, draw = jax.random.split(key)
-        condition = self.dropout.apply(networks.condition(batch), drop)
+        return jnp.stack([jax.random.split(drop, batch), jax.random.split(draw, batch)], axis=1)
+
+    def loss(
+        self, networks: Denoiser, batch: Batch, keys: Key[Array, "b 2"]
+    ) -> tuple[jax.Array, Metrics]:
+        """The flow-matching loss of a batch under dropped conditions."""
+        condition = self.dropout.apply(networks.condition(batch), keys[:, 0])
         velocity = _velocity(networks, condition)
         places = changed_places(batch["truth"], batch["prior"], self.change)
-        loss, _ = self.objective.loss(velocity, batch["truth"], draw, places=places)
+        loss, _ = self.objective.loss(velocity, batch["truth"], keys[:, 1], places=places)
         return loss, {}
 
     def validate(self, networks: Denoiser, batch: Batch) -> Metrics:
@@ -92,6 +117,20 @@ class Denoising:
             for time in VALIDATION_TIMES
         }
         return {"loss": jnp.mean(jnp.stack(list(errors.values()))), **errors}
+
+    def flops(self, batch: Batch) -> float:
+        """Model FLOPs of an update, of the transformer alone, which has nearly all of them."""
+        image = self.model.image
+        forward = count_forward(
+            self.model.dit,
+            latents=self.model.video.latent_shape,
+            text=self.model.tokenizer.max_tokens,
+            image=0 if image is None else 1 + (image.image_size // image.patch) ** 2,
+        )
+        # Backward: by activations and by weights, of which a LoRA's are few.
+        weights = 3 if self.rank is None else 2
+        samples = len(batch["truth"])
+        return samples * (weights * forward.weights + 3 * forward.attention)
 
 
 def changed_places(

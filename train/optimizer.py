@@ -33,12 +33,21 @@ class OptimizerConfig:
     """Adam's decay of the second moment."""
     clip: float = 1.0
     """Largest global norm of the gradient."""
+    spike: float | None = None
+    """Leave an update out whose gradient is so many times as long as usual; None: none."""
+    average: float | None = None
+    """Decay of a moving average of the weights, for instance 0.9999, which is then what is
+    validated and kept; None: no average, which saves its memory."""
 
     def __post_init__(self) -> None:
-        """Check that the rates are positive."""
+        """Check that rates are positive, and that what limits or decays does."""
         for name in ("learning_rate", "clip"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
+        if self.spike is not None and self.spike <= 1:
+            raise InputError(f"spike must be above 1, the usual length, not {self.spike}.")
+        if self.average is not None and not 0 < self.average < 1:
+            raise InputError(f"average must be between 0 and 1, not {self.average}.")
 
 
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:

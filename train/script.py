@@ -1,17 +1,20 @@
-"""The training script, from top to bottom: mesh, data, state, step, loop.
+"""The training script, from top to bottom: mesh, data, step, state, loop.
 
 Resuming restores the state and the data iterator together, in this order: the data iterator is
 made as for a new run, the newest checkpoint is read straight into the shardings of the mesh, the
 iterator is set to the saved position, and the log is cut back to the restored step. A resumed run
 therefore repeats the losses of the run that was not interrupted bit for bit.
+
+The step is compiled before anything is read, so that a batch or a head count that the mesh does
+not divide is refused at once. The numbers of a step are looked at when the next one is under way,
+so that the devices never wait for the host.
 """
 
 from __future__ import annotations
 
-import itertools
 import sys
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,19 +23,27 @@ from typing import Any
 import jax
 import numpy as np
 from flax import nnx
+from jax.experimental import multihost_utils
 
-from egosim_jax.data.loader import make_loader
+from egosim_jax.command import FAILED, RESUBMIT, Stop
+from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
-from egosim_jax.logging import Console, JsonLines, Writers
+from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
 from egosim_jax.models.layers import initialise
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
-from egosim_jax.train.optimizer import OptimizerConfig, learning_rate, make_optimizer
+from egosim_jax.train.clock import Clock
+from egosim_jax.train.optimizer import OptimizerConfig, learning_rate
+from egosim_jax.train.samples import Samples
 from egosim_jax.train.state import TrainState
 from egosim_jax.train.step import Task, make_update, make_validation
-from egosim_jax.types import check_counts
+from egosim_jax.train.watchdog import Watchdog
+from egosim_jax.types import InputError, check_counts
+
+MOST_LEFT_OUT = 3
+"""Updates in a row that may be left out: then the run stops."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +54,8 @@ class Training:
     """Updates in all."""
     batch_size: int = 32
     """Examples per update, over all devices."""
+    accumulate: int = 1
+    """Parts in which an update takes its batch, one after the other, to save memory."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Update rule and learning rate."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
@@ -55,13 +68,43 @@ class Training:
     """Updates between checkpoints."""
     validate_every: int = 500
     """Updates between validations."""
+    sample_every: int | None = None
+    """Updates between sample clips; None: none are made."""
+    keep: int = 2
+    """Checkpoints to keep, the newest ones."""
+    keep_every: int | None = None
+    """Also keep the checkpoints whose step is a multiple of this."""
+    fallback: bool = False
+    """If the newest checkpoint is damaged, go on from the one before it."""
     workers: int = 0
     """Processes that prepare data; part of the data's order, so keep it when resuming."""
+    patience: float = 300.0
+    """Seconds without a finished step, and ten times what one takes, after which a run counts as
+    hung and ends with exit code 70."""
+    tensorboard: bool = False
+    """Also write for TensorBoard, to OUT/tensorboard."""
+    wandb: str | None = None
+    """Project of Weights & Biases to log to, too."""
 
     def __post_init__(self) -> None:
-        """Check that every count is positive."""
-        counts = ("steps", "batch_size", "log_every", "save_every", "validate_every")
-        check_counts({name: getattr(self, name) for name in counts})
+        """Check that every count is positive, and that parts of a batch are whole."""
+        counts = ("steps", "batch_size", "accumulate", "log_every", "save_every", "validate_every")
+        optional = ("sample_every", "keep", "keep_every")
+        check_counts({name: getattr(self, name) for name in (*counts, *optional)})
+
+
+MAY_DIFFER = (
+    "mesh", "accumulate", "log_every", "save_every", "validate_every", "sample_every", "keep",
+    "keep_every", "fallback", "patience", "tensorboard", "wandb",
+)  # fmt: skip
+"""Fields of `Training` that a resumed run may change: they do not change what is computed."""
+HOW_COMPUTED = tuple(f"task.model.dit.{name}" for name in ("dtype", "remat", "attention"))
+"""Fields of a task that change how it is computed."""
+
+
+def may_differ(*names: str) -> tuple[str, ...]:
+    """What a resumed run may change, in fields of these names that are a `Training`."""
+    return tuple(f"{name}.{free}" for name in names for free in MAY_DIFFER)
 
 
 def train(
@@ -72,82 +115,235 @@ def train(
     validation: Path | None,
     out: Path,
     weights: Path | None = None,
+    samples: Samples | None = None,
 ) -> Any:
     """Train `task` on the shards in `data`, resuming what `out` holds; the trained networks.
 
     `validation` names shards whose loss is measured at fixed times and with fixed noise; `weights`
     a folder to start from instead of random weights. The run folder holds config.json,
-    environment.json, metrics.jsonl and checkpoints/.
+    environment.json, metrics.jsonl, checkpoints/ and samples/. Several processes call it alike, and
+    the first one writes.
     """
     digests = None if weights is None else hashes(weights)
-    open_folder(out, {"task": task, "training": training, "weights": digests})
+    settings = {"task": task, "training": training, "weights": digests}
+    open_folder(out, settings, may_differ=[*may_differ("training"), *HOW_COMPUTED])
     mesh = make_mesh(training.mesh)
     placed = batch_sharding(mesh)
+    source = ShardReader(data)
+    _check_batch(training, mesh)
+    load = partial(_load, task=task, placed=placed)
+    clock = Clock(flops=float("nan"))
 
-    batches = make_loader(
-        ShardReader(data),
-        batch_size=training.batch_size,
-        seed=training.seed,
-        process_index=jax.process_index(),
-        process_count=jax.process_count(),
-        workers=training.workers,
-        transform=task.examples(),
+    graph, _, frozen = nnx.split(
+        nnx.eval_shape(lambda: task.networks(nnx.Rngs(0))), task.trained, ...
     )
-
-    optimizer = make_optimizer(training.optimizer, training.steps)
+    frozen = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, task.frozen_dtype), frozen)
+    if weights is None and jax.tree.leaves(frozen):
+        raise InputError("Weights that stay as they are have to come from somewhere. (--weights)")
 
     def create() -> TrainState:
         networks = task.networks(nnx.Rngs(training.seed))
-        return TrainState.create(nnx.state(networks, nnx.Param), optimizer)
+        return TrainState.create(
+            nnx.state(networks, task.trained), training.optimizer, training.steps
+        )
 
-    graph = nnx.graphdef(nnx.eval_shape(lambda: task.networks(nnx.Rngs(0))))
     abstract = jax.eval_shape(create)
-    sharding = state_sharding(mesh, abstract)
-
-    checkpoints = Checkpoints(out / "checkpoints")
-    if checkpoints.steps:
-        state = checkpoints.restore(_placed(abstract, sharding), batches)
-    elif weights is None:
-        state = initialise(create, out_shardings=sharding)
-    else:
-        params = place(weights, abstract.params, sharding.params)
-        begin = partial(TrainState.create, optimizer=optimizer)
-        state = jax.jit(begin, out_shardings=sharding, donate_argnums=0)(params)
-    start = int(state.step)
-    print(_greeting(state, start, training, out), file=sys.stderr, flush=True)
-    for name, digest in (digests or {}).items():
-        print(f"{out}: from {name} sha256 {digest[:16]}", file=sys.stderr, flush=True)
-
+    sharding, frozen_sharding = state_sharding(mesh, abstract), state_sharding(mesh, frozen)
     update = jax.jit(
-        make_update(task, graph, optimizer, training.seed),
-        in_shardings=(sharding, placed),
+        make_update(
+            task,
+            graph,
+            training.optimizer,
+            steps=training.steps,
+            seed=training.seed,
+            accumulate=training.accumulate,
+        ),
+        in_shardings=(sharding, frozen_sharding, placed),
         out_shardings=(sharding, None),
         donate_argnums=0,
     )
-    validate = jax.jit(make_validation(task, graph), in_shardings=(sharding.params, placed))
+    validate = jax.jit(
+        make_validation(task, graph), in_shardings=(sharding.params, frozen_sharding, placed)
+    )
 
-    writer = Writers([Console(), JsonLines(out / "metrics.jsonl", resume_after=start)])
-    rate = learning_rate(training.optimizer, training.steps)
-    clock = _Clock(start, training.steps)
-    pending: dict[int, Mapping[str, jax.Array]] = {}
-    with jax.set_mesh(mesh):
+    with jax.set_mesh(mesh), ExitStack() as opened:
+        with clock.phase("data"), closing(load(source, training, peek=True)) as peek:
+            example = _to_devices(next(peek), placed)
+        clock.flops = task.flops(example)
+        with clock.phase("compile"):
+            update = update.lower(abstract, frozen, example).compile()
+        _say(f"compiled in {clock.seconds['compile']:.1f} s{_need(update)}")
+
+        batches = opened.enter_context(closing(load(source, training)))
+        checkpoints = Checkpoints(
+            out / "checkpoints", keep=training.keep, keep_every=training.keep_every
+        )
+        opened.callback(checkpoints.close)
+        checkpoints.check_room(abstract)
+        with clock.phase("start"):
+            if weights is not None:
+                frozen = place(weights, frozen, frozen_sharding)
+            if checkpoints.steps:
+                state = checkpoints.restore(
+                    _placed(abstract, sharding), batches, fallback=training.fallback
+                )
+            elif weights is None or jax.tree.leaves(frozen):
+                state = initialise(create, out_shardings=sharding)
+            else:
+                params = place(weights, abstract.params, sharding.params)
+                begin = partial(TrainState.create, config=training.optimizer, steps=training.steps)
+                state = jax.jit(begin, out_shardings=sharding, donate_argnums=0)(params)
+        start = int(state.step)
+        _say(_greeting(state, start, training, out))
+        for name, digest in (digests or {}).items():
+            _say(f"{out}: from {name} sha256 {digest[:16]}")
+
+        writer = opened.enter_context(closing(_writers(training, out, start)))
+        watchdog = opened.enter_context(closing(Watchdog(training.patience)))
+        rate = learning_rate(training.optimizer, training.steps)
+        pending: dict[int, Mapping[str, jax.Array]] = {}
+        before: _LeftOut | None = None
+        clock.begin(start)
         for step in range(start + 1, training.steps + 1):
             last = step == training.steps
-            batch = _to_devices(next(batches), placed)
-            state, metrics = update(state, batch)
-            pending[step] = metrics
+            with clock.phase("data"):
+                examples = next(batches)
+            with clock.phase("step"):
+                state, metrics = update(state, frozen, _to_devices(examples, placed))
+                pending[step] = metrics
+                if before is not None:
+                    before.check()
+                before = _LeftOut(step, metrics, examples["record"], source)
+            watchdog.beat()
             if step % training.log_every == 0 or last:
-                numbers = _mean(pending)
+                with clock.phase("step"):
+                    before.check()
+                    numbers = _mean(pending)
                 pending = {}
-                writer.write(
-                    step, {**numbers, "rate": float(np.asarray(rate(step - 1))), **clock.tick(step)}
-                )
+                if batches.skipped:
+                    numbers["skipped"] = float(len(batches.skipped))
+                numbers["rate"] = float(np.asarray(rate(step - 1)))
+                writer.write(step, {**numbers, **clock.tick(step, training.steps)})
             if validation is not None and (step % training.validate_every == 0 or last):
-                writer.write(step, _validate(validate, state, validation, task, training, placed))
-            if step % training.save_every == 0 or last:
-                checkpoints.save(step, state, batches)
-    checkpoints.close()
-    return nnx.merge(graph, state.params)
+                watchdog.rest()
+                with clock.phase("validate"), closing(load(validation, training)) as some:
+                    rows = [
+                        jax.device_get(validate(state.best, frozen, _to_devices(batch, placed)))
+                        for batch in some
+                    ]
+                writer.write(step, {f"validation_{k}": _average(rows, k) for k in rows[0]})
+            every = training.sample_every
+            if samples is not None and every is not None and (step % every == 0 or last):
+                watchdog.rest()
+                with clock.phase("sample"):
+                    networks = nnx.merge(graph, state.best, frozen)
+                    samples.write(networks, out / "samples", step)
+            preempted = multihost_utils.reached_preemption_sync_point(step)
+            if step % training.save_every == 0 or last or preempted:
+                watchdog.rest()
+                with clock.phase("save"):
+                    checkpoints.save(step, state, batches)
+                    if last or preempted:
+                        checkpoints.wait()
+            if preempted and not last:
+                _say(f"where the time went:\n{clock.table()}")
+                raise Stop(f"{out}: stopped and saved after step {step}; run it again", RESUBMIT)
+        _say(f"where the time went:\n{clock.table()}")
+    return nnx.merge(graph, state.best, frozen)
+
+
+def _check_batch(training: Training, mesh: jax.sharding.Mesh) -> None:
+    devices = mesh.shape["data"] * mesh.shape["fsdp"]
+    if training.batch_size % (devices * training.accumulate):
+        raise InputError(
+            f"A batch of {training.batch_size} does not divide among data x fsdp = {devices} "
+            f"devices, {training.accumulate} parts each: it must be a multiple of "
+            f"{devices * training.accumulate}. (--training.batch-size, --training.accumulate, "
+            "--training.mesh)"
+        )
+
+
+def _load(
+    source: ShardReader | Path, training: Training, *, task: Task, placed: Any, peek: bool = False
+) -> Loader:
+    """This process's part of each batch; of validation shards, those that fill a batch, once."""
+    once = isinstance(source, Path)
+    reader = ShardReader(source) if isinstance(source, Path) else source
+    size = training.batch_size
+    if once:
+        devices = placed.mesh.shape["data"] * placed.mesh.shape["fsdp"]
+        size = min(size, max(devices, len(reader) // devices * devices))
+    index, count = _part(placed, size)
+    return make_loader(
+        reader,
+        batch_size=size,
+        seed=0 if once else training.seed,
+        shuffle=not once,
+        repeat=not once,
+        process_index=index,
+        process_count=count,
+        workers=0 if once or peek else training.workers,
+        transform=task.examples(),
+    )
+
+
+def _part(placed: Any, size: int) -> tuple[int, int]:
+    """Which part of a batch this process's devices hold, and of how many.
+
+    Processes that share samples, along the context axis, hold the same part.
+    """
+    rows = {
+        index[0].indices(size)[:2]
+        for index in placed.addressable_devices_indices_map((size,)).values()
+    }
+    first, end = min(rows)[0], max(rows)[1]
+    return first // (end - first), size // (end - first)
+
+
+class _LeftOut:
+    """Whether an update was left out, and of which records, looked at once it is done."""
+
+    def __init__(
+        self, step: int, metrics: Mapping[str, jax.Array], records: np.ndarray, source: ShardReader
+    ):
+        self.step, self.metrics, self.records, self.source = step, metrics, records, source
+        self.looked = False
+
+    def check(self) -> None:
+        """Name the records of an update that was left out; stop the run after several."""
+        count = 0 if self.looked else int(self.metrics["left_out"])
+        self.looked = True
+        if not count:
+            return
+        names = ", ".join(str(self.source[int(i)].metadata["video_id"]) for i in self.records)
+        loss, norm = float(self.metrics["loss"]), float(self.metrics["gradient_norm"])
+        said = f"step {self.step} left out: loss {loss:.4g}, gradient norm {norm:.4g}, of {names}"
+        print(said, file=sys.stderr, flush=True)
+        if count >= MOST_LEFT_OUT:
+            raise Stop(
+                f"{count} updates in a row were left out, so the run stops. The weights are those "
+                "before them: look at the clips above, or lower the learning rate.",
+                FAILED,
+            )
+
+
+def _writers(training: Training, out: Path, start: int) -> Writers:
+    if jax.process_index() != 0:
+        return Writers([])
+    writers: list[Any] = [
+        Console(training.steps),
+        JsonLines(out / "metrics.jsonl", resume_after=start),
+    ]
+    if training.tensorboard:
+        writers.append(TensorBoard(out / "tensorboard", resume_after=start))
+    if training.wandb is not None:
+        writers.append(WandB(out, project=training.wandb, name=out.name))
+    return Writers(writers)
+
+
+def _say(text: str) -> None:
+    if jax.process_index() == 0:
+        print(text, file=sys.stderr, flush=True)
 
 
 def _placed(abstract: Any, sharding: Any) -> Any:
@@ -157,11 +353,20 @@ def _placed(abstract: Any, sharding: Any) -> Any:
     return jax.tree.map(place, abstract, sharding)
 
 
+def _need(program: Any) -> str:
+    """Memory of a compiled program, if the compiler says."""
+    found = program.memory_analysis()
+    if found is None:
+        return ""
+    gigabytes = (found.argument_size_in_bytes + found.temp_size_in_bytes) / 1e9
+    return f", needs {gigabytes:.2f} GB a device"
+
+
 def _greeting(state: TrainState, start: int, training: Training, out: Path) -> str:
     weights = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     verb = f"resuming at step {start}" if start else "starting"
     devices = f"{jax.device_count()} x {jax.devices()[0].device_kind}"
-    return f"{out}: {verb} of {training.steps}, {weights:,} weights, {devices}"
+    return f"{out}: {verb} of {training.steps}, {weights:,} weights to train, {devices}"
 
 
 def _to_devices(batch: Mapping[str, np.ndarray], sharding: Any) -> dict[str, jax.Array]:
@@ -172,47 +377,16 @@ def _to_devices(batch: Mapping[str, np.ndarray], sharding: Any) -> dict[str, jax
 
 
 def _mean(pending: Mapping[int, Mapping[str, jax.Array]]) -> dict[str, float]:
-    """Means over the steps since the last line, fetched from the devices once."""
+    """Means over the steps since the last line, fetched from the devices once.
+
+    Updates that were left out count as such alone.
+    """
     rows = jax.device_get(list(pending.values()))
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    kept = [row for row in rows if not row["left_out"]]
+    numbers = {name: _average(kept, name) for name in rows[0] if name != "left_out" and kept}
+    left_out = len(rows) - len(kept)
+    return {**numbers, "left_out": float(left_out)} if left_out else numbers
 
 
-def _validate(
-    validate: Any, state: TrainState, folder: Path, task: Task, training: Training, placed: Any
-) -> dict[str, float]:
-    """Validation numbers, averaged over every example that fills a whole batch."""
-    source = ShardReader(folder)
-    size = min(training.batch_size, len(source))
-    batches: Iterator = make_loader(
-        source,
-        batch_size=size,
-        seed=0,
-        shuffle=False,
-        repeat=False,
-        process_index=jax.process_index(),
-        process_count=jax.process_count(),
-        transform=task.examples(),
-    )
-    rows = [
-        jax.device_get(validate(state.params, _to_devices(batch, placed)))
-        for batch in itertools.islice(batches, len(source) // size)
-    ]
-    return {f"validation_{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-
-class _Clock:
-    """Seconds a step and time left; the first interval, which compiles, is told apart."""
-
-    def __init__(self, start: int, steps: int):
-        self.then, self.step, self.steps = time.monotonic(), start, steps
-        self.compiling = True
-
-    def tick(self, step: int) -> dict[str, float]:
-        """The numbers since the last call."""
-        now = time.monotonic()
-        seconds = (now - self.then) / max(1, step - self.step)
-        self.then, self.step = now, step
-        if self.compiling:
-            self.compiling = False
-            return {"seconds_with_compiling": seconds}
-        return {"seconds": seconds, "minutes_left": seconds * (self.steps - step) / 60}
+def _average(rows: list[Mapping[str, np.ndarray]], name: str) -> float:
+    return float(np.mean([row[name] for row in rows]))

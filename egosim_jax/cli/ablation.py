@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from egosim_jax.cli.sheet import Block, draw_sheet
+from egosim_jax.io.sheet import Block, draw_sheet
 from egosim_jax.cli.spread import mean_and_spread
 from egosim_jax.command import DONE
 from egosim_jax.progress import track

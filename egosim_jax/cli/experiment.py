@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import RESULTS, Generate
-from egosim_jax.cli.sheet import Block, draw_sheet
+from egosim_jax.io.sheet import Block, draw_sheet
 from egosim_jax.command import DONE
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from egosim_jax.models.layers import initialise
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.denoiser import Denoising
-from egosim_jax.train.optimizer import OptimizerConfig, make_optimizer
+from egosim_jax.train.optimizer import OptimizerConfig
 from egosim_jax.train.state import TrainState
 from egosim_jax.train.step import make_update
 from egosim_jax.types import VideoSpec
@@ -51,7 +51,7 @@ def batch(seed: int) -> dict[str, np.ndarray]:
 def main(data: int, fsdp: int, context: int, out: str) -> None:
     """Compute and write everything that must not depend on the mesh."""
     mesh = make_mesh(MeshConfig(data=data, fsdp=fsdp, context=context))
-    optimizer = make_optimizer(OptimizerConfig(learning_rate=1e-3), STEPS)
+    config = OptimizerConfig(learning_rate=1e-3)
 
     def create() -> TrainState:
         params = nnx.state(TASK.networks(nnx.Rngs(0)), nnx.Param)
@@ -61,16 +61,16 @@ def main(data: int, fsdp: int, context: int, out: str) -> None:
         noisy = [
             x + 0.05 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)
         ]
-        return TrainState.create(jax.tree.unflatten(tree, noisy), optimizer)
+        return TrainState.create(jax.tree.unflatten(tree, noisy), config, STEPS)
 
     graph = nnx.graphdef(nnx.eval_shape(lambda: TASK.networks(nnx.Rngs(0))))
     sharding = state_sharding(mesh, jax.eval_shape(create))
     placed = batch_sharding(mesh)
     state = initialise(create, out_shardings=sharding)
-    key = jax.random.key(0)
+    keys = TASK.keys(jax.random.key(0), BATCH)
 
     def loss(params, batch):
-        return TASK.loss(nnx.merge(graph, params), batch, key)[0]
+        return TASK.loss(nnx.merge(graph, params), batch, keys)[0]
 
     def put(seed: int):
         return jax.device_put(batch(seed), placed)
@@ -83,13 +83,13 @@ def main(data: int, fsdp: int, context: int, out: str) -> None:
         )
         value, gradients = gradient(state.params, put(0))
         update = jax.jit(
-            make_update(TASK, graph, optimizer, 0),
-            in_shardings=(sharding, placed),
+            make_update(TASK, graph, config, steps=STEPS, seed=0),
+            in_shardings=(sharding, None, placed),
             out_shardings=(sharding, None),
         )
         curve = []
         for step in range(STEPS):
-            state, metrics = update(state, put(step))
+            state, metrics = update(state, nnx.State({}), put(step))
             curve.append(float(metrics["loss"]))
     leaves = {
         ".".join(map(str, path)): np.asarray(leaf.get_value())

@@ -1,0 +1,59 @@
+"""One process or many: every run has jax's coordination service, which is what hears SIGTERM.
+
+Slurm, Open MPI and TPU pods are recognised by jax. Anywhere else, give every process
+
+    JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
+
+and with none of these a process is on its own, and its service listens to this machine alone.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+
+from egosim_jax.types import InputError
+
+NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+
+
+@contextmanager
+def joined() -> Iterator[None]:
+    """Join the other processes of the run, before any device is used; leave them at the end."""
+    given = {name: os.environ[name] for name in NAMES if name in os.environ}
+    if given:
+        if missing := [name for name in NAMES if name not in given]:
+            raise InputError(
+                f"{', '.join(given)} is set and {', '.join(missing)} is not: a run of several "
+                "processes needs all three, a run of one process none."
+            )
+        address, count, index = given.values()
+        _check_numbers(count, index)
+        jax.distributed.initialize(address, int(count), int(index))
+    else:
+        try:
+            jax.distributed.initialize()
+        except ValueError:  # no cluster
+            jax.distributed.initialize(_own_address(), 1, 0)
+    try:
+        yield
+    finally:
+        jax.distributed.shutdown()
+
+
+def _check_numbers(count: str, index: str) -> None:
+    if not (count.isdigit() and index.isdigit() and int(index) < int(count)):
+        raise InputError(
+            f"JAX_NUM_PROCESSES={count} and JAX_PROCESS_ID={index}: they must be numbers, the "
+            "second from 0 to one below the first."
+        )
+
+
+def _own_address() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
