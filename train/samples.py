@@ -15,9 +15,9 @@ from jax.experimental import multihost_utils
 
 from egosim_jax.conditioning.video import to_uint8
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.sheet import Block, draw_sheet
 from egosim_jax.generator import ModelConfig, denoise
 from egosim_jax.io import weights
-from egosim_jax.io.sheet import Block, draw_sheet
 from egosim_jax.io.video import write_video
 from egosim_jax.models.wan_vae import WanVAE
 from egosim_jax.sharding import batch_sharding, parts

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from egosim_jax.io.sheet import Block, draw_sheet
 from egosim_jax.cli.spread import mean_and_spread
 from egosim_jax.command import DONE
+from egosim_jax.data.sheet import Block, draw_sheet
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
 

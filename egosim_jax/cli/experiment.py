@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import RESULTS, Generate
-from egosim_jax.io.sheet import Block, draw_sheet
 from egosim_jax.command import DONE
+from egosim_jax.data.sheet import Block, draw_sheet
 
 if TYPE_CHECKING:
     from egosim_jax.data.metadata import ClipFiles

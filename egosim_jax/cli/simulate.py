@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from egosim_jax.cli.recording import Recording
-from egosim_jax.io.sheet import Block, draw_sheet
 from egosim_jax.cli.view import RECORDING, write_portrait
 from egosim_jax.command import DONE
+from egosim_jax.data.sheet import Block, draw_sheet
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
