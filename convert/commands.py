@@ -18,7 +18,7 @@ from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, in_rows, write
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.run import write_json
-from egosim_jax.io.weights import WeightsError, hashes, mismatches
+from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
 from egosim_jax.progress import track, track_bytes
 from egosim_jax.types import InputError
 
@@ -187,7 +187,7 @@ class Lora:
     config: str
     """Name of the model that it is for."""
     out: Path
-    """File to write or, with --merge, weights folder for the video transformer."""
+    """File to write or, with --merge, weights folder, whose other networks are links."""
     merge: Path | None = None
     """Weights folder that it is added to."""
     scale: float = 1.0
@@ -198,7 +198,7 @@ class Lora:
     def run(self) -> int:
         """Read, check, write."""
         from egosim_jax import configs
-        from egosim_jax.convert.lora import about_lora, exported, read_lora
+        from egosim_jax.convert.lora import BASE, about_lora, base_of, exported, read_lora
         from egosim_jax.convert.plan import merged
         from egosim_jax.io.mapped import read_safetensors
 
@@ -206,7 +206,7 @@ class Lora:
         deltas = read_lora(self.source, config)
         origin = sorted(self.source.iterdir()) if self.source.is_dir() else [self.source]
         if self.merge is None:
-            base = {} if self.base is None else {"base_sha256": hashes(self.base)["dit"]}
+            base = base_of(self.source) if self.base is None else {BASE: hashes(self.base)["dit"]}
             weights = [
                 Weight(
                     name=name, shape=tensor.shape, dtype=tensor.dtype, pieces=(lambda t=tensor: t,)
@@ -219,6 +219,7 @@ class Lora:
         weights = merged(read_safetensors(file), deltas, config, scale=self.scale)
         about = {"format": "egosim_jax", "config": self.config, "lora": self.source.name}
         _write(self.out / file.name, weights, origin=[file, *origin], about=about)
+        link_others(self.out, self.merge)
         return command.DONE
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from egosim_jax.convert.source import sources
 from egosim_jax.convert.tables import wan_dit
 from egosim_jax.io.mapped import Tensor, read_metadata
-from egosim_jax.models.lora import Delta
+from egosim_jax.models.lora import BASE, OURS, Delta, from_tensors
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.types import InputError
 
@@ -62,7 +62,7 @@ class Layer:
 
 
 def read_lora(path: Path, config: WanDiTConfig) -> dict[str, Delta]:
-    """The summands of a LoRA by our paths, in float32.
+    """The summands of a LoRA by our paths, in float32; one that we trained has them already.
 
     `path` is a file, or PEFT's folder of one with its config. Blocks that it does not have get 0,
     lower ranks than the highest of a stack are filled up with 0. Raises `InputError` listing every
@@ -70,6 +70,9 @@ def read_lora(path: Path, config: WanDiTConfig) -> dict[str, Delta]:
     shapes do not fit.
     """
     (source,) = _only(path)
+    if _is_ours(source.files[0]):
+        arrays = {name: tensor.array() for name, tensor in source.tensors.items()}
+        return from_tensors(arrays)
     alpha = _default_alpha(path, source.files[0])
     stacks: dict[str, dict[int | None, Layer]] = {}
     for place, layer in _layers(source.tensors, config, alpha, name=source.name).items():
@@ -82,6 +85,10 @@ def _only(path: Path) -> list:
     if len(found) != 1:
         raise InputError(f"{path} holds {len(found)} files of weights; a LoRA is one. (--lora)")
     return found
+
+
+def _is_ours(file: Path) -> bool:
+    return file.suffix == ".safetensors" and read_metadata(file).get("format") == OURS
 
 
 def _default_alpha(path: Path, file: Path) -> float | None:
@@ -157,6 +164,12 @@ def exported(deltas: Mapping[str, Delta], config: WanDiTConfig) -> dict[str, np.
             tensors[f"{EXPORTED}{theirs}.lora_B.weight"] = np.ascontiguousarray(up.T)
             tensors[f"{EXPORTED}{theirs}.alpha"] = np.array(down.shape[-1], np.float32)
     return tensors
+
+
+def base_of(path: Path) -> dict[str, str]:
+    """What a file's header says of the weights that the LoRA was trained on."""
+    about = read_metadata(path) if path.suffix == ".safetensors" else {}
+    return {BASE: about[BASE]} if BASE in about else {}
 
 
 def about_lora(deltas: Mapping[str, Delta]) -> dict[str, str]:

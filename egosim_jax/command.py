@@ -11,6 +11,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -36,8 +37,17 @@ class Command(Protocol):
         ...
 
 
-def main(commands: Any, *, program: str, description: str, args: Sequence[str] | None) -> int:
+def main(
+    commands: Any,
+    *,
+    program: str,
+    description: str,
+    args: Sequence[str] | None,
+    within: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> int:
     """Parse a command line into one of the dataclasses `commands`, run it, give its exit code.
+
+    What `within` gives is entered before the command runs and left after it.
 
     Results go to stdout, progress and errors to stderr. A wrong option or bad input is one clear
     message; a traceback means that something is broken.
@@ -52,7 +62,12 @@ def main(commands: Any, *, program: str, description: str, args: Sequence[str] |
         args=args,
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
-    return guarded(command.run)
+
+    def run() -> int:
+        with within():
+            return command.run()
+
+    return guarded(run)
 
 
 def _keep_compiled_programs() -> None:

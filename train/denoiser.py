@@ -41,6 +41,11 @@ class Denoiser(nnx.Module):
         self.text = UMT5(config.text, rngs=rngs) if joint else None
         self.image = CLIPVision(config.image, rngs=rngs) if joint and config.image else None
 
+    def parts(self) -> dict[str, nnx.Module]:
+        """The networks by name."""
+        named = {"dit": self.dit, "text": self.text, "image": self.image}
+        return {name: network for name, network in named.items() if network is not None}
+
     def condition(self, batch: Batch) -> Condition:
         """The condition of a cached batch."""
         text = batch["text"] if self.text is None else self.text(batch["ids"], batch["ids_mask"])

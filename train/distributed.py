@@ -57,3 +57,12 @@ def _own_address() -> str:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def check_alone(recipe: str) -> None:
+    """Raise `InputError` in a run of several processes."""
+    if jax.process_count() > 1:
+        raise InputError(
+            f"{recipe} makes its data as it goes, in one process, not in {jax.process_count()}: it "
+            "is a small model. Several processes train on latents that were encoded before."
+        )

@@ -16,6 +16,7 @@ import numpy as np
 
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import Tensor, read_metadata, read_safetensors
+from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -105,9 +106,7 @@ def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, st
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of weights. (--weights)")
     files = [
-        path
-        for path in sorted(folder.glob("*.safetensors"))
-        if only is None or path.stem in only
+        path for path in sorted(folder.glob("*.safetensors")) if only is None or path.stem in only
     ]
     return {path.stem: read_metadata(path).get(HASH) or sha256(path) for path in files}
 
@@ -115,20 +114,48 @@ def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, st
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
     """Write a module's weights as safetensors: to a temporary name, then renamed.
 
-    `dtype` casts floating tensors; by default they keep their own.
+    `dtype` casts floating tensors; by default they keep their own. Of several processes, which
+    call it together, the first one writes.
     """
-    from safetensors.flax import save_file
+    tensors = {}
+    for name, leaf in _leaves(module).items():
+        value = leaf.get_value()
+        gathered = _gathered(value if dtype is None else value.astype(dtype))
+        if gathered is not None:
+            tensors[name] = gathered
+    if tensors:
+        write(path, tensors)
 
-    tensors = {name: leaf.get_value() for name, leaf in _leaves(module).items()}
-    if dtype is not None:
-        tensors = {name: tensor.astype(dtype) for name, tensor in tensors.items()}
-    temporary = path.with_name(path.name + ".tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary.touch()
-    mode = temporary.stat().st_mode
-    save_file(tensors, temporary)
-    temporary.chmod(mode)  # safetensors' own is for the owner alone
-    temporary.replace(path)
+
+def write(
+    path: Path, tensors: Mapping[str, np.ndarray], *, about: Mapping[str, str] | None = None
+) -> None:
+    """Write tensors, and what is to be said about them, as safetensors, whole or not at all."""
+    from safetensors.numpy import save_file
+
+    with whole(path) as temporary:
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        save_file(dict(tensors), temporary, dict(about or {}))
+        temporary.chmod(mode)  # safetensors' own is for the owner alone
+
+
+def link_others(folder: Path, origin: Path) -> None:
+    """Link what a weights folder lacks of another one: networks that stayed, the tokenizer."""
+    for path in origin.iterdir():
+        link = folder / path.name
+        if not link.exists() and (path.is_dir() or path.suffix == ".safetensors"):
+            link.symlink_to(path.resolve())
+
+
+def _gathered(array: Any) -> np.ndarray | None:
+    """An array's values, in the first process, from all that have a part of it."""
+    import jax
+    from jax.experimental import multihost_utils
+
+    if not array.is_fully_addressable:
+        array = multihost_utils.process_allgather(array, tiled=True)
+    return np.asarray(array) if jax.process_index() == 0 else None
 
 
 def load(

@@ -19,6 +19,11 @@ from jaxtyping import Float
 from egosim_jax.models.layers import Linear, LowRank
 from egosim_jax.types import InputError
 
+OURS = "egosim_jax"
+"""The format that a file's header names if its names are ours."""
+BASE = "base_sha256"
+"""In that header: the hash of the weights that the LoRA was trained on."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Delta:
@@ -58,6 +63,32 @@ def deltas_of(network: nnx.Module) -> dict[str, Delta]:
         for path, layer in linears(network)
         if layer.low_rank is not None
     }
+
+
+def tensors(deltas: Mapping[str, Delta]) -> dict[str, np.ndarray]:
+    """Our own names of summands in a file: a layer's path, then `down` or `up`."""
+    return {
+        f"{path}.{part}": getattr(delta, part)
+        for path, delta in deltas.items()
+        for part in ("down", "up")
+    }
+
+
+def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Delta]:
+    """The inverse of `tensors`. Raises `InputError` naming what is of no pair."""
+    paths = {name.removesuffix(".down").removesuffix(".up") for name in tensors}
+    pairs = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
+    if odd := sorted(pairs ^ tensors.keys()):
+        raise InputError(f"The LoRA has no pairs of down and up of {', '.join(odd)}.")
+    return {
+        path: Delta(down=tensors[f"{path}.down"], up=tensors[f"{path}.up"])
+        for path in sorted(paths)
+    }
+
+
+def about(config: str, *, base: str) -> dict[str, str]:
+    """The header of a file in our own names; `base` is the hash of what it was trained on."""
+    return {"format": OURS, "config": config, BASE: base}
 
 
 def start(network: nnx.Module, rank: int, *, rngs: nnx.Rngs) -> None:

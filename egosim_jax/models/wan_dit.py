@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from einops import rearrange
 from flax import nnx
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from egosim_jax.models import rope
@@ -44,6 +45,15 @@ from egosim_jax.types import InputError
 
 TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
 """Logical axes of the residual stream, and of what is the same for all tokens."""
+
+
+BLOCK_INPUT = "block_input"
+offload_inputs = jax.checkpoint_policies.save_and_offload_only_these_names(
+    names_which_can_be_saved=[],
+    names_which_can_be_offloaded=[BLOCK_INPUT],
+    offload_src="device",
+    offload_dst="pinned_host",
+)
 
 
 @no_type_check
@@ -110,6 +120,7 @@ class WanDiT(nnx.Module):
         time, modulation = (constrain(x, VECTORS) for x in self.time(t))
 
         def step(block: Block, x: jax.Array, sources: tuple[KeysValues, ...]) -> tuple:
+            x = checkpoint_name(x, BLOCK_INPUT)
             x = block(x, modulation, context.rotation, sources)
             return constrain(x, TOKENS), None
 
@@ -142,6 +153,7 @@ class WanDiT(nnx.Module):
             "none": None,
             "full": checkpoint,
             "attention": partial(checkpoint, policy=keep_attention),
+            "offload": partial(checkpoint, policy=offload_inputs),
         }[self.config.remat]
 
     def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:

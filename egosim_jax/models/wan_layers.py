@@ -40,7 +40,7 @@ IMAGE_NORM_EPS = 1e-5
 
 Activation = Callable[[jax.Array], jax.Array]
 KeysValues = tuple[Float[Array, "*l b _ h k"], Float[Array, "*l b _ h k"]]
-Remat = Literal["none", "full", "attention"]
+Remat = Literal["none", "full", "attention", "offload"]
 
 xavier = nnx.initializers.xavier_uniform()
 normal = nnx.initializers.normal(0.02)
@@ -77,7 +77,8 @@ class WanDiTConfig:
     attention: Kernel = "xla"
     """Attention kernel."""
     remat: Remat = "none"
-    """What the backward pass recomputes: nothing, every block, or blocks but self-attention."""
+    """What the backward pass computes again: nothing, every block, blocks but self-attention, or
+    every block from its input, which waits in the host's memory."""
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other and the kernel fits the dtype."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
 from egosim_jax.train.recipes.real_tiny import CLIP_FRAMES, RealTiny
 from egosim_jax.train.script import Training
@@ -52,6 +53,7 @@ class Debug:
         from egosim_jax.data.clips import write_clips
         from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
+        check_alone("debug")
         spec = replace(configs.get("debug").video, frames=CLIP_FRAMES)
         if not self.metadata.exists():
             made = (to_triplet(next(make_sequence(seed, spec=spec))) for seed in range(self.clips))

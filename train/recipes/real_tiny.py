@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.command import DONE
+from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training
+from egosim_jax.train.script import Training, may_differ
 
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
@@ -70,8 +71,9 @@ class RealTiny:
         from egosim_jax.io.run import open_folder
         from egosim_jax.train.from_scratch import FromScratch
 
+        check_alone("real_tiny")
         config = configs.get(self.config)
-        open_folder(self.out, self)
+        open_folder(self.out, self, may_differ=may_differ("vae", "denoiser"))
         stages = FromScratch(
             config=config,
             frames={split: self._pack(split, config) for split in ("train", "test")},

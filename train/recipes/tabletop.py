@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egosim_jax.command import DONE
+from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training
+from egosim_jax.train.script import Training, may_differ
 
 FIRST_TRAINED = 1000
 """Seed of the first scene that is trained on; those below are held out."""
@@ -72,7 +73,8 @@ class Tabletop:
         from egosim_jax.io.run import open_folder
         from egosim_jax.train.from_scratch import FromScratch
 
-        open_folder(self.out, self)
+        check_alone("tabletop")
+        open_folder(self.out, self, may_differ=may_differ("vae", "denoiser"))
         stages = FromScratch(
             config=configs.get(self.config),
             frames={

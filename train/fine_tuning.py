@@ -1,0 +1,107 @@
+"""Training the denoiser of a large model further, on latents that `egosim data encode` made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from egosim_jax.command import DONE
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.models.attention import Kernel
+from egosim_jax.models.wan_layers import Remat
+from egosim_jax.train.script import Training
+
+if TYPE_CHECKING:
+    from egosim_jax.generator import ModelConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class FineTuning:
+    """Train a denoiser from weights, all of it or a LoRA, on cached latents.
+
+    Writes OUT/weights, a folder that is complete, or OUT/lora.safetensors; beside it the log,
+    checkpoints and sample clips. The same command, started again, resumes, on other devices, too.
+    """
+
+    latents: Path
+    """Folder of latents shards."""
+    weights: Path
+    """Weights folder to start from; its encoders must be those that made the latents."""
+    out: Path
+    """Folder of the run."""
+    config: str
+    """Name of the model."""
+    training: Training
+    """How long, how fast and how often."""
+    validation: Path | None = None
+    """Folder of latents shards to validate on, and to make sample clips of."""
+    rank: int | None = None
+    """Train a LoRA of this rank on the blocks' linear layers; the weights stay."""
+    times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
+    """How noise levels are drawn and weighted."""
+    dropout: ConditionDropout = field(default_factory=ConditionDropout)
+    """How often each condition is hidden."""
+    remat: Remat | None = None
+    """What the backward pass computes again, if not what the model says."""
+    attention: Kernel | None = None
+    """Attention kernel, if not the model's."""
+    dtype: Literal["float32", "bfloat16"] | None = None
+    """Dtype to compute in, if not the model's; weights and moments are float32 in any case."""
+    samples: int = 2
+    """Clips of the validation that are generated every `sample_every` updates."""
+
+    def run(self) -> int:
+        """Check the latents, train, write the weights."""
+        import jax
+
+        from egosim_jax.diffusion.objective import Objective
+        from egosim_jax.io import weights
+        from egosim_jax.models import lora
+        from egosim_jax.train.cache import check_encoders
+        from egosim_jax.train.denoiser import Denoising
+        from egosim_jax.train.samples import Samples
+        from egosim_jax.train.script import train
+
+        model = self._model()
+        for shards in (self.latents, self.validation):
+            if shards is not None:
+                check_encoders(shards, model, self.weights)
+        trained = train(
+            Denoising(
+                model=model,
+                objective=Objective(schedule=model.schedule, times=self.times),
+                dropout=self.dropout,
+                rank=self.rank,
+            ),
+            self.training,
+            data=self.latents,
+            validation=self.validation,
+            out=self.out,
+            weights=self.weights,
+            samples=self.validation
+            and Samples(model=model, latents=self.validation, vae=self.weights, count=self.samples),
+        )
+        if self.rank is not None:
+            path, deltas = self.out / "lora.safetensors", lora.deltas_of(trained.dit)
+            base = weights.hashes(self.weights)["dit"]
+            if jax.process_index() == 0:
+                tensors = lora.tensors(deltas)
+                weights.write(path, tensors, about=lora.about(self.config, base=base))
+            print(path)
+            return DONE
+        folder = self.out / "weights"
+        for name, network in trained.parts().items():
+            weights.save(folder / f"{name}.safetensors", network, dtype=model.dit.dtype)
+        if jax.process_index() == 0:
+            weights.link_others(folder, self.weights)
+        print(folder)
+        return DONE
+
+    def _model(self) -> ModelConfig:
+        from egosim_jax import configs
+
+        changes = {"remat": self.remat, "attention": self.attention, "dtype": self.dtype}
+        model = configs.get(self.config).at(self.weights)
+        given = {name: value for name, value in changes.items() if value is not None}
+        return replace(model, dit=replace(model.dit, **given))
