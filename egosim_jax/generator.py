@@ -6,10 +6,14 @@ Each arrow is one compiled program. All denoising steps are one program, a scan 
 to the host; what the steps share (embeddings, cross-attention keys and values, the condition's part
 of the patch embedding) is computed before the scan, and the noise is donated. An item's noise
 depends on its own seed only, so that a clip does not depend on the batch it was made in.
+
+On a mesh (`sharding.py`) every batch is dealt out over data x fsdp; the devices along context share
+the denoising of a clip, and each of them encodes and decodes it, too.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from egosim_jax.conditioning import condition_channels, pack_mask
@@ -36,9 +41,11 @@ from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 from egosim_jax.rendering.reference import draw_hands
+from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
 from egosim_jax.types import Action, Clip, Condition, InputError, Triplet, VideoSpec, View
 
 T = TypeVar("T")
+Module = TypeVar("Module", bound=nnx.Module)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,16 +108,17 @@ class Networks(nnx.Module):
         self.image = None if config.image is None else CLIPVision(config.image, rngs=rngs)
 
     @classmethod
-    def load(cls, config: ModelConfig, folder: Path) -> Networks:
+    def load(cls, config: ModelConfig, folder: Path, *, mesh: Mesh | None = None) -> Networks:
         """The networks of a weights folder, which holds `<network>.safetensors` for each.
 
-        Raises `InputError` with every path that is missing, unknown or of another shape.
+        With a mesh each device reads its own part of the weights. Raises `InputError` with every
+        path that is missing, unknown or of another shape.
         """
         networks = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0)))
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of weights. (--weights)")
         for name, network in networks.parts().items():
-            weights.load(folder / f"{name}.safetensors", network)
+            weights.load(folder / f"{name}.safetensors", network, mesh=mesh)
         return networks
 
     @classmethod
@@ -185,11 +193,19 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
         mask=inputs.mask.astype(jnp.float32),
         prior=networks.vae.encode(to_model(inputs.prior)),
         hands=networks.vae.encode(to_model(inputs.hands)),
-        text=networks.text(inputs.ids, inputs.ids_mask),
+        text=_gathered(networks.text)(inputs.ids, inputs.ids_mask),
         image=None
         if networks.image is None or inputs.pixels is None
-        else networks.image(inputs.pixels),
+        else _gathered(networks.image)(inputs.pixels),
     )
+
+
+def _gathered(network: Module) -> Module:
+    """The network, its weights fetched whole to every device, which then works by itself."""
+    if not several_devices():
+        return network
+    graph, params = nnx.split(network)
+    return nnx.merge(graph, jax.lax.with_sharding_constraint(params, PartitionSpec()))
 
 
 def denoise(
@@ -216,23 +232,47 @@ def denoise(
 
 
 class Program:
-    """A function of the networks and arrays, compiled once for each shape of its arguments."""
+    """A function of the networks and arrays, compiled once for each shape of its arguments.
 
-    def __init__(self, function: Callable[..., Any], networks: nnx.Module, **options: Any):
+    On a mesh, on which `place` has put the networks, all arrays have a leading batch axis. Raises
+    `InputError` before compiling for a batch that the mesh does not divide.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        networks: nnx.Module,
+        *,
+        mesh: Mesh | None = None,
+        **options: Any,
+    ):
         graph, self._params = nnx.split(networks, nnx.Param)
+        self._mesh = mesh
+        if mesh is not None:
+            options["out_shardings"] = batch_sharding(mesh)
         self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
         self._compiled: dict[Any, Any] = {}
 
     def compile(self, *args: Any) -> Any:
         """Compile for these arguments, arrays or shapes, and give the shapes of the answer."""
-        lowered = self._jit.lower(self._params, *args)
-        self._compiled[_signature(args)] = lowered.compile()
+        signature, mesh = _signature(args), self._mesh
+        if mesh is not None:
+            check_batch(jax.tree.leaves(args)[0].shape[0], mesh)
+            placed = batch_sharding(mesh)
+            args = jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed), args
+            )
+        with contextlib.nullcontext() if mesh is None else jax.set_mesh(mesh):
+            lowered = self._jit.lower(self._params, *args)
+            self._compiled[signature] = lowered.compile()
         return lowered.out_info
 
     def __call__(self, *args: Any) -> Any:
         """Run, compiling first if nobody has."""
         if (signature := _signature(args)) not in self._compiled:
             self.compile(*args)
+        if self._mesh is not None:
+            args = jax.device_put(args, batch_sharding(self._mesh))
         return self._compiled[signature](self._params, *args)
 
 
@@ -240,19 +280,31 @@ def _signature(args: Any) -> Any:
     return tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(args))
 
 
-class Generator:
-    """A model ready to generate."""
+def place(networks: Module, mesh: Mesh | None) -> Module:
+    """Networks whose weights lie on a mesh as the rules say; the same ones without a mesh."""
+    if mesh is None:
+        return networks
+    graph, params = nnx.split(networks, nnx.Param)
+    return nnx.merge(graph, jax.device_put(params, state_sharding(mesh, params)))
 
-    def __init__(self, config: ModelConfig, networks: Networks):
+
+class Generator:
+    """A model ready to generate, on one device or on those of a mesh."""
+
+    def __init__(self, config: ModelConfig, networks: Networks, mesh: Mesh | None = None):
         self.config = config
-        self._encode = Program(encode_condition, networks)
-        self._latents = Program(lambda vae, video: vae.encode(to_model(video)), networks.vae)
+        networks = place(networks, mesh)
+        self._encode = Program(encode_condition, networks, mesh=mesh)
+        self._latents = Program(
+            lambda vae, video: vae.encode(to_model(video)), networks.vae, mesh=mesh
+        )
         self._denoise = Program(
             lambda dit, condition, noise: denoise(dit, condition, noise, config),
             networks.dit,
+            mesh=mesh,
             donate_argnums=2,
         )
-        self._decode = Program(lambda vae, x: to_uint8(vae.decode(x)), networks.vae)
+        self._decode = Program(lambda vae, x: to_uint8(vae.decode(x)), networks.vae, mesh=mesh)
 
     def compile(self, batch: int) -> None:
         """Compile everything that `generate` needs for batches of this size."""
@@ -270,8 +322,19 @@ class Generator:
         """One clip for each triplet, from the noise of its seed.
 
         `without` hides one condition, as training does (`conditioning/dropout.py`). Raises
-        `FloatingPointError` naming the clips whose latents are not finite.
+        `InputError` if a mesh does not divide the batch, and `FloatingPointError` naming the clips
+        whose latents are not finite.
         """
+        return self._clips(self.latents(triplets, seeds, without=without))
+
+    def latents(
+        self,
+        triplets: Sequence[Triplet],
+        seeds: Sequence[int],
+        *,
+        without: Literal["prior", "mask", "hands", "text"] | None = None,
+    ) -> Float[Array, "b f h w 16"]:
+        """What `generate` decodes; it raises the same."""
         condition = self._encode(Inputs.of(triplets, self.config))
         if without is not None:
             condition = ConditionDropout(**{without: 1.0}).apply(condition, jax.random.key(0))
@@ -283,7 +346,7 @@ class Generator:
         ]
         if bad:
             raise FloatingPointError(f"The latents of {bad} are not finite (NaN or infinity).")
-        return self._clips(latents)
+        return latents
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
@@ -301,32 +364,12 @@ class Generator:
 
     def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
         """The truth through the autoencoder and back: the best any denoiser could give."""
-        return self._clips(self._latents(_truths(triplets)))
+        return self._clips(self._latents(truths(triplets)))
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w 16"]:
         """The starting noise of each seed."""
         shape = (*self.config.video.latent_shape, self.config.vae.z_dim)
         return jnp.stack([jax.random.normal(jax.random.key(seed), shape) for seed in seeds])
-
-    def cache(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
-        """What training needs of each triplet, encoded once: the arrays of a latents shard.
-
-        With frozen encoders these are their embeddings; with joint ones, the encoders' inputs.
-        """
-        inputs = Inputs.of(triplets, self.config)
-        condition = self._encode(inputs)
-        arrays = {
-            "truth": self._latents(_truths(triplets)),
-            "prior": condition.prior,
-            "hands": condition.hands,
-            "mask": inputs.mask,
-        }
-        if self.config.encoders == "joint":
-            arrays |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
-        else:
-            arrays |= {"text": condition.text, "image": condition.image}
-        present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
-        return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
 
     def _clips(self, latents: Float[Array, "b f h w 16"]) -> list[Clip]:
         frames = np.asarray(self._decode(latents))
@@ -339,7 +382,8 @@ def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
         yield items[first : first + size]
 
 
-def _truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
+def truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
+    """The true videos. Raises `InputError` naming the clips that have none."""
     without = [t.video_id for t in triplets if t.truth is None]
     if without:
         raise InputError(f"{', '.join(without)}: no truth to encode. (column video)")

@@ -15,8 +15,7 @@ width.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any
 
@@ -24,7 +23,7 @@ import jax
 from flax import nnx
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, MeshConfig
 
 WEIGHTS: Mapping[str, tuple[str, ...]] = {"embed": ("fsdp", "context")}
 """Logical axis of a weight to mesh axes; an axis that is not listed is never split."""
@@ -36,31 +35,41 @@ ACTIVATIONS: Mapping[str, tuple[str, ...]] = {
 """Logical axis of an activation to mesh axes."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeshConfig:
-    """Sizes of the mesh axes; their product is the number of devices."""
+def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
+    """Lay devices out as data x fsdp x context; all of them, if none are given.
 
-    data: int = 1
-    """Copies of the weights, each with its own part of the batch."""
-    fsdp: int = -1
-    """Devices that share one copy of the weights; -1 takes all that are left."""
-    context: int = 1
-    """Devices that share one sample, each with a part of its tokens."""
-
-
-def make_mesh(config: MeshConfig) -> Mesh:
-    """Lay the devices out as data x fsdp x context, or say how many there are."""
-    devices = jax.device_count()
-    taken = config.data * config.context
-    fsdp = devices // max(1, taken) if config.fsdp == -1 else config.fsdp
-    if min(config.data, fsdp, config.context) < 1 or taken * fsdp != devices:
+    Raises `InputError` if the sizes do not fit the number of devices.
+    """
+    devices = jax.devices() if devices is None else devices
+    wanted = (config.data, config.fsdp, config.context)
+    left = len(devices) // max(1, prod(size for size in wanted if size != -1))
+    shape = tuple(left if size == -1 else size for size in wanted)
+    if wanted.count(-1) > 1 or min(shape) < 1 or prod(shape) != len(devices):
         raise InputError(
             f"A mesh of data {config.data} x fsdp {config.fsdp} x context {config.context} does "
-            f"not fit {devices} devices: the product of the axes must be the number of devices. "
-            "(--training.mesh.data, --training.mesh.fsdp, --training.mesh.context)"
+            f"not fit {len(devices)} devices: the product of the axes must be the number of "
+            "devices, and only one of them may be -1, which takes those that are left. "
+            "(--mesh.data, --mesh.fsdp, --mesh.context; in training, after the stage's name)"
         )
-    shape = (config.data, fsdp, config.context)
-    return jax.make_mesh(shape, ("data", "fsdp", "context"), axis_types=(AxisType.Auto,) * 3)
+    axes = ("data", "fsdp", "context")
+    return jax.make_mesh(shape, axes, axis_types=(AxisType.Auto,) * 3, devices=devices)
+
+
+def check_batch(size: int, mesh: Mesh | AbstractMesh) -> None:
+    """Raise `InputError` unless a batch can be dealt out in equal parts over data x fsdp."""
+    parts = batch_parts(mesh)
+    if size % parts:
+        raise InputError(
+            f"A batch of {size} cannot be shared by a mesh of data {mesh.shape['data']} x fsdp "
+            f"{mesh.shape['fsdp']}: it must be a multiple of their product, {parts}. Nearest: "
+            f"{-(-size // parts) * parts}. (--batch-size, or another mesh: devices along context "
+            "share one sample)"
+        )
+
+
+def batch_parts(mesh: Mesh | AbstractMesh) -> int:
+    """Into how many parts a mesh splits a batch."""
+    return prod(mesh.shape[name] for name in ACTIVATIONS["batch"])
 
 
 def several_devices() -> bool:

@@ -88,6 +88,19 @@ class VideoSpec:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class MeshConfig:
+    """Sizes of the mesh axes; their product is the number of devices. One of them may be -1: it
+    takes all devices that are left."""
+
+    data: int = 1
+    """Copies of the weights, each with its own part of the batch."""
+    fsdp: int = -1
+    """Devices that share one copy of the weights."""
+    context: int = 1
+    """Devices that share one sample, each with a part of its tokens."""
+
+
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Cameras:

@@ -1,29 +1,130 @@
 """Encode clips once, so that training steps read latents and embeddings instead of videos.
 
 Every window of a clip is a record of its own, since the causal VAE encodes a window's first frame
-alone. The manifest's provenance names the config and the hashes of the encoders' weights.
+alone. The windows are cut into parts of equal number. A part becomes one shard in a folder of its
+own, OUT/parts/00000, ..., which is whole or is not there; process p of n writes parts p, p + n, ...
+and leaves alone what is there already. When all parts are there, the first process renames their
+shards into OUT and writes the manifest. Its provenance names the config, the source's fingerprint
+and the hashes of the networks that made the arrays.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.data.shards import ShardReader, ShardWriter
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
+
+from egosim_jax.conditioning.video import to_model
+from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, gather, read_manifest
 from egosim_jax.data.transforms import decode_record, record_length
-from egosim_jax.generator import Generator, batches
-from egosim_jax.types import InputError, Triplet
+from egosim_jax.generator import Inputs, ModelConfig, Program, batches, place, truths
+from egosim_jax.io.run import open_folder
+from egosim_jax.io.weights import hashes, load
+from egosim_jax.models.clip_vision import CLIPVision
+from egosim_jax.models.umt5 import UMT5
+from egosim_jax.models.wan_vae import WanVAE
+from egosim_jax.progress import track
+from egosim_jax.sharding import check_batch
+from egosim_jax.types import InputError, Triplet, check_counts
+
+MOST_PARTS = 100_000
+"""Shards whose names have five digits."""
+THREADS = min(8, os.cpu_count() or 1)
+"""Read clips while others are encoded."""
+
+Window = tuple[int, int]
+"""Record number and first frame."""
 
 
-def windows(source: ShardReader, *, frames: int, stride: int) -> list[tuple[int, int]]:
+class Encoders(nnx.Module):
+    """The networks that training a denoiser leaves alone: the VAE, and frozen encoders."""
+
+    def __init__(self, config: ModelConfig, *, rngs: nnx.Rngs):
+        names = encoder_names(config)
+        self.vae = WanVAE(config.vae, rngs=rngs)
+        self.text = UMT5(config.text, rngs=rngs) if "text" in names else None
+        image = config.image if "image" in names else None
+        self.image = None if image is None else CLIPVision(image, rngs=rngs)
+
+    @classmethod
+    def load(cls, config: ModelConfig, folder: Path, *, mesh: Mesh | None = None) -> Encoders:
+        """Read them, and nothing else, from a weights folder, onto a mesh if there is one.
+
+        Raises `InputError` with every path that is missing, unknown or of another shape.
+        """
+        encoders = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0)))
+        for name in encoder_names(config):
+            load(folder / f"{name}.safetensors", getattr(encoders, name), mesh=mesh)
+        return encoders
+
+
+def encoder_names(config: ModelConfig) -> list[str]:
+    """Networks whose output is cached: the VAE; text and image encoder unless they are trained."""
+    if config.encoders == "joint":
+        return ["vae"]
+    return ["vae", "text"] if config.image is None else ["vae", "text", "image"]
+
+
+class Encoding:
+    """Clips to the arrays of latents shards, on one device or on those of a mesh."""
+
+    def __init__(self, config: ModelConfig, encoders: Encoders, mesh: Mesh | None = None):
+        self.config = config
+        self._encode = Program(_encode, place(encoders, mesh), mesh=mesh)
+
+    def __call__(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
+        """What training needs of each triplet.
+
+        With frozen encoders these are their embeddings; with joint ones, the encoders' inputs.
+        """
+        inputs = Inputs.of(triplets, self.config)
+        arrays = {"mask": inputs.mask, **self._encode(inputs, truths(triplets))}
+        if self.config.encoders == "joint":
+            arrays |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
+        present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
+        return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
+
+
+def _encode(encoders: Encoders, inputs: Inputs, truth: jax.Array) -> dict[str, jax.Array]:
+    """One video after the other, so that the VAE is compiled once and needs little memory."""
+    videos = jnp.stack([truth, jnp.asarray(inputs.prior), jnp.asarray(inputs.hands)])
+    latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), videos)
+    arrays = {"truth": latents[0], "prior": latents[1], "hands": latents[2]}
+    if encoders.text is not None:
+        arrays["text"] = encoders.text(inputs.ids, inputs.ids_mask)
+    if encoders.image is not None and inputs.pixels is not None:
+        arrays["image"] = encoders.image(inputs.pixels)
+    return arrays
+
+
+def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     """Record number and first frame of every window of `frames` frames, `stride` apart.
 
-    Reads every record. Raises `InputError` if a clip is shorter than a window.
+    Reads every record of encoded videos. Raises `InputError` if a clip is shorter than a window, or
+    if the records are no clips with their truth.
     """
+    manifest = source.manifest
+    if manifest.kind == "latents" or "truth" not in manifest.arrays:
+        raise InputError(
+            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}: to be encoded "
+            "there must be videos or frames, with their truth. (--shards)"
+        )
+    known = manifest.arrays["prior"].shape[0] if manifest.kind == "frames" else None
     found = []
-    for number, record in enumerate(source):
-        last = record_length(record.arrays) - frames
+    for number in range(len(source)):
+        last = (known or record_length(source[number].arrays)) - frames
         if last < 0:
             raise InputError(
                 f"{source.name(number)} has {last + frames} frames; a window needs {frames}."
@@ -33,36 +134,162 @@ def windows(source: ShardReader, *, frames: int, stride: int) -> list[tuple[int,
 
 
 def cache(
-    generator: Generator,
+    config: ModelConfig,
+    folder: Path,
     *,
     source: ShardReader,
-    todo: Sequence[tuple[int, int]],
     out: Path,
+    stride: int,
+    batch_size: int,
+    mesh: Mesh | None = None,
+    shard_windows: int = 64,
+    process_index: int | None = None,
+    process_count: int | None = None,
+    verb: str = "encoding",
+) -> None:
+    """Write the latents shards of every window of `source`, or go on where a run was interrupted.
+
+    `folder` holds the weights, of which `encoder_names` are read. Each batch is dealt out over
+    `mesh`, which holds devices of this process. All processes call this alike and have `out` in
+    common; it is whole when they return. Raises `InputError` if `out` was begun with another
+    config, source, stride or number of windows in a shard, or with other encoders.
+    """
+    check_counts({"--stride": stride, "--batch-size": batch_size, "--shard-windows": shard_windows})
+    if mesh is not None:
+        check_batch(batch_size, mesh)
+    index = jax.process_index() if process_index is None else process_index
+    count = jax.process_count() if process_count is None else process_count
+    provenance = {
+        "config": config.name,
+        "source": source.manifest.fingerprint,
+        "encoders": hashes(folder, only=encoder_names(config)),
+    }
+    _open(
+        out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
+    )
+    _wait_for_all("opened")  # early, since what is shared first has to be shared soon
+    if (out / MANIFEST).exists():
+        shutil.rmtree(out / "parts", ignore_errors=True)
+        return
+    todo = list(batches(windows(source, frames=config.video.frames, stride=stride), shard_windows))
+    if len(todo) > MOST_PARTS:
+        raise InputError(
+            f"{len(todo)} shards of {shard_windows} windows are too many: there can be "
+            f"{MOST_PARTS}. (--shard-windows, --stride)"
+        )
+    parts = [out / "parts" / f"{number:05d}" for number in range(len(todo))]
+    missing = {
+        parts[number]: todo[number]
+        for number in range(index, len(todo), count)
+        if not (parts[number] / MANIFEST).exists()
+    }
+    if missing:
+        encode = Encoding(config, Encoders.load(config, folder, mesh=mesh), mesh)
+        progress = _write(encode, missing, source, batch_size, provenance)
+        for _ in track(progress, verb, total=sum(map(len, missing.values()))):
+            pass
+    _wait_for_all("encoded")
+    if index == 0:
+        gather(parts, out)
+        shutil.rmtree(out / "parts")
+    _wait_for_all("gathered")
+
+
+def _open(out: Path, settings: Mapping[str, Any]) -> None:
+    if (out / MANIFEST).exists() and not (out / "config.json").exists():
+        raise InputError(f"{out} already holds shards that were not encoded here. (--out)")
+    open_folder(out, settings)
+
+
+def _wait_for_all(what: str) -> None:
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(f"cache {what}")
+
+
+def _write(
+    encode: Encoding,
+    parts: Mapping[Path, Sequence[Window]],
+    source: ShardReader,
     batch_size: int,
     provenance: Mapping[str, Any],
-    overwrite: bool = False,
-) -> Iterator[tuple[int, int]]:
-    """Write latents shards; yields each window of `todo` once it is encoded.
-
-    `source` holds videos or frames with a truth, `todo` the windows of it that are wanted.
-    """
-    spec = generator.config.video
-    with ShardWriter(
-        out, kind="latents", spec=spec, provenance=provenance, overwrite=overwrite
-    ) as writer:
-        for batch in batches(todo, batch_size):
-            filled = [*batch, *[batch[-1]] * (batch_size - len(batch))]
-            examples = generator.cache([_triplet(source, *window, generator) for window in filled])
-            for (number, start), arrays in zip(batch, examples, strict=False):
-                writer.add(arrays, {**source[number].metadata, "start": start})
-                yield number, start
+) -> Iterator[Window]:
+    """Write part after part; yields each window once it is encoded."""
+    jobs = [(part, batch) for part, todo in parts.items() for batch in batches(todo, batch_size)]
+    spec = encode.config.video
+    for part, group in groupby(_read(source, jobs, encode.config), key=itemgetter(0)):
+        with ShardWriter(
+            part, kind="latents", spec=spec, provenance=provenance, shard_bytes=2**62
+        ) as writer:
+            for _, clips in group:
+                fill = [clips[-1]] * (batch_size - len(clips))
+                examples = encode([triplet for _, _, triplet in (*clips, *fill)])
+                for (window, metadata, _), arrays in zip(clips, examples, strict=False):
+                    writer.add(arrays, {**metadata, "start": window[1]})
+                    yield window
 
 
-def _triplet(source: ShardReader, number: int, start: int, generator: Generator) -> Triplet:
+Example = tuple[Window, Mapping[str, Any], Triplet]
+
+
+def _read(
+    source: ShardReader, jobs: Sequence[tuple[Path, Sequence[Window]]], config: ModelConfig
+) -> Iterator[tuple[Path, list[Example]]]:
+    """The clips of each job, read while the one before is encoded."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        before: tuple[Path, list[Future[Example]]] | None = None
+        for part, batch in jobs:
+            now = part, [pool.submit(_clip, source, window, config) for window in batch]
+            if before is not None:
+                yield before[0], [future.result() for future in before[1]]
+            before = now
+        if before is not None:
+            yield before[0], [future.result() for future in before[1]]
+
+
+def _clip(source: ShardReader, window: Window, config: ModelConfig) -> Example:
+    number, start = window
     record = source[number]
-    arrays: dict[str, Any] = decode_record(record.arrays, generator.config.video, start=start)
-    return Triplet(
-        video_id=str(record.metadata["video_id"]),
-        prompt=str(record.metadata["prompt"]),
-        **arrays,
-    )
+    try:
+        arrays: dict[str, Any] = decode_record(record.arrays, config.video, start=start)
+    except InputError as error:
+        raise InputError(f"{source.name(number)}: {error}") from error
+    metadata = record.metadata
+    names = {"video_id": str(metadata["video_id"]), "prompt": str(metadata["prompt"])}
+    return window, metadata, Triplet(**names, **arrays)
+
+
+def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> None:
+    """Raise `InputError` unless latents shards were encoded for a model, by a weights folder's VAE.
+
+    Compares config and video with the manifest in `shards`, and the hashes of the networks that
+    encoded with those of the same networks in the folder, of which only the VAE must be there;
+    without a folder, config and video alone.
+    """
+    manifest = read_manifest(shards)
+    encoders = manifest.provenance.get("encoders")
+    if manifest.kind != "latents" or not isinstance(encoders, Mapping) or "vae" not in encoders:
+        raise InputError(
+            f"{shards} holds {manifest.kind} and does not say which encoders made them. Encode "
+            "again. (egosim data encode)"
+        )
+    problems = [
+        f"  {what}: the shards have {have}, this training {want}"
+        for what, have, want in (
+            ("config", manifest.provenance.get("config"), config.name),
+            ("video", manifest.spec, config.video),
+        )
+        if have != want
+    ]
+    if weights is not None:
+        ours = {"vae": "none", **hashes(weights, only=encoders)}
+        problems += [
+            f"  {name}: the shards have {str(encoders[name])[:16]}, {weights} {ours[name][:16]}"
+            for name in sorted(encoders.keys() & ours.keys())
+            if encoders[name] != ours[name]
+        ]
+    if problems:
+        listing = "\n".join(problems)
+        raise InputError(
+            f"{shards} was not encoded for this training:\n{listing}\nEncode again with these "
+            "weights (egosim data encode), or take those that it was encoded with. (--weights)"
+        )

@@ -16,12 +16,11 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import MANIFEST, ShardReader
 from egosim_jax.data.transforms import record_length
 from egosim_jax.diffusion.objective import Objective
-from egosim_jax.generator import Generator, ModelConfig, Networks
+from egosim_jax.generator import ModelConfig, Networks
 from egosim_jax.io import weights
 from egosim_jax.models.wan_vae import WanVAE, standardise_latents
-from egosim_jax.progress import track
 from egosim_jax.train.autoencoder import Autoencoding, latent_statistics
-from egosim_jax.train.cache import cache, windows
+from egosim_jax.train.cache import cache
 from egosim_jax.train.denoiser import Denoising
 from egosim_jax.train.script import Training, train
 
@@ -60,7 +59,7 @@ class FromScratch:
         """Autoencoder, latents, denoiser; the folder of the weights."""
         networks = Networks.random(self.config, seed=0)
         networks.vae = self._autoencoder()
-        latents = {split: self._encode(split, networks) for split in self.frames}
+        latents = {split: self._encode(split) for split in self.frames}
         trained = train(
             Denoising(
                 model=self.config,
@@ -104,7 +103,7 @@ class FromScratch:
         standardise_latents(vae, *latent_statistics(vae, videos))
         return vae
 
-    def _encode(self, split: str, networks: Networks) -> Path:
+    def _encode(self, split: str) -> Path:
         """Cache the latents of every window of a split."""
         out = self.out / "latents" / split
         if not (out / MANIFEST).exists():
@@ -112,18 +111,13 @@ class FromScratch:
             # To validate, a clip's first window and, if it is longer, its last.
             last = record_length(source[0].arrays) - self.config.video.frames
             every = self.stride if split == "train" else max(1, last)
-            todo = windows(source, frames=self.config.video.frames, stride=every)
-            progress = cache(
-                Generator(self.config, networks),
+            cache(
+                self.config,
+                self.out / "weights",
                 source=source,
-                todo=todo,
                 out=out,
+                stride=every,
                 batch_size=BATCH,
-                provenance={
-                    "config": self.config.name,
-                    "weights": weights.hashes(self.out / "weights"),
-                },
+                verb=f"encoding {split}",
             )
-            for _ in track(progress, f"encoding {split}", total=len(todo)):
-                pass
         return out

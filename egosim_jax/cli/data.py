@@ -13,7 +13,7 @@ import tyro
 
 from egosim_jax.command import DONE, PARTIAL
 from egosim_jax.progress import track
-from egosim_jax.types import InputError, VideoSpec, check_counts
+from egosim_jax.types import InputError, MeshConfig, VideoSpec, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.data.shards import ShardReader
@@ -78,7 +78,9 @@ class Pack:
 class Encode:
     """Encode shards of clips once, so that training reads latents and embeddings.
 
-    Every window of a clip becomes a record. Prints the folder.
+    Every window of a clip becomes a record. The same command goes on where an interrupted one
+    stopped. Several processes with one OUT share the work, each with its own devices. Prints the
+    folder.
     """
 
     config: str
@@ -91,33 +93,33 @@ class Encode:
     """Folder of the latents shards."""
     stride: int = 1
     """Frames between the windows of a clip."""
-    batch_size: int = 1
-    """Windows encoded together."""
-    overwrite: bool = False
-    """Replace the shards that the folder holds."""
+    batch_size: int | None = None
+    """Windows that a process encodes together: a multiple of its number of devices, which is what
+    is taken if none is given."""
+    shard_windows: int = 64
+    """Windows in a shard file: what an interrupted run loses at most. Best a multiple of the batch
+    size."""
 
     def run(self) -> int:
-        """Encode batch after batch."""
+        """Encode shard after shard."""
+        import jax
+
         from egosim_jax import configs
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.generator import Generator, Networks
-        from egosim_jax.io.weights import hashes
-        from egosim_jax.train.cache import cache, windows
+        from egosim_jax.sharding import make_mesh
+        from egosim_jax.train.cache import cache
 
-        check_counts({"--stride": self.stride, "--batch-size": self.batch_size})
-        config, source = configs.get(self.config).at(self.weights), ShardReader(self.shards)
-        todo = windows(source, frames=config.video.frames, stride=self.stride)
-        progress = cache(
-            Generator(config, Networks.load(config, self.weights)),
-            source=source,
-            todo=todo,
+        mesh = make_mesh(MeshConfig(data=-1, fsdp=1), jax.local_devices())
+        cache(
+            configs.get(self.config).at(self.weights),
+            self.weights,
+            source=ShardReader(self.shards),
             out=self.out,
-            batch_size=self.batch_size,
-            provenance={"config": config.name, "weights": hashes(self.weights)},
-            overwrite=self.overwrite,
+            stride=self.stride,
+            batch_size=mesh.size if self.batch_size is None else self.batch_size,
+            mesh=mesh,
+            shard_windows=self.shard_windows,
         )
-        for _ in track(progress, "encoding", total=len(todo)):
-            pass
         print(self.out)
         return DONE
 
@@ -219,8 +221,8 @@ class Look:
         """Choose, decode, draw."""
         import numpy as np
 
-        from egosim_jax.cli.sheet import Block, draw_sheet
         from egosim_jax.data.shards import ShardReader
+        from egosim_jax.data.sheet import Block, draw_sheet
         from egosim_jax.data.transforms import decode_record
 
         check_counts({"--limit": self.limit, "--moments": self.moments, "--width": self.width})

@@ -8,17 +8,19 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from egosim_jax.cli.sheet import Block, draw_sheet
 from egosim_jax.command import DONE, PARTIAL, USAGE
-from egosim_jax.types import Clip, InputError, Triplet, check_counts
+from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.types import Clip, InputError, MeshConfig, Triplet, check_counts
 
 if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
     from egosim_jax.data.metadata import ClipFiles
     from egosim_jax.generator import Generator, ModelConfig
 
@@ -64,8 +66,13 @@ class Generate:
     """Denoising steps, if not the model's own."""
     seed: int = 0
     """Each clip's noise comes from this seed and its id; without metadata, the scene does too."""
-    batch_size: int = 1
-    """Clips generated together."""
+    batch_size: int | None = None
+    """Clips generated together, over all devices: a multiple of mesh.data x mesh.fsdp, which is
+    what is taken if none is given."""
+    mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
+    """Layout of the devices; by default each makes clips of its own. Less time for one clip:
+    --mesh.data 1 --mesh.context -1. Weights too large for one device: --mesh.data 1
+    --mesh.fsdp -1."""
     lenient: bool = False
     """Repair input as the official loader does: repeat or cut frames, stretch sizes, take a
     missing mask for all observed."""
@@ -80,6 +87,7 @@ class Generate:
             {"--steps": self.steps, "--batch-size": self.batch_size, "--limit": self.limit}
         )
         config = self._config()
+        mesh, size = self._placing()
         items = None if self.metadata is None else self._items(self.metadata)
         self._open(config)
         if items is None:
@@ -94,7 +102,7 @@ class Generate:
             return USAGE
         if sound:
             _warn_of_long_prompts(sound, config)
-            bad += self._generate(sound, config)
+            bad += self._generate(sound, config, mesh, size)
             self._draw(items, config)
         print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self._folder}", file=sys.stderr)
         return PARTIAL if bad else DONE
@@ -137,6 +145,15 @@ class Generate:
             raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
         return config if self.steps is None else dataclasses.replace(config, steps=self.steps)
 
+    def _placing(self) -> tuple[Mesh, int]:
+        """The devices, and how many clips they make together."""
+        from egosim_jax.sharding import batch_parts, check_batch, make_mesh
+
+        mesh = make_mesh(self.mesh)
+        size = batch_parts(mesh) if self.batch_size is None else self.batch_size
+        check_batch(size, mesh)
+        return mesh, size
+
     def _open(self, config: ModelConfig) -> None:
         from egosim_jax.io.run import open_folder
         from egosim_jax.io.weights import hashes
@@ -168,18 +185,22 @@ class Generate:
                 sound.append(item)
         return sound, bad
 
-    def _generate(self, items: Sequence[_Item], config: ModelConfig) -> list[tuple[_Item, str]]:
-        """Generate batch after batch; the items that failed."""
+    def _generate(
+        self, items: Sequence[_Item], config: ModelConfig, mesh: Mesh, size: int
+    ) -> list[tuple[_Item, str]]:
+        """Generate `size` clips after `size` clips; the items that failed."""
         from egosim_jax.generator import batches
+        from egosim_jax.sharding import batch_parts
 
-        generator = self._generator(config)
+        parts = batch_parts(mesh)
+        size = min(size, -(-len(items) // parts) * parts)  # what the mesh divides and is enough
+        generator = self._generator(config, mesh)
         then = time.monotonic()
-        generator.compile(min(self.batch_size, len(items)))
+        generator.compile(size)
         print(f"compiled in {time.monotonic() - then:.1f} s", file=sys.stderr)
 
         bad: list[tuple[_Item, str]] = []
-        began, size = time.monotonic(), min(self.batch_size, len(items))
-        done = 0
+        began, done = time.monotonic(), 0
         for batch in batches(items, size):
             then = time.monotonic()
             loaded, problems = self._load(batch, config)
@@ -194,19 +215,19 @@ class Generate:
             )
         return bad
 
-    def _generator(self, config: ModelConfig) -> Generator:
+    def _generator(self, config: ModelConfig, mesh: Mesh) -> Generator:
         from egosim_jax.generator import Generator, Networks
 
         if self._weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
-            return Generator(config, Networks.random(config, seed=self.seed))
-        networks = Networks.load(config, self._weights)
+            return Generator(config, Networks.random(config, seed=self.seed), mesh)
+        networks = Networks.load(config, self._weights, mesh=mesh)
         if self.lora is not None:
             from egosim_jax.convert.lora import read_lora
             from egosim_jax.models import lora
 
             lora.apply(networks.dit, read_lora(self.lora, config.dit), scale=self.lora_scale)
-        return Generator(config, networks)
+        return Generator(config, networks, mesh)
 
     def _load(
         self, batch: Sequence[_Item], config: ModelConfig

@@ -20,7 +20,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -228,22 +228,67 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         self._writer, self._records, self._bytes = None, 0, 0
 
     def _note(self, arrays: Mapping[str, np.ndarray], name: str) -> None:
-        """Merge a record's shapes into the manifest's; axes on which records differ become None."""
-        if self._arrays and arrays.keys() != self._arrays.keys():
-            raise InputError(
-                f"{name} holds {sorted(arrays)}, but the records before it hold "
-                f"{sorted(self._arrays)}."
-            )
+        """Merge a record's shapes into the manifest's."""
         for key, array in arrays.items():
-            info = self._arrays.get(key, ArrayInfo(dtype=array.dtype.name, shape=array.shape))
-            if array.dtype not in _DTYPES.values() or array.dtype.name != info.dtype:
-                raise InputError(f"{name}: {key} is {array.dtype}, wanted {info.dtype}.")
-            if array.ndim != len(info.shape):
-                raise InputError(f"{name}: {key} is {array.shape}, wanted {info.shape}.")
-            shape = tuple(
-                a if a == b else None for a, b in zip(info.shape, array.shape, strict=True)
-            )
-            self._arrays[key] = ArrayInfo(dtype=info.dtype, shape=shape)
+            if array.dtype not in _DTYPES.values():
+                raise InputError(f"{name}: {key} is {array.dtype}, which no record can hold.")
+        infos = {
+            key: ArrayInfo(dtype=array.dtype.name, shape=array.shape)
+            for key, array in arrays.items()
+        }
+        self._arrays = _merge(self._arrays, infos, name)
+
+
+def _merge(
+    before: Mapping[str, ArrayInfo], arrays: Mapping[str, ArrayInfo], name: str
+) -> dict[str, ArrayInfo]:
+    """What two descriptions have in common; axes on which they differ become None."""
+    if before and arrays.keys() != before.keys():
+        raise InputError(
+            f"{name} holds {sorted(arrays)}, but the records before it hold {sorted(before)}."
+        )
+    merged = {}
+    for key, info in arrays.items():
+        want = before.get(key, info)
+        if info.dtype != want.dtype:
+            raise InputError(f"{name}: {key} is {info.dtype}, wanted {want.dtype}.")
+        if len(info.shape) != len(want.shape):
+            raise InputError(f"{name}: {key} is {info.shape}, wanted {want.shape}.")
+        axes = zip(want.shape, info.shape, strict=True)
+        shape = tuple(a if a == b else None for a, b in axes)
+        merged[key] = ArrayInfo(dtype=info.dtype, shape=shape)
+    return merged
+
+
+def gather(parts: Sequence[Path], out: Path) -> Manifest:
+    """Make one folder of shards of several, in this order, by renaming; the manifest comes last.
+
+    Every part holds one shard, and all were written with the same kind, spec and provenance. After
+    an interruption the same call goes on. Raises `InputError` naming the parts that are not there,
+    and the shards that are not as their part's manifest says.
+    """
+    missing = [part.name for part in parts if not (part / MANIFEST).exists()]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(parts)} parts are not in {parts[0].parent}: "
+            f"{', '.join(missing[:8])}. All processes must write to the same folder. (--out)"
+        )
+    arrays: dict[str, ArrayInfo] = {}
+    shards, problems = [], []
+    for number, part in enumerate(parts):
+        manifest = read_manifest(part)
+        (shard,) = manifest.shards
+        arrays = _merge(arrays, manifest.arrays, str(part))
+        shards.append(dataclasses.replace(shard, file=f"shard-{number:05d}.array_record"))
+        if (part / shard.file).exists():
+            (part / shard.file).replace(out / shards[-1].file)
+        for problem in file_problems(out, shards[-1]):
+            problems.append(f"  {problem}: remove {part} to write it again")
+    if problems:
+        raise InputError("\n".join([f"{out} cannot be put together:", *problems]))
+    manifest = dataclasses.replace(read_manifest(parts[0]), arrays=arrays, shards=tuple(shards))
+    write_json(out / MANIFEST, dataclasses.asdict(manifest))
+    return manifest
 
 
 class ShardReader:

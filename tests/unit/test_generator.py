@@ -113,30 +113,10 @@ def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, trip
     )
 
 
-def test_the_cache_of_joint_encoders_holds_their_inputs(generator, triplets):
-    arrays = generator.cache(triplets[:1])[0]
-    assert {name: array.shape for name, array in arrays.items()} == {
-        "truth": (2, 4, 6, 16),
-        "prior": (2, 4, 6, 16),
-        "hands": (2, 4, 6, 16),
-        "mask": (2, 4, 6, 4),
-        "ids": (128,),
-        "ids_mask": (128,),
-        "pixels": (28, 28, 3),
-    }
-
-
-def test_the_cache_of_frozen_encoders_holds_their_embeddings(networks, triplets):
-    frozen = Generator(dataclasses.replace(CONFIG, encoders="frozen"), networks)
-    arrays = frozen.cache(triplets[:1])[0]
-    assert (arrays["text"].shape, arrays["image"].shape) == ((128, 64), (5, 32))
-    assert "ids" not in arrays
-
-
-def test_a_clip_without_truth_cannot_be_cached(generator, triplets):
+def test_a_clip_without_truth_cannot_be_reconstructed(generator, triplets):
     blind = dataclasses.replace(triplets[0], truth=None)
     with pytest.raises(InputError, match="tabletop_human_0_0: no truth"):
-        generator.cache([blind])
+        generator.reconstruct([blind])
 
 
 def test_latents_that_are_not_finite_name_their_clips(networks, triplets):

@@ -1,0 +1,278 @@
+"""Latents that are encoded once: whole, and the same however they were made."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from egosim_jax import configs
+from egosim_jax.cli.__main__ import main
+from egosim_jax.data import shards
+from egosim_jax.data.check import check
+from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, read_manifest
+from egosim_jax.generator import Networks
+from egosim_jax.io.weights import hashes
+from egosim_jax.train import cache as caching
+from egosim_jax.train.cache import cache, check_encoders
+from egosim_jax.types import InputError, VideoSpec
+
+DEBUG = configs.get("debug")
+CONFIG = dataclasses.replace(DEBUG, video=VideoSpec(frames=5, height=16, width=32))
+FROZEN = dataclasses.replace(CONFIG, encoders="frozen")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of weights without a denoiser."""
+    folder = tmp_path_factory.mktemp("weights")
+    Networks.random(CONFIG, seed=0).save(folder)
+    (folder / "dit.safetensors").unlink()
+    return folder
+
+
+def write_clips(folder: Path, spec: VideoSpec, count: int = 3, frames: int = 8) -> Path:
+    """Random clips: four windows of 5 frames in each of 8."""
+    rng = np.random.default_rng(0)
+    video = (frames, spec.height, spec.width)
+    with ShardWriter(folder, kind="frames", spec=spec) as writer:
+        for number in range(count):
+            arrays = {
+                name: rng.integers(0, 256, (*video, 3)).astype(np.uint8)
+                for name in ("truth", "prior", "hands")
+            }
+            arrays["mask"] = np.zeros(video, np.uint8)
+            arrays["first_frame"] = arrays["prior"][0]
+            names = {"video_id": f"clip_{number}", "prompt": f"take cup {number}"}
+            writer.add(arrays, {**names, "extra": {"split": "train"}})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> ShardReader:
+    return ShardReader(write_clips(tmp_path_factory.mktemp("clips"), CONFIG.video))
+
+
+def encode(source: ShardReader, weights: Path, out: Path, **options) -> None:
+    """Twelve windows in three shards of five, five and two."""
+    fixed = {"stride": 1, "batch_size": 2, "shard_windows": 5}
+    cache(CONFIG, weights, source=source, out=out, **{**fixed, **options})
+
+
+@pytest.fixture(scope="module")
+def encoded(source, weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("encoded")
+    encode(source, weights, out)
+    return out
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file but what the run says of its machine."""
+    return {
+        path.name: path.read_bytes() for path in folder.iterdir() if path.name != "environment.json"
+    }
+
+
+def test_every_window_is_a_record_in_order(encoded):
+    reader = ShardReader(encoded)
+    windows = [(record.metadata["video_id"], record.metadata["start"]) for record in reader]
+    assert windows == [(f"clip_{number}", start) for number in range(3) for start in range(4)]
+    assert [shard.records for shard in reader.manifest.shards] == [5, 5, 2]
+    assert reader[0].metadata["extra"] == {"split": "train"}
+    assert not [problem for _, problems in check(encoded) for problem in problems]
+    assert not (encoded / "parts").exists()
+
+
+def test_the_manifest_names_what_made_the_arrays_alone(encoded, source, weights):
+    assert read_manifest(encoded).provenance == {
+        "config": "debug",
+        "source": source.manifest.fingerprint,
+        "encoders": {"vae": hashes(weights)["vae"]},
+    }
+
+
+def test_latents_of_joint_encoders_come_with_their_inputs(encoded):
+    arrays = ShardReader(encoded)[0].arrays
+    assert {name: array.shape for name, array in arrays.items()} == {
+        "truth": (2, 2, 4, 16),
+        "prior": (2, 2, 4, 16),
+        "hands": (2, 2, 4, 16),
+        "mask": (2, 2, 4, 4),
+        "ids": (128,),
+        "ids_mask": (128,),
+        "pixels": (28, 28, 3),
+    }
+
+
+def test_latents_of_frozen_encoders_come_with_their_embeddings(source, weights, tmp_path):
+    cache(FROZEN, weights, source=source, out=tmp_path, stride=4, batch_size=3)
+    arrays = ShardReader(tmp_path)[0].arrays
+    assert (arrays["text"].shape, arrays["image"].shape) == ((128, 64), (5, 32))
+    assert "ids" not in arrays
+    assert read_manifest(tmp_path).provenance["encoders"] == hashes(weights)
+
+
+def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
+    encoded, source, weights, tmp_path, monkeypatch
+):
+    """The first time it ends within the second part."""
+    whole, calls = caching.Encoding.__call__, []
+
+    def failing(self, triplets):
+        calls.append(triplets)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return whole(self, triplets)
+
+    monkeypatch.setattr(caching.Encoding, "__call__", failing)
+    with pytest.raises(KeyboardInterrupt):
+        encode(source, weights, tmp_path)
+    assert not (tmp_path / MANIFEST).exists()
+    assert [path.name for path in (tmp_path / "parts").glob(f"*/{MANIFEST}")] == [MANIFEST]
+    done = len(calls)
+    encode(source, weights, tmp_path)
+    assert len(calls) == done + 3 + 1  # five windows and two, by twos
+    assert contents(tmp_path) == contents(encoded)
+
+
+def test_a_run_killed_while_the_shards_are_put_together_goes_on(
+    encoded, source, weights, tmp_path, monkeypatch
+):
+    def killed(path, value):
+        if path.parent == tmp_path and path.name == MANIFEST:
+            raise KeyboardInterrupt
+        before(path, value)
+
+    before = shards.write_json
+    monkeypatch.setattr(shards, "write_json", killed)
+    with pytest.raises(KeyboardInterrupt):
+        encode(source, weights, tmp_path)
+    monkeypatch.undo()
+    encode(source, weights, tmp_path)
+    assert contents(tmp_path) == contents(encoded)
+
+
+def test_processes_share_the_parts_and_give_the_same_bytes(encoded, source, weights, tmp_path):
+    with pytest.raises(InputError, match=r"1 of 3 parts are not in .*: 00001"):
+        encode(source, weights, tmp_path, process_index=0, process_count=2)
+    encode(source, weights, tmp_path, process_index=1, process_count=2)
+    assert not (tmp_path / MANIFEST).exists()
+    encode(source, weights, tmp_path, process_index=0, process_count=2)
+    assert contents(tmp_path) == contents(encoded)
+
+
+def test_a_finished_folder_is_left_alone(encoded, source, weights, monkeypatch):
+    monkeypatch.setattr(caching, "Encoding", lambda *_: pytest.fail("it encodes"))
+    before = (encoded / MANIFEST).stat().st_mtime_ns
+    encode(source, weights, encoded)
+    assert (encoded / MANIFEST).stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"stride": 2}, "stride: the folder has 1"), ({"shard_windows": 6}, "shard_windows: the")],
+)
+def test_a_folder_of_other_settings_is_refused(encoded, source, weights, options, message):
+    with pytest.raises(InputError, match=message):
+        encode(source, weights, encoded, **options)
+
+
+@pytest.fixture(scope="module")
+def others(weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Other weights."""
+    folder = tmp_path_factory.mktemp("others")
+    tensors = load_file(weights / "vae.safetensors")
+    save_file({name: 2 * tensor for name, tensor in tensors.items()}, folder / "vae.safetensors")
+    return folder
+
+
+def test_a_folder_of_other_encoders_or_clips_is_refused(encoded, source, weights, others, tmp_path):
+    with pytest.raises(InputError, match=r"encoders\.vae: the folder has"):
+        encode(source, others, encoded)
+    clips = ShardReader(write_clips(tmp_path, CONFIG.video, count=2))
+    with pytest.raises(InputError, match="source: the folder has"):
+        encode(clips, weights, encoded)
+
+
+def test_shards_that_were_not_encoded_here_are_refused(source, weights, tmp_path):
+    write_clips(tmp_path, CONFIG.video)
+    with pytest.raises(InputError, match="already holds shards that were not encoded here"):
+        encode(source, weights, tmp_path)
+
+
+def test_what_cannot_be_encoded_is_refused(encoded, source, weights, tmp_path):
+    with pytest.raises(InputError, match="there must be videos or frames, with their truth"):
+        encode(ShardReader(encoded), weights, tmp_path / "a")
+    short = ShardReader(write_clips(tmp_path / "short", CONFIG.video, frames=4))
+    with pytest.raises(InputError, match="record 0 has 4 frames; a window needs 5"):
+        encode(short, weights, tmp_path / "b")
+    with pytest.raises(InputError, match="--batch-size must be at least 1"):
+        encode(source, weights, tmp_path / "c", batch_size=0)
+
+
+def test_a_part_that_lost_its_bytes_is_named(source, weights, tmp_path):
+    encode(source, weights, tmp_path, process_index=1, process_count=2)
+    (part,) = (tmp_path / "parts").glob("*/*.array_record")
+    part.write_bytes(b"")
+    with pytest.raises(InputError, match=r"0 bytes, the manifest says .*remove .*parts/00001"):
+        encode(source, weights, tmp_path, process_index=0, process_count=2)
+    assert not (tmp_path / MANIFEST).exists()
+
+
+def test_shards_fit_the_weights_that_encoded_them(encoded, weights, others):
+    check_encoders(encoded, CONFIG, weights)
+    check_encoders(encoded, CONFIG, None)
+    with pytest.raises(InputError, match=r"(?s)vae: the shards have .*Encode again") as caught:
+        check_encoders(encoded, CONFIG, others)
+    assert hashes(others)["vae"][:16] in str(caught.value)
+
+
+def test_shards_of_another_model_are_refused(encoded, weights):
+    with pytest.raises(InputError, match="config: the shards have debug, this training odd"):
+        check_encoders(encoded, dataclasses.replace(CONFIG, name="odd"), None)
+    with pytest.raises(InputError, match=r"video: .*height=16.*height=64"):
+        check_encoders(encoded, DEBUG, weights)
+
+
+def test_weights_without_a_vae_are_refused(encoded, tmp_path):
+    with pytest.raises(InputError, match=r"vae: the shards have .* none"):
+        check_encoders(encoded, CONFIG, tmp_path)
+
+
+def test_shards_that_do_not_say_who_encoded_them_are_refused(tmp_path):
+    with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video) as writer:
+        writer.add({"truth": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
+    with pytest.raises(InputError, match="does not say which encoders made them"):
+        check_encoders(tmp_path, CONFIG, None)
+
+
+def test_the_command_goes_on_after_a_kill(weights, tmp_path):
+    """Killed when its first part is there."""
+    clips = write_clips(tmp_path / "clips", DEBUG.video, count=6, frames=13)
+    fixed = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
+
+    def arguments(out: Path) -> list[str]:
+        return ["data", "encode", *fixed, "--out", str(out), "--shard-windows", "2"]
+
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "egosim_jax.cli", *arguments(out)]
+    program = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"})
+    try:
+        while program.poll() is None and not (out / "parts" / "00000" / MANIFEST).exists():
+            time.sleep(0.01)
+    finally:
+        program.send_signal(signal.SIGKILL)
+        program.wait()
+    assert not (out / MANIFEST).exists()
+    assert main(arguments(out)) == 0
+    assert main(arguments(tmp_path / "whole")) == 0
+    first, second = read_manifest(out), read_manifest(tmp_path / "whole")
+    assert first == second
+    assert json.loads((out / "config.json").read_text("utf-8"))["config"] == "debug"

@@ -1,0 +1,74 @@
+"""Latents and clips of a tiny model without a mesh and on meshes of 8 devices, to FOLDER/found."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from egosim_jax import configs
+from egosim_jax.generator import Generator, Networks
+from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.sharding import MeshConfig, make_mesh
+from egosim_jax.types import InputError, Triplet, VideoSpec
+
+DEBUG = configs.get("debug")
+# 2 x 2 x 4 tokens and 8 heads, which eight devices divide.
+CONFIG = dataclasses.replace(
+    DEBUG,
+    video=VideoSpec(frames=5, height=32, width=64),
+    dit=WanDiTConfig(dim=64, ffn_dim=96, heads=8, layers=2, text_dim=64, image_dim=32),
+    vae=dataclasses.replace(DEBUG.vae, dim_mult=(1, 1, 1, 1)),
+    steps=2,
+)
+BATCH = 8
+MESHES = {(4, 2, 1): BATCH, (1, 1, 8): 1}
+"""Data, fsdp, context; and how many clips: as many as there is room for, and one on all devices."""
+
+
+def triplet(seed: int) -> Triplet:
+    """Random pictures, so that nothing has to be rendered."""
+    rng = np.random.default_rng(seed)
+    video = CONFIG.video
+    frames = (video.frames, video.height, video.width)
+
+    def draw(*shape: int) -> np.ndarray:
+        return rng.integers(0, 256, shape).astype(np.uint8)
+
+    return Triplet(
+        video_id=f"clip_{seed}",
+        prompt=f"take cup {seed}",
+        prior=draw(*frames, 3),
+        mask=255 * draw(*frames).astype(bool).astype(np.uint8),
+        hands=draw(*frames, 3),
+        first_frame=draw(*frames[1:], 3),
+    )
+
+
+def main(folder: Path) -> None:
+    """Generate the same clips everywhere."""
+    networks = Networks.random(CONFIG, seed=0)
+    head = networks.dit.head.linear.kernel
+    head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)  # not zero
+    networks.save(folder)
+    triplets = [triplet(seed) for seed in range(BATCH)]
+    found = {}
+    for sizes, count in {None: BATCH, **MESHES}.items():
+        mesh = sizes and make_mesh(
+            MeshConfig(**dict(zip(("data", "fsdp", "context"), sizes, strict=True)))
+        )
+        generator = Generator(CONFIG, Networks.load(CONFIG, folder, mesh=mesh), mesh)
+        clips = generator.generate(triplets[:count], range(count))
+        found[f"{sizes} latents"] = np.asarray(generator.latents(triplets[:count], range(count)))
+        found[f"{sizes} frames"] = np.stack([clip.frames for clip in clips])
+    generator = Generator(CONFIG, networks, make_mesh(MeshConfig(data=4, fsdp=2)))
+    try:
+        generator.compile(6)
+    except InputError as error:
+        found["refusal"] = np.array(str(error))
+    np.savez(folder / "found.npz", **found)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

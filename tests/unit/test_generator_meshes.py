@@ -1,0 +1,41 @@
+"""A clip does not depend on the devices that made it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FLAGS = (
+    "--xla_force_host_platform_device_count=8 "
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
+"""Compiling is what takes time here."""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """Everything that `run_generator` computes, in one program that imports jax once."""
+    folder = tmp_path_factory.mktemp("meshes")
+    command = [sys.executable, "-m", "tests.unit.run_generator", str(folder)]
+    environment = os.environ | {"XLA_FLAGS": FLAGS, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "full rematerialization" not in done.stderr
+    return dict(np.load(folder / "found.npz"))
+
+
+def test_clips_of_a_mesh_are_those_of_one_device(found):
+    """In float32: sums are taken in another order."""
+    for mesh in ("(4, 2, 1)", "(1, 1, 8)"):
+        latents, frames = found[f"{mesh} latents"], found[f"{mesh} frames"].astype(int)
+        alone = found["None latents"][: len(latents)]
+        assert np.linalg.norm(latents - alone) / np.linalg.norm(alone) <= 1e-5
+        assert np.abs(frames - found["None frames"][: len(frames)]).max() <= 1
+
+
+def test_a_batch_that_the_mesh_does_not_divide_is_refused(found):
+    assert "A batch of 6 cannot be shared by a mesh of data 4 x fsdp 2" in str(found["refusal"])
