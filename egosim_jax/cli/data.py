@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections import Counter
@@ -79,8 +80,9 @@ class Encode:
     """Encode shards of clips once, so that training reads latents and embeddings.
 
     Every window of a clip becomes a record. The same command goes on where an interrupted one
-    stopped. Several processes with one OUT share the work, each with its own devices. Prints the
-    folder.
+    stopped. Several processes share the work, each with its own devices and all with one OUT: start
+    them with Slurm or Open MPI, or give each JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and
+    JAX_PROCESS_ID. Prints the folder.
     """
 
     config: str
@@ -102,6 +104,17 @@ class Encode:
 
     def run(self) -> int:
         """Encode shard after shard."""
+        from egosim_jax.train.distributed import NAMES, joined
+
+        counts = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
+        tasks = [os.environ.get(name, "1") for name in counts]
+        several = os.environ.keys() & {*NAMES} or any(number != "1" for number in tasks)
+        with joined() if several else contextlib.nullcontext():
+            self._encode()
+        print(self.out)
+        return DONE
+
+    def _encode(self) -> None:
         import jax
 
         from egosim_jax import configs
@@ -120,8 +133,6 @@ class Encode:
             mesh=mesh,
             shard_windows=self.shard_windows,
         )
-        print(self.out)
-        return DONE
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -102,6 +102,8 @@ def test_evaluate_reports_the_generated_clips_beside_the_baselines(generated, cl
         (["--weights", "nowhere"], "--weights"),
         (["--steps", "0"], "--steps must be at least 1"),
         (["--limit", "0"], "--limit must be at least 1"),
+        (["--batch-size", "0"], "--batch-size must be at least 1"),
+        (["--mesh.data", "1000"], "A mesh of data 1000 x fsdp 1 x context 1 does not fit"),
         (["--start", "4"], "fewer than the 13"),
     ],
 )
