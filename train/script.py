@@ -201,6 +201,18 @@ def train(
         writer = opened.enter_context(closing(_writers(training, out, start)))
         watchdog = opened.enter_context(closing(Watchdog(training.patience)))
         rate = learning_rate(training.optimizer, training.steps)
+
+        def check(state: TrainState) -> dict[str, float]:
+            """Means over the batches of the validation."""
+            with clock.phase("validate"), closing(load(validation, training)) as some:
+                rows = [
+                    jax.device_get(validate(state.best, frozen, _to_devices(batch, placed)))
+                    for batch in some
+                ]
+            return {f"validation_{name}": _average(rows, name) for name in rows[0]}
+
+        if validation is not None and start == 0:
+            writer.write(0, check(state))
         pending: dict[int, Mapping[str, jax.Array]] = {}
         before: _LeftOut | None = None
         clock.begin(start)
@@ -226,12 +238,7 @@ def train(
                 writer.write(step, {**numbers, **clock.tick(step, training.steps)})
             if validation is not None and (step % training.validate_every == 0 or last):
                 watchdog.rest()
-                with clock.phase("validate"), closing(load(validation, training)) as some:
-                    rows = [
-                        jax.device_get(validate(state.best, frozen, _to_devices(batch, placed)))
-                        for batch in some
-                    ]
-                writer.write(step, {f"validation_{k}": _average(rows, k) for k in rows[0]})
+                writer.write(step, check(state))
             every = training.sample_every
             if samples is not None and every is not None and (step % every == 0 or last):
                 watchdog.rest()

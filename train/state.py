@@ -13,7 +13,7 @@ from flax import nnx
 from egosim_jax.train.optimizer import OptimizerConfig, make_optimizer
 
 NORM_DECAY = 0.98
-"""Of the mean of gradient norms: it looks back some 50 updates."""
+"""Of the running mean of gradient norms: it looks back some 50 updates."""
 
 
 @no_type_check
@@ -29,7 +29,8 @@ class TrainState:
     moments: Any
     """State of the optax transformation."""
     usual_norm: jax.Array
-    """Mean gradient norm of the last updates that were not left out, float32; 0 before any."""
+    """Geometric mean of the gradient norms of the last updates that were not left out, float32; 0
+    before any."""
     left_out: jax.Array
     """Updates left out in a row, int32."""
     average: nnx.State | None
@@ -60,7 +61,9 @@ class TrainState:
         average: Any = self.average
         if average is not None and config.average is not None:
             average = optax.incremental_update(params, average, 1 - config.average)
-        mixed = NORM_DECAY * self.usual_norm + (1 - NORM_DECAY) * norm
+        # Geometric, so that the spikes that are to be told from it do not move it much.
+        norm = jnp.maximum(norm, jnp.finfo(norm.dtype).tiny)
+        mixed = self.usual_norm**NORM_DECAY * norm ** (1 - NORM_DECAY)
         return TrainState(
             step=self.step + 1,
             params=params,

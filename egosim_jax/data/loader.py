@@ -18,14 +18,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import grain
+import ml_dtypes
 import numpy as np
 from absl import flags
 
-from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.shards import Manifest, ShardReader
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
 
+LATENTS = ("truth", "prior", "hands", "mask")
+"""Arrays of a latents record that are as long and as large as its clip."""
 _THREADS = 4
 
 Example = Mapping[str, np.ndarray]
@@ -130,6 +133,20 @@ class Loader(grain.DatasetIterator):
         self._batches.set_state(state["position"])
 
 
+def _check(arrays: Example, manifest: Manifest) -> None:
+    """Raise `InputError` for a record with numbers that are none, or latents of another length."""
+    for name, array in arrays.items():
+        floating = array.dtype.kind == "f" or array.dtype == ml_dtypes.bfloat16
+        if floating and not np.isfinite(array).all():
+            raise InputError(f"{name} has values that are not finite (NaN or infinity).")
+        if manifest.kind == "latents" and manifest.spec is not None and name in LATENTS:
+            have, want = array.shape[:-1], manifest.spec.latent_shape
+            if have != want:
+                raise InputError(
+                    f"{name} has {have} latent frames, rows and columns; the manifest says {want}."
+                )
+
+
 @dataclass(frozen=True)
 class _Bad:
     """Stands for a record that cannot be read, on its way to be counted."""
@@ -147,7 +164,9 @@ class _Read(grain.transforms.RandomMap):
     def random_map(self, element: int, rng: np.random.Generator) -> Any:
         """The example, or why there is none."""
         try:
-            example = self._transformed(self.source[element].arrays, rng)
+            arrays = self.source[element].arrays
+            _check(arrays, self.source.manifest)
+            example = self._transformed(arrays, rng)
         except InputError as error:
             return _Bad(f"{self.source.name(element)}: {error}")
         return {**example, "record": np.int32(element)}

@@ -173,6 +173,22 @@ def test_too_many_damaged_records_stop_the_run_with_their_names(source, monkeypa
         next(loader)
 
 
+def test_a_record_with_nan_or_latents_of_another_length_is_skipped_and_named(tmp_path):
+    spec = VideoSpec(frames=5, height=16, width=32)
+    latents = np.zeros((*spec.latent_shape, 16), np.float32)
+    nan, longer = latents.copy(), np.concatenate([latents, latents])
+    nan[0, 0, 0, 0] = np.nan
+    with ShardWriter(tmp_path, kind="latents", spec=spec) as writer:
+        for number, truth in enumerate((latents, nan, longer, latents)):
+            writer.add({"truth": truth}, {"video_id": f"clip{number}"})
+    loader = make_loader(ShardReader(tmp_path), batch_size=2, seed=0, shuffle=False)
+    assert numbers(loader, 1) == [[0, 3]]
+    reasons = sorted(loader.skipped)
+    assert "record 1: truth has values that are not finite" in reasons[0]
+    assert "record 2: truth has (4, 2, 4) latent frames, rows and columns" in reasons[1]
+    assert "the manifest says (2, 2, 4)" in reasons[1]
+
+
 def test_a_mistake_in_a_transform_is_not_taken_for_a_bad_record(source):
     loader = make_loader(source, batch_size=4, seed=0, transform=lambda arrays: arrays["typo"])
     with pytest.raises(KeyError, match="typo"):

@@ -64,3 +64,14 @@ def test_a_value_that_cannot_be_written_leaves_the_old_file(tmp_path: Path):
     with pytest.raises(RecursionError):
         write_json(path, circular)
     assert json.loads(path.read_text("utf-8")) == {"a": 1}
+
+
+def test_what_may_differ_may_and_is_recorded(tmp_path):
+    open_folder(tmp_path, {"training": {"mesh": {"fsdp": 8}, "meshes": 1, "seed": 0}})
+    changed = {"training": {"mesh": {"fsdp": 4}, "meshes": 1, "seed": 0}}
+    open_folder(tmp_path, changed, may_differ=["training.mesh"])
+    assert json.loads((tmp_path / "config.json").read_text("utf-8")) == changed
+    other = {"training": {"mesh": {"fsdp": 2}, "meshes": 2, "seed": 0}}
+    with pytest.raises(InputError, match=r"training\.meshes") as refused:
+        open_folder(tmp_path, other, may_differ=["training.mesh"])
+    assert "mesh.fsdp" not in str(refused.value)

@@ -1,0 +1,110 @@
+"""A line fitted to points: a task that compiles in a moment, to test what surrounds any task.
+
+As a program: OUT DATA and JSON of the fields of `Training`, with `hang` a step that never ends.
+"""
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from egosim_jax.command import DONE, guarded
+from egosim_jax.data.shards import ShardWriter
+from egosim_jax.models.layers import Linear
+from egosim_jax.sharding import MeshConfig
+from egosim_jax.train.distributed import joined
+from egosim_jax.train.optimizer import OptimizerConfig
+from egosim_jax.train.script import Training, train
+
+WIDTH, POINTS = 8, 40
+
+
+@dataclass(frozen=True)
+class Line:
+    """Squared error of `x @ kernel + bias`; `ids` tells which records a batch has, in order."""
+
+    pause: float = 0.0
+    hang: int = -1
+    """Number of the record at which reading never ends."""
+    frozen_dtype: str = "float32"
+    trained: Any = nnx.Param
+
+    def networks(self, rngs: nnx.Rngs) -> Linear:
+        return Linear(4, WIDTH, axes=(None, "embed"), rngs=rngs)
+
+    def examples(self):
+        def read(arrays):
+            time.sleep(1e6 if arrays["number"].item() == self.hang else self.pause)
+            return arrays
+
+        return read if self.pause or self.hang >= 0 else None
+
+    def keys(self, key, batch):
+        return jax.random.split(key, batch)
+
+    def loss(self, networks, batch, keys):
+        noise = jax.vmap(lambda key: jax.random.normal(key, (4,)))(keys)
+        error = networks(batch["x"] + 0.01 * noise) - batch["y"]
+        places = jnp.arange(1.0, len(batch["record"]) + 1)
+        return jnp.square(error).mean(), {"ids": (places * batch["record"]).mean()}
+
+    def validate(self, networks, batch):
+        return {"loss": jnp.square(networks(batch["x"]) - batch["y"]).mean()}
+
+    def flops(self, batch):
+        return 6.0 * 4 * WIDTH * len(batch["x"])
+
+
+def write_points(folder: Path, *, huge: tuple[int, ...] = (), factor: float = 1e30) -> Path:
+    """Points of a line with some noise; those that are `huge` are far from it."""
+    rng = np.random.default_rng(0)
+    kernel = rng.normal(size=(4, WIDTH))
+    with ShardWriter(folder, kind="latents") as writer:
+        for number in range(POINTS):
+            x = rng.normal(size=4).astype(np.float32)
+            y = (x @ kernel + 0.1 * rng.normal(size=WIDTH)).astype(np.float32)
+            y = y * np.float32(factor) if number in huge else y
+            arrays = {"x": x, "y": y, "number": np.array(number, np.int32)}
+            writer.add(arrays, {"video_id": f"point_{number}"})
+    return folder
+
+
+def training(**changes: Any) -> Training:
+    """A short run that saves often."""
+    optimizer = OptimizerConfig(learning_rate=0.05, **changes.pop("optimizer", {}))
+    fields = {"steps": 20, "batch_size": 8, "log_every": 1, "save_every": 5, "validate_every": 100}
+    return Training(**{**fields, "optimizer": optimizer, **changes})
+
+
+def lines(out: Path) -> list[dict[str, float]]:
+    """The log, without what is told by a clock."""
+    told = ("seconds", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
+    return [
+        {name: value for name, value in json.loads(line).items() if name not in told}
+        for line in (out / "metrics.jsonl").read_text("utf-8").splitlines()
+    ]
+
+
+def main(out: str, data: str, changes: str) -> int:
+    """Train as the commands do."""
+    settings = json.loads(changes)
+    settings["mesh"] = MeshConfig(**settings.pop("mesh", {}))
+    task = Line(pause=settings.pop("pause", 0.0), hang=settings.pop("hang", -1))
+
+    def run() -> int:
+        with joined():
+            train(task, training(**settings), data=Path(data), validation=None, out=Path(out))
+        return DONE
+
+    return guarded(run)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
