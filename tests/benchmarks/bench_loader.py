@@ -1,0 +1,250 @@
+"""Our loader beside torch's, over the same shards, and how long training waits for it.
+
+Samples a second, in batches of 8, of two kinds of shards:
+
+    videos    files as mp4, of which a window of 17 frames of 160 x 96 is decoded: truth, prior,
+              hands, mask, and the first frame
+    latents   arrays that are read as they are, a training step's input
+
+Theirs is a `DataLoader` over the same reader with the same transform, and with as many worker
+processes. Without any, ours prepares examples in four threads, ahead of the caller; theirs in the
+caller's own, when asked. The loaders take turns, so that a busy neighbour slows both, and each
+round gives one ratio, ours to theirs. What a loader had prepared while the other's turn lasted is
+thrown away first.
+
+Then the `tabletop` model is trained on the latents, as the trainer does it: the next batch is asked
+for while the devices are at work.
+
+Without folders, small ones are made: of clips of the tabletop world, and of random latents, since
+what they hold does not change how they are read.
+
+    python -m tests.benchmarks.bench_loader [--videos FOLDER] [--latents FOLDER]
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import tyro
+
+from egosim_jax.data.loader import make_loader
+from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.data.transforms import DecodeWindow
+
+if TYPE_CHECKING:
+    from egosim_jax.generator import ModelConfig
+
+BATCH = 8
+CLIPS, LATENTS = 16, 256
+"""Records that are made, if no folders are given."""
+GOAL = 0.01
+"""Share of a training step that may be spent waiting for data."""
+
+
+class Prepared(NamedTuple):
+    """Loaders over one folder, ours and theirs, as endless iterators of batches."""
+
+    ours: Iterator[Any]
+    theirs: Iterator[Any]
+
+
+def main(
+    videos: Path | None = None,
+    latents: Path | None = None,
+    seconds: float = 2.0,
+    rounds: int = 5,
+    workers: tuple[int, ...] = (0, 2),
+    steps: int = 30,
+) -> None:
+    """Time both loaders, then training.
+
+    Args:
+        videos: Folder of shards of videos, at least 17 frames long; made if not given.
+        latents: Folder of shards of latents of the model `tabletop`; made if not given.
+        seconds: How long a loader's turn lasts.
+        rounds: Turns of each.
+        workers: Numbers of worker processes to try; 0 for none.
+        steps: Training steps.
+    """
+    if min(seconds, rounds, steps) <= 0:
+        raise SystemExit("--seconds, --rounds and --steps must be positive.")
+    from egosim_jax import configs
+
+    config = configs.get("tabletop")
+    with TemporaryDirectory() as folder:
+        sources = {
+            "videos": ShardReader(videos or make_videos(config, Path(folder))),
+            "latents": ShardReader(latents or make_latents(config, Path(folder))),
+        }
+        decode = {"videos": DecodeWindow(config.video), "latents": None}
+        for name, source in sources.items():
+            for count in workers:
+                compare(f"{name}, {count} workers", source, decode[name], count, seconds, rounds)
+        report_waiting(config, sources["latents"], steps)
+
+
+def compare(
+    name: str,
+    source: ShardReader,
+    transform: DecodeWindow | None,
+    workers: int,
+    seconds: float,
+    rounds: int,
+) -> None:
+    """Let both loaders take turns, and print samples a second and their ratio."""
+    ours = make_loader(source, batch_size=BATCH, seed=0, workers=workers, transform=transform)
+    with closing(ours):
+        loaders = Prepared(ours, iter(their_loader(source, transform, workers)))
+        ready = 2 * workers + 2  # batches that either may hold
+        speeds = []
+        for turn in range(rounds):
+            order = reversed(loaders) if turn % 2 else loaders
+            found = [samples_per_second(loader, seconds, ready) for loader in order]
+            speeds.append(found[::-1] if turn % 2 else found)
+    ratios = [ours / theirs for ours, theirs in speeds]
+    print(
+        f"{name}: ours {median(ours for ours, _ in speeds):.1f} samples/s, "
+        f"torch {median(theirs for _, theirs in speeds):.1f}, "
+        f"ratio {median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}] ({rounds} rounds)",
+        flush=True,
+    )
+
+
+def samples_per_second(batches: Iterator[Any], seconds: float, ready: int) -> float:
+    """Speed over the first whole batches that last so long, after those that were ready."""
+    for _ in range(ready):
+        next(batches)
+    start, samples = time.perf_counter(), 0
+    while (elapsed := time.perf_counter() - start) < seconds:
+        next(batches)
+        samples += BATCH
+    return samples / elapsed
+
+
+@dataclass(frozen=True)
+class TheirDataset:
+    """Records of a folder for torch's `DataLoader`."""
+
+    source: ShardReader
+    transform: DecodeWindow | None
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: int) -> Any:
+        arrays = self.source[index].arrays
+        if self.transform is None:
+            return arrays
+        return self.transform.random_map(arrays, np.random.default_rng())
+
+
+def their_loader(source: ShardReader, transform: DecodeWindow | None, workers: int) -> Any:
+    """torch's loader, endless; its workers are spawned, since a forked jax may hang."""
+    from torch.utils.data import DataLoader, RandomSampler
+
+    dataset = TheirDataset(source, transform)
+    return DataLoader(
+        dataset,
+        batch_size=BATCH,
+        sampler=RandomSampler(dataset, replacement=True, num_samples=2**40),
+        num_workers=workers,
+        multiprocessing_context="spawn" if workers else None,
+        collate_fn=stacked,
+    )
+
+
+def stacked(examples: list[dict[str, np.ndarray]]) -> dict[str, Any]:
+    """A batch of tensors, which torch's workers share instead of copying."""
+    import torch
+
+    return {
+        name: torch.from_numpy(np.stack([example[name] for example in examples]))
+        for name in examples[0]
+    }
+
+
+def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None:
+    """Train, and print which share of the time went into waiting for batches."""
+    import jax
+    from flax import nnx
+
+    from egosim_jax.diffusion.objective import Objective
+    from egosim_jax.train.denoiser import Denoising
+    from egosim_jax.train.optimizer import OptimizerConfig
+    from egosim_jax.train.state import TrainState
+    from egosim_jax.train.step import make_update
+
+    task = Denoising(model=config, objective=Objective(schedule=config.schedule))
+    graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)
+    optimizer = OptimizerConfig(rule="muon")
+    update = jax.jit(make_update(task, graph, optimizer, steps=steps, seed=0), donate_argnums=0)
+    state = TrainState.create(params, optimizer, steps)
+    with closing(make_loader(source, batch_size=BATCH, seed=0)) as batches:
+        state, before = update(state, frozen, jax.device_put(next(batches)))
+        jax.block_until_ready(state)
+        start, waited = time.perf_counter(), 0.0
+        for _ in range(steps):
+            asked = time.perf_counter()
+            examples = next(batches)
+            waited += time.perf_counter() - asked
+            state, metrics = update(state, frozen, jax.device_put(examples))
+            jax.block_until_ready(before)
+            before = metrics
+        jax.block_until_ready(state)
+        total = time.perf_counter() - start
+    print(
+        f"training: {waited / total:.3%} of {steps} steps of {total / steps:.2f} s waiting for "
+        f"data ({1000 * waited / steps:.2f} ms a step); "
+        f"goal below {GOAL:.0%}: {'met' if waited < GOAL * total else 'MISSED'}"
+    )
+
+
+def make_videos(config: ModelConfig, folder: Path) -> Path:
+    """Shards of clips of the tabletop world as mp4, two windows long."""
+    from egosim_jax.data.clips import write_clips
+    from egosim_jax.data.metadata import read_metadata
+    from egosim_jax.data.pack import pack
+    from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+
+    spec = replace(config.video, frames=2 * config.video.frames - 1)
+    clips = (next(make_sequence(seed, spec=spec)) for seed in range(CLIPS))
+    table = write_clips(folder / "clips", (to_triplet(clip) for clip in clips), fps=spec.fps)
+    out = folder / "videos"
+    for problem in pack(read_metadata(table), out=out, spec=None, provenance={}):
+        if problem:
+            raise SystemExit(problem)
+    return out
+
+
+def make_latents(config: ModelConfig, folder: Path) -> Path:
+    """Shards of random latents and encoders' inputs."""
+    rng = np.random.default_rng(0)
+    shape, tokens = config.video.latent_shape, config.tokenizer.max_tokens
+    size = config.image.image_size
+    out = folder / "latents"
+    with ShardWriter(out, kind="latents", spec=config.video) as writer:
+        for number in range(LATENTS):
+            videos = {
+                name: rng.standard_normal((*shape, config.vae.z_dim), np.float32)
+                for name in ("truth", "prior", "hands")
+            }
+            others = {
+                "mask": rng.integers(0, 2, (*shape, 4), np.uint8),
+                "ids": rng.integers(0, config.text.vocab, tokens, np.int32),
+                "ids_mask": np.arange(tokens) < rng.integers(1, tokens),
+                "pixels": rng.standard_normal((size, size, 3), np.float32),
+            }
+            writer.add({**videos, **others}, {"video_id": str(number), "prompt": "", "extra": {}})
+    return out
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
