@@ -1,0 +1,82 @@
+"""Killing `run_tiny` and starting it again."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+"""Compiling is what takes time in these runs."""
+
+
+class Run:
+    """The processes of a run of `run_tiny`, one after the other."""
+
+    def __init__(self, data: Path, out: Path, *, steps: int, save_every: int, processes: int = 1):
+        self.out, self.processes = out, processes
+        program = [sys.executable, "-m", "tests.training.run_tiny"]
+        self.command = [*program, str(data), str(out), str(steps), str(save_every)]
+
+    def start(self) -> list[subprocess.Popen]:
+        """Start it, or let it go on."""
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            address = f"127.0.0.1:{free.getsockname()[1]}"
+        started = []
+        for index in range(self.processes):
+            environment = os.environ | {"XLA_FLAGS": QUICK}
+            if self.processes > 1:
+                environment |= {
+                    "JAX_COORDINATOR_ADDRESS": address,
+                    "JAX_NUM_PROCESSES": str(self.processes),
+                    "JAX_PROCESS_ID": str(index),
+                }
+            with (self.out.parent / f"{self.out.name}_{index}.log").open("a") as log:
+                started.append(
+                    subprocess.Popen(
+                        self.command, cwd=ROOT, env=environment, stdout=log, stderr=log
+                    )
+                )
+        return started
+
+    def finish(self) -> None:
+        """Let it run to its end."""
+        codes = [process.wait(timeout=900) for process in self.start()]
+        assert codes == [0] * self.processes, self.said()
+
+    def kill_when(self, ready: Callable[[], bool]) -> bool:
+        """Start it and kill all processes as soon as `ready`; whether it was before its end."""
+        started = self.start()
+        deadline = time.monotonic() + 900
+        while not ready() and all(process.poll() is None for process in started):
+            assert time.monotonic() < deadline, self.said()
+            time.sleep(0.002)
+        killed = all(process.poll() is None for process in started)
+        for process in started:
+            process.kill()
+            process.wait()
+        return killed
+
+    def lines(self) -> list[dict[str, float]]:
+        """The log, without what is told by a clock; a line that a kill cut off is not one yet."""
+        path = self.out / "metrics.jsonl"
+        told = ("seconds", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
+        text = path.read_text("utf-8") if path.exists() else ""
+        return [
+            {name: value for name, value in json.loads(line).items() if name not in told}
+            for line in text.splitlines(keepends=True)
+            if line.endswith("\n")
+        ]
+
+    def is_saving(self) -> bool:
+        """Whether a checkpoint is half written."""
+        return any((self.out / "checkpoints").glob("*tmp*"))
+
+    def said(self) -> str:
+        """What the first process printed last."""
+        return (self.out.parent / f"{self.out.name}_0.log").read_text("utf-8")[-3000:]
