@@ -1,4 +1,4 @@
-"""Loss, gradients and 20 updates of a tiny model on a mesh: DATA FSDP CONTEXT OUT.npz."""
+"""Loss, gradients and 20 updates of a tiny model on a mesh: DATA FSDP CONTEXT PARTS OUT.npz."""
 
 import dataclasses
 import sys
@@ -48,7 +48,7 @@ def batch(seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def main(data: int, fsdp: int, context: int, out: str) -> None:
+def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
     """Compute and write everything that must not depend on the mesh."""
     mesh = make_mesh(MeshConfig(data=data, fsdp=fsdp, context=context))
     config = OptimizerConfig(learning_rate=1e-3)
@@ -83,7 +83,7 @@ def main(data: int, fsdp: int, context: int, out: str) -> None:
         )
         value, gradients = gradient(state.params, put(0))
         update = jax.jit(
-            make_update(TASK, graph, config, steps=STEPS, seed=0),
+            make_update(TASK, graph, config, steps=STEPS, seed=0, accumulate=parts),
             in_shardings=(sharding, None, placed),
             out_shardings=(sharding, None),
         )
@@ -99,4 +99,4 @@ def main(data: int, fsdp: int, context: int, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:4]), sys.argv[4])
+    main(*map(int, sys.argv[1:5]), sys.argv[5])

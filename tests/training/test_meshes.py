@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.training.killing import QUICK
+
 ROOT = Path(__file__).parents[2]
-MESHES = [(1, 8, 1), (4, 2, 1), (1, 4, 2), (2, 2, 2)]
-"""Data, fsdp, context."""
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-"""Compiling is what takes time here."""
+MESHES = [(1, 8, 1, 1), (4, 2, 1, 1), (1, 4, 2, 2), (2, 2, 2, 1)]
+"""Data, fsdp, context, and parts in which a batch is taken."""
 
 
-def run(mesh: tuple[int, int, int], out: Path) -> tuple[dict[str, np.ndarray], str]:
+def run(mesh: tuple[int, int, int, int], out: Path) -> tuple[dict[str, np.ndarray], str]:
     """The numbers of a mesh, and what the compiler said."""
-    flags = f"--xla_force_host_platform_device_count={np.prod(mesh)} {QUICK}"
+    flags = f"--xla_force_host_platform_device_count={np.prod(mesh[:3])} {QUICK}"
     command = [sys.executable, "-m", "tests.training.run_mesh", *map(str, mesh), str(out)]
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -27,7 +27,7 @@ def run(mesh: tuple[int, int, int], out: Path) -> tuple[dict[str, np.ndarray], s
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
-    return run((1, 1, 1), tmp_path_factory.mktemp("mesh") / "alone.npz")[0]
+    return run((1, 1, 1, 1), tmp_path_factory.mktemp("mesh") / "alone.npz")[0]
 
 
 @pytest.mark.parametrize("mesh", MESHES, ids=str)

@@ -1,0 +1,74 @@
+"""FLOPs: the known count of the 14B, what the compiler counts, and MFU from them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
+from egosim_jax.train.clock import Clock
+from egosim_jax.train.denoiser import Denoising
+from egosim_jax.train.flops import count_forward, peak
+
+
+def test_a_forward_of_the_14b_takes_1126_tflop():
+    """Counted by hand from the published architecture, for 61 frames of 832 x 480."""
+    model = configs.get("egosim_14b")
+    flops = count_forward(model.dit, latents=model.video.latent_shape, text=512, image=257)
+    assert flops.total == pytest.approx(1126.17e12, rel=1e-5)
+    assert flops.attention == pytest.approx((510.363 + 10.469 + 5.255) * 1e12, rel=1e-4)
+
+
+@pytest.mark.parametrize("image", [0, 5])
+def test_the_count_is_the_compilers_of_a_small_network(image):
+    """Which counts norms and activations, too: a few percent at this width."""
+    config = WanDiTConfig(
+        dim=256, ffn_dim=512, heads=2, layers=1, text_dim=64, image_dim=64 if image else None
+    )
+    latents, text = (2, 16, 16), 16
+    networks = nnx.eval_shape(lambda: WanDiT(config, rngs=nnx.Rngs(0)))
+    graph, params = nnx.split(networks)
+    shapes = [(1, *latents, 52), (1,), (1, text, 64), *([(1, image, 64)] if image else [])]
+    given = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    program = jax.jit(lambda params, *args: nnx.merge(graph, params)(*args))
+    counted = program.lower(params, *given).cost_analysis()["flops"]
+    ours = count_forward(config, latents=latents, text=text, image=image).total
+    assert ours == pytest.approx(counted, rel=0.06)
+
+
+def test_an_update_takes_three_forwards_and_a_loras_spares_the_gradients_of_weights():
+    model = configs.get("debug")
+    batch = {"truth": jnp.zeros((3, 1))}
+    whole, low = Denoising(model=model).flops(batch), Denoising(model=model, rank=2).flops(batch)
+    tokens = {"text": model.tokenizer.max_tokens, "image": 5}
+    forward = count_forward(model.dit, latents=model.video.latent_shape, **tokens)
+    assert whole == pytest.approx(9 * forward.total)
+    assert whole - low == pytest.approx(3 * forward.weights)
+
+
+def test_devices_are_known_by_the_beginning_of_their_kind():
+    assert peak("NVIDIA H100 80GB HBM3") == peak("NVIDIA H200") == 989.4e12
+    assert peak("TPU v5 lite") == 197e12
+    assert np.isnan(peak("cpu"))
+
+
+def test_rates_are_of_steps_with_their_waits(monkeypatch):
+    now = iter(np.arange(0.0, 100.0))
+    monkeypatch.setattr("time.monotonic", lambda: next(now))
+    monkeypatch.setattr(
+        "jax.devices", lambda: [dataclasses.make_dataclass("D", ["device_kind"])("NVIDIA H100")]
+    )
+    clock = Clock(flops=989.4e12)
+    clock.begin(10)
+    for phase in ("data", "step", "data", "step", "validate"):
+        with clock.phase(phase):
+            pass
+    numbers = clock.tick(12, 132)
+    assert numbers["seconds"] == 2.0
+    assert numbers["waiting"] == 0.5
+    assert numbers["mfu"] == pytest.approx(0.5)
+    assert numbers["minutes_left"] == 4.0
