@@ -14,6 +14,7 @@ from egosim_jax.train.script import Training
 
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
+    from egosim_jax.train.denoiser import Denoiser
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +54,7 @@ class FineTuning:
 
     def run(self) -> int:
         """Check the latents, train, write the weights."""
-        import jax
-
         from egosim_jax.diffusion.objective import Objective
-        from egosim_jax.io import weights
-        from egosim_jax.models import lora
         from egosim_jax.train.cache import check_encoders
         from egosim_jax.train.denoiser import Denoising
         from egosim_jax.train.samples import Samples
@@ -82,20 +79,7 @@ class FineTuning:
             samples=self.validation
             and Samples(model=model, latents=self.validation, vae=self.weights, count=self.samples),
         )
-        if self.rank is not None:
-            path, deltas = self.out / "lora.safetensors", lora.deltas_of(trained.dit)
-            base = weights.hashes(self.weights)["dit"]
-            if jax.process_index() == 0:
-                tensors = lora.tensors(deltas)
-                weights.write(path, tensors, about=lora.about(self.config, base=base))
-            print(path)
-            return DONE
-        folder = self.out / "weights"
-        for name, network in trained.parts().items():
-            weights.save(folder / f"{name}.safetensors", network, dtype=model.dit.dtype)
-        if jax.process_index() == 0:
-            weights.link_others(folder, self.weights)
-        print(folder)
+        print(write_trained(trained, self.out, model=model, start=self.weights))
         return DONE
 
     def _model(self) -> ModelConfig:
@@ -105,3 +89,27 @@ class FineTuning:
         model = configs.get(self.config).at(self.weights)
         given = {name: value for name, value in changes.items() if value is not None}
         return replace(model, dit=replace(model.dit, **given))
+
+
+def write_trained(trained: Denoiser, out: Path, *, model: ModelConfig, start: Path) -> Path:
+    """Write OUT/lora.safetensors, if that was trained, or OUT/weights, which is then complete.
+
+    `start` is the weights folder that a LoRA is for, or that has the networks that stayed. All
+    processes call this alike.
+    """
+    import jax
+
+    from egosim_jax.io import weights
+    from egosim_jax.models import lora
+
+    if deltas := lora.deltas_of(trained.dit):
+        path, base = out / "lora.safetensors", weights.hashes(start)["dit"]
+        if jax.process_index() == 0:
+            weights.write(path, lora.tensors(deltas), about=lora.about(model.name, base=base))
+        return path
+    folder = out / "weights"
+    for name, network in trained.parts().items():
+        weights.save(folder / f"{name}.safetensors", network, dtype=model.dit.dtype)
+    if jax.process_index() == 0:
+        weights.link_others(folder, start)
+    return folder

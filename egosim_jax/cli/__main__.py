@@ -15,6 +15,7 @@ from egosim_jax.cli.accuracy import Update
 from egosim_jax.cli.continuous import Continuous
 from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
 from egosim_jax.cli.doctor import Doctor
+from egosim_jax.cli.embodiment import Embodiment
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
@@ -48,6 +49,7 @@ class Experiment:
         Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
         | Annotated[Continuous, tyro.conf.subcommand("continuous")]
         | Annotated[Update, tyro.conf.subcommand("update")]
+        | Annotated[Embodiment, tyro.conf.subcommand("embodiment")]
         | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
         | Annotated[Debug, tyro.conf.subcommand("debug")]
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 Measures = Mapping[str, tuple[str, str]]
 """By name: what a table calls it, and its format."""
 Line = Mapping[str, Mapping[str, float]]
-"""Mean and spread of each measure."""
+"""Mean and spread of each measure; what was measured once has no spread."""
 
 
 def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
@@ -34,15 +34,19 @@ def summarise(found: Sequence[Mapping[str, float]], measures: Measures) -> Line:
 def print_table(
     first: str, rows: Mapping[str, Line], measures: Measures, *, title: str | None = None
 ) -> None:
-    """Print a row for each line, mean ± spread; `first` heads the column of their names."""
+    """Print a row for each line, mean ± spread; `first` heads the column of their names.
+
+    What a line has not measured stays empty.
+    """
     from rich.console import Console
     from rich.table import Table
 
     shown = Table(first, *(name for name, _ in measures.values()), title=title)
     for row, line in rows.items():
-        cells = []
-        for name, (_, form) in measures.items():
-            mean, spread = (form.format(line[name][key]) for key in ("mean", "spread"))
-            cells.append(f"{mean} ± {spread}")
+        cells = (_cell(line.get(name, {}), form) for name, (_, form) in measures.items())
         shown.add_row(row, *cells)
     Console(width=140).print(shown)
+
+
+def _cell(value: Mapping[str, float], form: str) -> str:
+    return " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)

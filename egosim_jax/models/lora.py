@@ -76,7 +76,7 @@ def tensors(deltas: Mapping[str, Delta]) -> dict[str, np.ndarray]:
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Delta]:
     """The inverse of `tensors`. Raises `InputError` naming what is of no pair."""
-    paths = {name.removesuffix(".down").removesuffix(".up") for name in tensors}
+    paths = {name.rpartition(".")[0] for name in tensors}
     pairs = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
     if odd := sorted(pairs ^ tensors.keys()):
         raise InputError(f"The LoRA has no pairs of down and up of {', '.join(odd)}.")

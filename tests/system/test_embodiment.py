@@ -1,0 +1,113 @@
+"""The cross-embodiment experiment, from clips to its table, in its smallest size."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from safetensors.numpy import load_file
+
+from egosim_jax import configs
+from egosim_jax.cli.__main__ import main
+from egosim_jax.generator import Networks
+
+MODELS = {"people", "full", "lora", "scratch"}
+ALIKE = {"steps": 2, "batch-size": 2, "warmup": 1, "learning-rate": 0.01}
+
+
+def experiment(run: Path, *more: str) -> list[str]:
+    fixed = ["--config", "debug", "--weights", str(run.parent / "weights"), "--out", str(run)]
+    counts = ["--human-scenes", "2", "--robot-scenes", "2", "--held-out", "2", "--batch-size", "2"]
+    stages = [str(x) for model in MODELS for k, v in ALIKE.items() for x in (f"--{model}.{k}", v)]
+    return ["experiment", "embodiment", *fixed, *counts, "--rank", "2", *stages, *more]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("embodiment")
+    Networks.random(configs.get("debug"), seed=1).save(folder / "weights")
+    assert main(experiment(folder / "run")) == 0
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def report(run: Path) -> dict:
+    return json.loads((run / "report.json").read_text("utf-8"))
+
+
+def test_there_is_a_line_for_each_model_and_for_what_needs_none(report):
+    others = {"prior copied", "first frame repeated", "truth through the autoencoder"}
+    assert report["table"].keys() == MODELS | others
+    assert all(line["psnr"]["mean"] > 0 for line in report["table"].values())
+
+
+def test_validation_losses_are_finite_before_and_after(report):
+    for name in MODELS:
+        steps = report["validation"][name]
+        assert all(map(math.isfinite, steps.values()))
+        line = report["table"][name]
+        assert line["before"]["mean"] == steps["0"]
+        assert line["after"]["mean"] == steps["2"]
+
+
+def test_robots_trainings_start_from_the_peoples_model(report):
+    line = report["table"]
+    for name in ("full", "lora"):
+        assert line[name]["before"]["mean"] == pytest.approx(line["people"]["after"]["mean"])
+    assert line["scratch"]["before"]["mean"] == pytest.approx(line["people"]["before"]["mean"])
+
+
+def test_every_scene_belongs_to_one_split(run):
+    plans = {split: run / "frames" / split / "config.json" for split in ("human", "robot")}
+    plans["held_out"] = run / "frames" / "held_out" / "config.json"
+    made = {name: json.loads(path.read_text("utf-8")) for name, path in plans.items()}
+    assert [made[name]["kind"] for name in made] == ["human", "robot", "robot"]
+    seeds = [seed for plan in made.values() for seed in plan["seeds"]]
+    assert sorted(seeds) == list(range(5000, 5006))
+
+
+def test_the_weights_of_each_model_are_complete(run):
+    config = configs.get("debug")
+    for name in MODELS - {"lora"}:
+        Networks.load(config, run / name / "weights")
+    assert load_file(run / "lora" / "lora.safetensors")
+    assert not (run / "lora" / "weights").exists()
+
+
+def test_the_sheet_has_a_row_for_each_model_between_conditions_and_truth(run):
+    with Image.open(run / "contact_sheet.png") as sheet:
+        assert sheet.size == (6 * 96, 2 * (16 + 7 * 64))
+    assert (run / "curves.png").exists()
+
+
+def test_started_again_it_trains_nothing_and_reports_the_same(run, report, capsys, monkeypatch):
+    for name in ("train.script.train", "generator.Generator.generate"):
+        monkeypatch.setattr(f"egosim_jax.{name}", lambda *_, **__: pytest.fail("it was done"))
+    (run / "report.json").unlink()
+    assert main(experiment(run)) == 0
+    assert json.loads((run / "report.json").read_text("utf-8")) == report
+    said = capsys.readouterr().out
+    assert "then a LoRA: training on robots" in said
+    assert "robots alone" in said
+
+
+def test_a_stage_that_was_lost_is_made_again_alike(run):
+    path = run / "lora" / "lora.safetensors"
+    before = load_file(path)
+    path.unlink()
+    assert main(experiment(run)) == 0
+    again = load_file(path)
+    assert again.keys() == before.keys()
+    assert all((again[name] == before[name]).all() for name in before)
+
+
+def test_another_config_is_refused(run, capsys):
+    assert main(experiment(run, "--lora.learning-rate", "0.5")) == 2
+    assert "experiment.lora.learning_rate" in capsys.readouterr().err
+
+
+def test_a_stage_that_cannot_be_is_refused_before_clips_are_made(tmp_path, capsys):
+    assert main(experiment(tmp_path / "run", "--scratch.learning-rate", "-1")) == 2
+    assert "learning_rate must be positive" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
