@@ -12,7 +12,9 @@ import json
 import logging
 import shutil
 import sys
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,7 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, *, keep: int = 2, keep_every: int | None = None):
-        logging.getLogger("absl").setLevel(logging.WARNING)
+        logging.getLogger("absl").setLevel(logging.CRITICAL)  # what goes wrong is raised, too
         self.folder, self.keep = folder.absolute(), keep
         policies = ocp.training.preservation_policies
         preserve: Any = [policies.LatestN(keep)]
@@ -77,19 +79,26 @@ class Checkpoints:
         Raises what `wait` raises, of the save before.
         """
         self.wait()
-        response = self._checkpointer.save_checkpointables_async(step, {STATE: state, DATA: data})
+        with self._explained(step):
+            saved = {STATE: state, DATA: data}
+            response = self._checkpointer.save_checkpointables_async(step, saved)
         if response is not None:
             self._saving = step, self._thread.submit(self._seal, step, response)
 
     def wait(self) -> None:
         """Wait until the last save is on disk. Raises `InputError` if the disk is full."""
-        if self._saving is None:
-            return
-        (step, saving), self._saving = self._saving, None
+        if self._saving is not None:
+            (step, saving), self._saving = self._saving, None
+            with self._explained(step):
+                saving.result()
+
+    @contextmanager
+    def _explained(self, step: int) -> Iterator[None]:
+        """Say of a full disk what was not saved, and what stands."""
         try:
-            saving.result()
+            yield
         except Exception as error:
-            if "No space left" not in str(error):
+            if not any("No space left" in str(cause) for cause in _causes(error)):
                 raise
             kept = max((kept for kept in self.steps if kept < step), default=None)
             stands = "there is none before it" if kept is None else f"that of step {kept} stands"
@@ -126,7 +135,8 @@ class Checkpoints:
             self.wait()
         finally:
             self._thread.shutdown()
-            self._checkpointer.close()
+            with suppress(OSError, ValueError):  # the failure of a save, which was raised before
+                self._checkpointer.close()
 
     def _seal(self, step: int, response: Any) -> None:
         """Once the checkpoint is whole, write the hashes of its files into it."""
@@ -192,6 +202,12 @@ class Checkpoints:
                 f"The checkpoint of step {step} in {self.folder} is of another model or "
                 f"optimiser. Use its config, or another --out:\n{listing}"
             )
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def _files(folder: Path) -> dict[str, Path]:
