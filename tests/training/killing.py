@@ -18,7 +18,7 @@ class Run:
     """The processes of a run of `run_tiny`, one after the other."""
 
     def __init__(self, data: Path, out: Path, *, steps: int, save_every: int, processes: int = 1):
-        self.out, self.processes = out, processes
+        self.out, self.processes, self.began = out, processes, 0.0
         program = [sys.executable, "-m", "tests.training.run_tiny"]
         self.command = [*program, str(data), str(out), str(steps), str(save_every)]
 
@@ -27,7 +27,7 @@ class Run:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"
-        started = []
+        started, self.began = [], time.time()
         for index in range(self.processes):
             environment = os.environ | {"XLA_FLAGS": QUICK}
             if self.processes > 1:
@@ -74,8 +74,9 @@ class Run:
         ]
 
     def is_saving(self) -> bool:
-        """Whether a checkpoint is half written."""
-        return any((self.out / "checkpoints").glob("*tmp*"))
+        """Whether the processes that run now, or ran last, have a checkpoint half written."""
+        written = (self.out / "checkpoints").glob("*tmp*")
+        return any(path.stat().st_mtime > self.began for path in written if path.exists())
 
     def said(self) -> str:
         """What the first process printed last."""
