@@ -202,9 +202,9 @@ def train(
         watchdog = opened.enter_context(closing(Watchdog(training.patience)))
         rate = learning_rate(training.optimizer, training.steps)
 
-        def check(state: TrainState) -> dict[str, float]:
-            """Means over the batches of the validation."""
-            with clock.phase("validate"), closing(load(validation, training)) as some:
+        def measure(state: TrainState, shards: Path) -> dict[str, float]:
+            """Validation numbers, means over batches."""
+            with clock.phase("validate"), closing(load(shards, training)) as some:
                 rows = [
                     jax.device_get(validate(state.best, frozen, _to_devices(batch, placed)))
                     for batch in some
@@ -212,7 +212,7 @@ def train(
             return {f"validation_{name}": _average(rows, name) for name in rows[0]}
 
         if validation is not None and start == 0:
-            writer.write(0, check(state))
+            writer.write(0, measure(state, validation))
         pending: dict[int, Mapping[str, jax.Array]] = {}
         before: _LeftOut | None = None
         clock.begin(start)
@@ -238,7 +238,7 @@ def train(
                 writer.write(step, {**numbers, **clock.tick(step, training.steps)})
             if validation is not None and (step % training.validate_every == 0 or last):
                 watchdog.rest()
-                writer.write(step, check(state))
+                writer.write(step, measure(state, validation))
             every = training.sample_every
             if samples is not None and every is not None and (step % every == 0 or last):
                 watchdog.rest()

@@ -1,0 +1,108 @@
+"""From clips to latents to a fine-tuned model, whole and as a LoRA, by the commands alone."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from egosim_jax import configs
+from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.convert.__main__ import main as egosim_convert
+from egosim_jax.generator import Networks
+from egosim_jax.io.mapped import read_metadata, read_safetensors
+from egosim_jax.train.__main__ import main as egosim_train
+
+DEBUG = configs.get("debug")
+HABITS = "--training.steps 4 --training.batch-size 2 --training.log-every 1 --training.save-every 2"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of `debug`, and latents of clips to train on and to validate on."""
+    folder = tmp_path_factory.mktemp("tuning")
+    networks = Networks.random(DEBUG, seed=0)
+    # Behind a head of zeros, as training from nothing begins, a LoRA's gradients would be zero.
+    head = networks.dit.head.linear.kernel
+    head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)
+    networks.save(folder / "weights")
+    for split, seed, scenes in (("train", 0, 3), ("test", 3, 2)):
+        make = f"data make tabletop --scenes {scenes} --seed {seed} --frames 9 --height 64 "
+        make += f"--width 96 --fps 16 --workers 1 --out {folder / split}"
+        assert egosim(make.split()) == 0
+        encode = f"data encode --config debug --weights {folder / 'weights'} --shards "
+        encode += f"{folder / split} --out {folder / 'latents' / split}"
+        assert egosim(encode.split()) == 0
+    return folder
+
+
+def tune(folder: Path, recipe: str, out: str, *more: str) -> int:
+    command = f"{recipe} --config debug --weights {folder / 'weights'} --latents "
+    command += f"{folder / 'latents' / 'train'} --out {folder / out} {HABITS}"
+    return egosim_train([*command.split(), *more])
+
+
+def losses(run: Path) -> list[float]:
+    lines = map(json.loads, (run / "metrics.jsonl").read_text("utf-8").splitlines())
+    return [line["loss"] for line in lines if "loss" in line]
+
+
+def test_all_weights_are_tuned_and_generate_a_clip(folder):
+    validation = ["--validation", str(folder / "latents" / "test"), "--samples", "1"]
+    assert tune(folder, "egosim_14b_fewshot", "full", *validation) == 0
+    run = folder / "full"
+    assert len(losses(run)) == 4
+    assert np.isfinite(losses(run)).all()
+    sheet = run / "samples" / "step_000004.png"
+    assert sheet.stat().st_size > 1000
+    assert sheet.with_suffix(".mp4").exists()
+    before, after = (
+        read_safetensors(path / "dit.safetensors")["head.linear.kernel"].array()
+        for path in (folder / "weights", run / "weights")
+    )
+    assert np.abs(after - before).max() > 0
+    assert (run / "weights" / "vae.safetensors").is_symlink()
+    command = f"generate --config debug --weights {run / 'weights'} --out {folder / 'clip'}"
+    assert egosim(command.split()) == 0
+
+
+def test_a_lora_is_tuned_shown_exported_and_merged(folder, capsys):
+    assert tune(folder, "egosim_14b_lora", "lora", "--rank", "2", "--training.accumulate", "2") == 0
+    lora = folder / "lora" / "lora.safetensors"
+    assert capsys.readouterr().out.splitlines()[-1] == str(lora)
+    export = f"lora {lora} --config debug --out {folder / 'comfy.safetensors'}"
+    assert egosim_convert(export.split()) == 0
+    assert all(
+        name.startswith("diffusion_model.")
+        for name in read_safetensors(folder / "comfy.safetensors")
+    )
+    bases = [read_metadata(path)["base_sha256"] for path in (lora, folder / "comfy.safetensors")]
+    assert bases[0] == bases[1]
+
+    both = [lora, folder / "comfy.safetensors"]
+    for number, path in enumerate(both):
+        merge = f"lora {path} --config debug --merge {folder / 'weights'} "
+        merge += f"--out {folder / f'merged{number}'}"
+        assert egosim_convert(merge.split()) == 0
+    ours, theirs = (read_safetensors(folder / f"merged{n}" / "dit.safetensors") for n in range(2))
+    assert all(np.array_equal(ours[name].array(), theirs[name].array()) for name in ours)
+    name = "blocks.self_attn.q.kernel"
+    base = read_safetensors(folder / "weights" / "dit.safetensors")[name].array()
+    change = ours[name].array() - base
+    assert np.abs(change).max() > 0
+    assert np.linalg.matrix_rank(change[0], tol=1e-6) == 2
+    Networks.load(DEBUG, folder / "merged0")
+
+
+def test_latents_of_other_encoders_are_refused(folder, tmp_path, capsys):
+    Networks.random(DEBUG, seed=1).save(tmp_path)
+    command = f"egosim_14b --config debug --weights {tmp_path} --latents "
+    command += f"{folder / 'latents' / 'train'} --out {tmp_path / 'run'} {HABITS}"
+    assert egosim_train(command.split()) == 2
+    assert "was not encoded for this training" in capsys.readouterr().err
+
+
+def test_a_lora_takes_weights_that_stay(folder, capsys):
+    assert tune(folder, "egosim_14b_lora", "none", "--rank", "0") == 2
+    assert "rank of at least 1" in capsys.readouterr().err
