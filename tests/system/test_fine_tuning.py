@@ -103,6 +103,7 @@ def test_latents_of_other_encoders_are_refused(folder, tmp_path, capsys):
     assert "was not encoded for this training" in capsys.readouterr().err
 
 
-def test_a_lora_takes_weights_that_stay(folder, capsys):
-    assert tune(folder, "egosim_14b_lora", "none", "--rank", "0") == 2
+def test_a_lora_of_no_rank_is_refused(folder, capsys):
+    more = ("--rank", "0", "--training.accumulate", "1")
+    assert tune(folder, "egosim_14b_lora", "none", *more) == 2
     assert "rank of at least 1" in capsys.readouterr().err
