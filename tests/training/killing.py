@@ -1,5 +1,6 @@
 """Killing `run_tiny` and starting it again."""
 
+import contextlib
 import json
 import os
 import socket
@@ -18,7 +19,8 @@ class Run:
     """The processes of a run of `run_tiny`, one after the other."""
 
     def __init__(self, data: Path, out: Path, *, steps: int, save_every: int, processes: int = 1):
-        self.out, self.processes, self.began = out, processes, 0.0
+        self.out, self.processes = out, processes
+        self._left: set[tuple[str, int]] = set()
         program = [sys.executable, "-m", "tests.training.run_tiny"]
         self.command = [*program, str(data), str(out), str(steps), str(save_every)]
 
@@ -27,7 +29,7 @@ class Run:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"
-        started, self.began = [], time.time()
+        started, self._left = [], self._half_written()
         for index in range(self.processes):
             environment = os.environ | {"XLA_FLAGS": QUICK}
             if self.processes > 1:
@@ -75,8 +77,15 @@ class Run:
 
     def is_saving(self) -> bool:
         """Whether the processes that run now, or ran last, have a checkpoint half written."""
-        written = (self.out / "checkpoints").glob("*tmp*")
-        return any(path.stat().st_mtime > self.began for path in written if path.exists())
+        return bool(self._half_written() - self._left)
+
+    def _half_written(self) -> set[tuple[str, int]]:
+        """Names and inodes: what an earlier kill left goes away only after the next start."""
+        found = set()
+        for path in (self.out / "checkpoints").glob("*tmp*"):
+            with contextlib.suppress(FileNotFoundError):
+                found.add((path.name, path.stat().st_ino))
+        return found
 
     def said(self) -> str:
         """What the first process printed last."""
