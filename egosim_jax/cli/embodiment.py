@@ -39,15 +39,15 @@ Videos = Mapping[str, Sequence["np.ndarray"]]
 Validation = Mapping[int, float]
 """Validation loss by step."""
 METHODS = {
-    "people": "people's model as it is",
-    "full": "then all weights",
-    "lora": "then a LoRA",
+    "people": "people alone",
+    "full": "people, then all weights",
+    "lora": "people, then a LoRA",
     "scratch": "robots alone",
 }
 """The models by the name of their field and folder, and what tables call them."""
 LOSSES = {
-    "before": ("validation loss before", "{:.3f}"),
-    "after": ("after", "{:.3f}"),
+    "before": ("loss before", "{:.3f}"),
+    "after": ("loss after", "{:.3f}"),
 }
 DEFINED = {
     "before, after": "flow-matching loss of the held-out robot clips at fixed noise levels and "
@@ -161,7 +161,12 @@ class Embodiment:
         table = _compare(scenes, videos, validations)
         report = {"definitions": DEFINED, "table": table, "validation": validations}
         write_json(self.out / "report.json", report)
-        print_table("", _titled(table), {**LOSSES, **MEASURES}, title="robots, held out")
+        print_table(
+            "",
+            _titled(table),
+            {**LOSSES, **MEASURES},
+            title="robots, held out: mean ± spread over scenes",
+        )
         for name in ("full", "lora"):
             print(_verdict(METHODS[name], validations[name]))
         self._draw(scenes, videos, validations)

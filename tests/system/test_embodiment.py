@@ -88,7 +88,7 @@ def test_started_again_it_trains_nothing_and_reports_the_same(run, report, capsy
     assert main(experiment(run)) == 0
     assert json.loads((run / "report.json").read_text("utf-8")) == report
     said = capsys.readouterr().out
-    assert "then a LoRA: training on robots" in said
+    assert "people, then a LoRA: training on robots" in said
     assert "robots alone" in said
 
 
