@@ -48,7 +48,7 @@ def losses(run: Path) -> list[float]:
     return [line["loss"] for line in lines if "loss" in line]
 
 
-def test_all_weights_are_tuned_and_generate_a_clip(folder):
+def test_all_weights_are_tuned_and_generate_a_clip(folder, capsys):
     validation = ["--validation", str(folder / "latents" / "test"), "--samples", "1"]
     assert tune(folder, "egosim_14b_fewshot", "full", *validation) == 0
     run = folder / "full"
@@ -65,6 +65,15 @@ def test_all_weights_are_tuned_and_generate_a_clip(folder):
     assert (run / "weights" / "vae.safetensors").is_symlink()
     command = f"generate --config debug --weights {run / 'weights'} --out {folder / 'clip'}"
     assert egosim(command.split()) == 0
+
+    # It goes on, here at its end, with other arithmetic, but not with another objective.
+    assert tune(folder, "egosim_14b_fewshot", "full", "--dtype", "bfloat16") == 0
+    assert len(losses(run)) == 4
+    written = read_safetensors(run / "weights" / "dit.safetensors")["head.linear.kernel"]
+    assert written.dtype == "bfloat16"
+    np.testing.assert_allclose(written.array().astype(np.float32), after, rtol=2**-8)
+    assert tune(folder, "egosim_14b_fewshot", "full", "--times", "uniform") == 2
+    assert "task.objective.times" in capsys.readouterr().err
 
 
 def test_a_lora_is_tuned_shown_exported_and_merged(folder, capsys):
