@@ -83,7 +83,11 @@ class Samples:
         size = -(-len(found) // parts("batch")) * parts("batch")
         where = batch_sharding(jax.sharding.get_mesh())
         rows = list(islice(cycle(found), size))
-        return {name: jax.device_put(np.stack([r[name] for r in rows]), where) for name in rows[0]}
+        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        return {
+            name: jax.make_array_from_callback(array.shape, where, array.__getitem__)
+            for name, array in arrays.items()
+        }
 
 
 @jax.jit(static_argnums=(0, 3))
