@@ -1,6 +1,10 @@
 """From clips to latents to a fine-tuned model, whole and as a LoRA, by the commands alone."""
 
 import json
+import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -13,6 +17,7 @@ from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.generator import Networks
 from egosim_jax.io.mapped import read_metadata, read_safetensors
 from egosim_jax.train.__main__ import main as egosim_train
+from tests.training.killing import QUICK
 
 DEBUG = configs.get("debug")
 HABITS = "--training.steps 4 --training.batch-size 2 --training.log-every 1 --training.save-every 2"
@@ -102,6 +107,34 @@ def test_a_lora_is_tuned_shown_exported_and_merged(folder, capsys):
     assert np.abs(change).max() > 0
     assert np.linalg.matrix_rank(change[0], tol=1e-6) == 2
     Networks.load(DEBUG, folder / "merged0")
+
+
+def test_two_processes_tune_together_and_draw_what_they_share(folder):
+    """As the page on training shows it, each a program of its own."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    out, latents = folder / "two", folder / "latents"
+    command = f"egosim_14b_fewshot --config debug --weights {folder / 'weights'} --out {out} "
+    command += f"--latents {latents / 'train'} --validation {latents / 'test'} --samples 1 {HABITS}"
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "egosim_jax.train", *command.split()],
+            env=os.environ
+            | {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+            | {"JAX_PROCESS_ID": str(index), "XLA_FLAGS": QUICK},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(2)
+    ]
+    said = [process.communicate(timeout=600)[1] for process in started]
+    assert [process.returncode for process in started] == [0, 0], said
+    assert "where the time went" in said[0]
+    assert "where the time went" not in said[1]
+    assert len(losses(out)) == 4
+    assert (out / "samples" / "step_000004.png").stat().st_size > 1000
+    Networks.load(DEBUG, out / "weights")
 
 
 def test_latents_of_other_encoders_are_refused(folder, tmp_path, capsys):
