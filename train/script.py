@@ -5,7 +5,7 @@ made as for a new run, the newest checkpoint is read straight into the shardings
 iterator is set to the saved position, and the log is cut back to the restored step. A resumed run
 therefore repeats the losses of the run that was not interrupted bit for bit.
 
-The step is compiled before anything is read, so that a batch or a head count that the mesh does
+The step is compiled before weights are read, so that a batch or a head count that the mesh does
 not divide is refused at once. The numbers of a step are looked at when the next one is under way,
 so that the devices never wait for the host.
 """
@@ -33,7 +33,13 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
 from egosim_jax.models.layers import initialise
-from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
+from egosim_jax.sharding import (
+    MeshConfig,
+    batch_parts,
+    batch_sharding,
+    make_mesh,
+    state_sharding,
+)
 from egosim_jax.train.clock import Clock
 from egosim_jax.train.optimizer import OptimizerConfig, learning_rate
 from egosim_jax.train.samples import Samples
@@ -167,18 +173,18 @@ def train(
     )
 
     with jax.set_mesh(mesh), ExitStack() as opened:
-        with clock.phase("data"), closing(load(source, training, peek=True)) as peek:
-            example = _to_devices(next(peek), placed)
-        clock.flops = task.flops(example)
-        with clock.phase("compile"):
-            update = update.lower(abstract, frozen, example).compile()
-        _say(f"compiled in {clock.seconds['compile']:.1f} s{_need(update)}")
-
         batches = opened.enter_context(closing(load(source, training)))
         checkpoints = Checkpoints(
             out / "checkpoints", keep=training.keep, keep_every=training.keep_every
         )
         opened.callback(checkpoints.close)
+        if max(checkpoints.steps, default=0) < training.steps:
+            with clock.phase("data"), closing(load(source, training, peek=True)) as peek:
+                example = _to_devices(next(peek), placed)
+            clock.flops = task.flops(example)
+            with clock.phase("compile"):
+                update = update.lower(abstract, frozen, example).compile()
+            _say(f"compiled in {clock.seconds['compile']:.1f} s{_need(update)}")
         checkpoints.check_room(abstract)
         with clock.phase("start"):
             if weights is not None:
@@ -260,13 +266,12 @@ def train(
 
 
 def _check_batch(training: Training, mesh: jax.sharding.Mesh) -> None:
-    devices = mesh.shape["data"] * mesh.shape["fsdp"]
-    if training.batch_size % (devices * training.accumulate):
+    devices, parts = batch_parts(mesh), training.accumulate
+    if training.batch_size % (devices * parts):
         raise InputError(
             f"A batch of {training.batch_size} does not divide among data x fsdp = {devices} "
-            f"devices, {training.accumulate} parts each: it must be a multiple of "
-            f"{devices * training.accumulate}. (--training.batch-size, --training.accumulate, "
-            "--training.mesh)"
+            f"devices, {parts} parts each: it must be a multiple of {devices * parts}. "
+            "(--training.batch-size, --training.accumulate, --training.mesh)"
         )
 
 
@@ -278,7 +283,7 @@ def _load(
     reader = ShardReader(source) if isinstance(source, Path) else source
     size = training.batch_size
     if once:
-        devices = placed.mesh.shape["data"] * placed.mesh.shape["fsdp"]
+        devices = batch_parts(placed.mesh)
         size = min(size, max(devices, len(reader) // devices * devices))
     index, count = _part(placed, size)
     return make_loader(
