@@ -14,7 +14,7 @@ from flax import nnx
 from jax.experimental import multihost_utils
 
 from egosim_jax.conditioning.video import to_uint8
-from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.shards import Record, ShardReader
 from egosim_jax.data.sheet import Block, draw_sheet
 from egosim_jax.generator import ModelConfig, denoise
 from egosim_jax.io import weights
@@ -45,8 +45,8 @@ class Samples:
         Called under the mesh of the training, by all of its processes.
         """
         graph, params = nnx.split(networks)
-        generated = self._gather(_generate(graph, params, self._batch, self.model))
-        truth = self._gather(_decode(*self._vae, self._batch["truth"]))
+        generated = self._frames(_generate(graph, params, self._batch, self.model))
+        truth = self._truth
         if jax.process_index() != 0:
             return
         pairs = [np.concatenate(pair, axis=2) for pair in zip(generated, truth, strict=True)]
@@ -54,15 +54,20 @@ class Samples:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_video(path, np.concatenate(pairs, axis=1), self.model.video.fps)
         moments = np.linspace(0, self.model.video.frames - 1, MOMENTS).round().astype(int).tolist()
+        names = [record.metadata["video_id"] for record in self._records]
         blocks = [
             Block(f"{name}, step {step}: generated, truth", list(pair))
-            for name, *pair in zip(self._names, generated, truth, strict=True)
+            for name, *pair in zip(names, generated, truth, strict=True)
         ]
         draw_sheet(blocks, path.with_suffix(".png"), moments=moments)
 
-    def _gather(self, latents: jax.Array) -> np.ndarray:
-        frames = latents if latents.dtype == np.uint8 else _decode(*self._vae, latents)
-        return multihost_utils.process_allgather(frames, tiled=True)[: self.count]
+    def _frames(self, latents: jax.Array) -> np.ndarray:
+        frames = _decode(*self._vae, latents)
+        return multihost_utils.process_allgather(frames, tiled=True)[: len(self._records)]
+
+    @cached_property
+    def _truth(self) -> np.ndarray:
+        return self._frames(self._batch["truth"])
 
     @cached_property
     def _vae(self) -> tuple[nnx.GraphDef, nnx.State]:
@@ -71,15 +76,14 @@ class Samples:
         return nnx.split(vae)
 
     @cached_property
-    def _names(self) -> list[str]:
+    def _records(self) -> list[Record]:
         reader = ShardReader(self.latents)
-        return [str(reader[i].metadata["video_id"]) for i in range(min(self.count, len(reader)))]
+        return [reader[i] for i in range(min(self.count, len(reader)))]
 
     @cached_property
     def _batch(self) -> dict[str, jax.Array]:
         """The records, repeated until the devices can share them."""
-        reader = ShardReader(self.latents)
-        found = [reader[i].arrays for i in range(min(self.count, len(reader)))]
+        found = [record.arrays for record in self._records]
         size = -(-len(found) // parts("batch")) * parts("batch")
         where = batch_sharding(jax.sharding.get_mesh())
         rows = list(islice(cycle(found), size))
