@@ -38,7 +38,7 @@ def joined() -> Iterator[None]:
         try:
             jax.distributed.initialize()
         except ValueError:  # no cluster
-            jax.distributed.initialize(_own_address(), 1, 0)
+            jax.distributed.initialize(own_address(), 1, 0)
     try:
         yield
     finally:
@@ -53,7 +53,8 @@ def _check_numbers(count: str, index: str) -> None:
         )
 
 
-def _own_address() -> str:
+def own_address() -> str:
+    """A free port of this machine, heard by it alone."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"127.0.0.1:{free.getsockname()[1]}"

@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +16,7 @@ from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.generator import Networks
 from egosim_jax.io.mapped import read_metadata, read_safetensors
 from egosim_jax.train.__main__ import main as egosim_train
+from egosim_jax.train.distributed import own_address
 from tests.training.killing import QUICK
 
 DEBUG = configs.get("debug")
@@ -111,9 +111,7 @@ def test_a_lora_is_tuned_shown_exported_and_merged(folder, capsys):
 
 def test_two_processes_tune_together_and_draw_what_they_share(folder):
     """As the page on training shows it, each a program of its own."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+    address = own_address()
     out, latents = folder / "two", folder / "latents"
     command = f"egosim_14b_fewshot --config debug --weights {folder / 'weights'} --out {out} "
     command += f"--latents {latents / 'train'} --validation {latents / 'test'} --samples 1 {HABITS}"

@@ -3,16 +3,29 @@
 import contextlib
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from egosim_jax.train.distributed import own_address
+
 ROOT = Path(__file__).parents[2]
 QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 """Compiling is what takes time in these runs."""
+
+
+def logged(out: Path) -> list[dict[str, float]]:
+    """The log of a run, without what is told by a clock; a line that is cut off is not one yet."""
+    path = out / "metrics.jsonl"
+    told = ("seconds", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
+    text = path.read_text("utf-8") if path.exists() else ""
+    return [
+        {name: value for name, value in json.loads(line).items() if name not in told}
+        for line in text.splitlines(keepends=True)
+        if line.endswith("\n")
+    ]
 
 
 class Run:
@@ -26,9 +39,7 @@ class Run:
 
     def start(self) -> list[subprocess.Popen]:
         """Start it, or let it go on."""
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            address = f"127.0.0.1:{free.getsockname()[1]}"
+        address = own_address()
         started, self._left = [], self._half_written()
         for index in range(self.processes):
             environment = os.environ | {"XLA_FLAGS": QUICK}
@@ -65,15 +76,8 @@ class Run:
         return killed
 
     def lines(self) -> list[dict[str, float]]:
-        """The log, without what is told by a clock; a line that a kill cut off is not one yet."""
-        path = self.out / "metrics.jsonl"
-        told = ("seconds", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
-        text = path.read_text("utf-8") if path.exists() else ""
-        return [
-            {name: value for name, value in json.loads(line).items() if name not in told}
-            for line in text.splitlines(keepends=True)
-            if line.endswith("\n")
-        ]
+        """The log (`logged`)."""
+        return logged(self.out)
 
     def is_saving(self) -> bool:
         """Whether the processes that run now, or ran last, have a checkpoint half written."""

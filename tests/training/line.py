@@ -83,15 +83,6 @@ def training(**changes: Any) -> Training:
     return Training(**{**fields, "optimizer": optimizer, **changes})
 
 
-def lines(out: Path) -> list[dict[str, float]]:
-    """The log, without what is told by a clock."""
-    told = ("seconds", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
-    return [
-        {name: value for name, value in json.loads(line).items() if name not in told}
-        for line in (out / "metrics.jsonl").read_text("utf-8").splitlines()
-    ]
-
-
 def main(out: str, data: str, changes: str) -> int:
     """Train as the commands do."""
     settings = json.loads(changes)

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,7 +14,9 @@ import pytest
 from egosim_jax.command import DONE, HUNG, RESUBMIT
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
-from tests.training.line import lines, write_points
+from egosim_jax.train.distributed import own_address
+from tests.training.killing import logged
+from tests.training.line import write_points
 
 ROOT = Path(__file__).parents[2]
 LONG = {"steps": 100, "save_every": 30, "pause": 0.03}
@@ -48,7 +49,7 @@ def run(out: Path, data: Path, **settings) -> str:
 
 def wait_for(out: Path, step: int, *processes: subprocess.Popen) -> None:
     deadline = time.monotonic() + 300
-    while not (out / "metrics.jsonl").is_file() or len(lines(out)) < step:
+    while not (out / "metrics.jsonl").is_file() or len(logged(out)) < step:
         ended = [process.communicate()[1] for process in processes if process.poll() is not None]
         assert not ended, f"it ended too early: {ended}"
         assert time.monotonic() < deadline
@@ -59,7 +60,7 @@ def wait_for(out: Path, step: int, *processes: subprocess.Popen) -> None:
 def straight(points: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, float]]:
     out = tmp_path_factory.mktemp("straight") / "run"
     run(out, points, **LONG)
-    return lines(out)
+    return logged(out)
 
 
 def test_sigterm_saves_the_step_and_ends_with_75_and_the_rest_is_the_same(
@@ -71,11 +72,11 @@ def test_sigterm_saves_the_step_and_ends_with_75_and_the_rest_is_the_same(
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=120)[1]
     assert process.returncode == RESUBMIT, said
-    done = len(lines(out))
+    done = len(logged(out))
     assert f"saved after step {done}" in said
     assert done < LONG["steps"]
     assert f"resuming at step {done} of" in run(out, points, **LONG)
-    assert lines(out) == straight
+    assert logged(out) == straight
 
 
 def test_a_run_that_hangs_prints_its_stacks_and_ends_with_70(points, tmp_path):
@@ -100,7 +101,7 @@ def test_a_run_goes_on_with_other_numbers_of_devices(points, tmp_path):
         process.kill()
         process.communicate()
     assert "resuming at step 2" in run(out, points, **schedule)
-    alone, moved = lines(tmp_path / "one"), lines(out)
+    alone, moved = logged(tmp_path / "one"), logged(out)
     assert [line["ids"] for line in moved] == [line["ids"] for line in alone]
     losses = [[line["loss"] for line in log] for log in (moved, alone)]
     np.testing.assert_allclose(*losses, rtol=1e-5)
@@ -108,10 +109,7 @@ def test_a_run_goes_on_with_other_numbers_of_devices(points, tmp_path):
 
 def pair(out: Path, data: Path, **settings) -> list[subprocess.Popen]:
     """Two processes of one run."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    shared = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+    shared = {"JAX_COORDINATOR_ADDRESS": own_address(), "JAX_NUM_PROCESSES": "2"}
     return [
         start(out, data, env={**shared, "JAX_PROCESS_ID": str(index)}, **settings)
         for index in range(2)
@@ -134,13 +132,13 @@ def test_two_processes_stop_together_and_go_on_as_if_nothing_had_happened(points
     processes[1].send_signal(signal.SIGTERM)
     assert finish(processes) == [RESUBMIT, RESUBMIT]
     processes = pair(stopped, points, **schedule)
-    wait_for(stopped, len(lines(stopped)) + 9, *processes)
+    wait_for(stopped, len(logged(stopped)) + 9, *processes)
     for process in processes:
         process.kill()
         process.communicate()
     assert finish(pair(stopped, points, **schedule)) == [DONE, DONE]
-    assert lines(stopped) == lines(whole)
-    assert [line["step"] for line in lines(whole)] == list(range(1, schedule["steps"] + 1))
+    assert logged(stopped) == logged(whole)
+    assert [line["step"] for line in logged(whole)] == list(range(1, schedule["steps"] + 1))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,8 @@ from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.optimizer import OptimizerConfig
 from egosim_jax.train.script import train
 from egosim_jax.types import InputError
-from tests.training.line import POINTS, Line, lines, training, write_points
+from tests.training.killing import logged
+from tests.training.line import POINTS, Line, training, write_points
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def values(networks) -> np.ndarray:
 
 def test_the_loss_falls_and_the_run_says_where_the_time_went(points, tmp_path, capsys):
     fit(tmp_path, points, validation=points)
-    log = lines(tmp_path)
+    log = logged(tmp_path)
     losses = [line["loss"] for line in log if "loss" in line]
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
     checked = {line["step"]: line["validation_loss"] for line in log if "validation_loss" in line}
@@ -47,7 +48,7 @@ def test_the_loss_falls_and_the_run_says_where_the_time_went(points, tmp_path, c
 def test_an_update_that_is_not_finite_changes_nothing_and_is_named(tmp_path, capsys):
     data = write_points(tmp_path / "points", huge=(3,))
     fit(tmp_path / "run", data, steps=10)
-    log = lines(tmp_path / "run")
+    log = logged(tmp_path / "run")
     out = [line for line in log if line.get("left_out")]
     assert len(out) == 2  # ten batches of eight see each of the forty points twice
     assert all("loss" not in line for line in out)
@@ -60,7 +61,7 @@ def test_an_update_that_is_not_finite_changes_nothing_and_is_named(tmp_path, cap
 def test_weights_after_an_update_that_is_left_out_are_those_before(tmp_path):
     data = write_points(tmp_path / "points", huge=(3,))
     fit(tmp_path / "long", data, steps=10)
-    bad = next(line["step"] for line in lines(tmp_path / "long") if line.get("left_out"))
+    bad = next(line["step"] for line in logged(tmp_path / "long") if line.get("left_out"))
     before = values(fit(tmp_path / "before", data, steps=bad - 1, optimizer={"decay": "constant"}))
     after = values(fit(tmp_path / "after", data, steps=bad, optimizer={"decay": "constant"}))
     np.testing.assert_array_equal(after, before)
@@ -79,7 +80,7 @@ def test_three_in_a_row_stop_the_run_with_the_names(tmp_path, capsys):
 def test_a_gradient_far_longer_than_usual_is_left_out_on_request(tmp_path, spike, left_out):
     data = write_points(tmp_path / "points", huge=(7,), factor=100.0)
     fit(tmp_path / "run", data, steps=70, log_every=1, save_every=70, optimizer={"spike": spike})
-    late = [line for line in lines(tmp_path / "run") if line["step"] > 50]
+    late = [line for line in logged(tmp_path / "run") if line["step"] > 50]
     assert any("left_out" in line for line in late) == left_out
 
 
