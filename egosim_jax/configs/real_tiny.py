@@ -16,7 +16,9 @@ from egosim_jax.types import VideoSpec
 CONFIG = ModelConfig(
     name="real_tiny",
     video=VideoSpec(frames=17, height=96, width=160, fps=16),
-    dit=WanDiTConfig(dim=192, ffn_dim=768, heads=3, layers=6, text_dim=64, image_dim=64),
+    dit=WanDiTConfig(
+        dim=192, ffn_dim=768, heads=3, layers=6, text_dim=64, image_dim=64, remat="products"
+    ),
     vae=WanVAEConfig(
         dim=8,
         dim_mult=(1, 2, 4, 8),

@@ -23,8 +23,11 @@ from egosim_jax.sharding import ACTIVATIONS, constrain, parts, several_devices, 
 from egosim_jax.types import InputError
 
 Kernel = Literal["xla", "cudnn"]
-"""`xla` runs anywhere, one head at a time, so that the scores of a single head are in memory;
+"""`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`);
 `cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only)."""
+SCORES = 2**26
+"""Bytes of scores that the `xla` kernel makes at a time, if a single head's are not more: a small
+model's heads all at once, which is faster, and those of a long video one by one."""
 SELF_ATTENTION = "self_attention"
 """The name, for checkpoint policies, of what the `xla` kernel's backward pass needs."""
 CUDNN_FORWARD = "dot_product_attention_fwd_wrapper"
@@ -102,7 +105,7 @@ def _forward(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> tuple[ja
         out = _matmul("b n m, b m k -> b n k", p.astype(v.dtype), v) / total
         return out.astype(v.dtype), top + jnp.log(total)
 
-    out, log_total = jax.lax.map(head, (q, k, v))
+    out, log_total = jax.lax.map(head, (q, k, v), batch_size=_heads_at_once(q, k))
     if q.shape == k.shape:
         out, log_total = (checkpoint_name(x, SELF_ATTENTION) for x in (out, log_total))
     return out, (q, k, v, out, log_total)
@@ -119,10 +122,17 @@ def _backward(scale: float, residuals: tuple, g: jax.Array) -> tuple:
         dk = _matmul("b n m, b n k -> b m k", ds, q) * scale
         return dq.astype(q.dtype), dk.astype(k.dtype), dv.astype(v.dtype)
 
-    return jax.lax.map(head, (*residuals, g))
+    q, k, *_ = residuals
+    return jax.lax.map(head, (*residuals, g), batch_size=_heads_at_once(q, k))
 
 
 _by_head.defvjp(_forward, _backward)
+
+
+def _heads_at_once(q: jax.Array, k: jax.Array) -> int:
+    heads, batch, queries, _ = q.shape
+    fit = SCORES // (4 * batch * queries * k.shape[2])
+    return max((n for n in range(1, min(fit, heads) + 1) if heads % n == 0), default=1)
 
 
 def _scores(q: jax.Array, k: jax.Array, scale: float) -> jax.Array:

@@ -46,7 +46,9 @@ from egosim_jax.types import InputError
 TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
 """Logical axes of the residual stream, and of what is the same for all tokens."""
 
-
+keep_products = jax.checkpoint_policies.save_from_both_policies(
+    jax.checkpoint_policies.dots_with_no_batch_dims_saveable, keep_attention
+)
 BLOCK_INPUT = "block_input"
 offload_inputs = jax.checkpoint_policies.save_and_offload_only_these_names(
     names_which_can_be_saved=[],
@@ -153,6 +155,7 @@ class WanDiT(nnx.Module):
             "none": None,
             "full": checkpoint,
             "attention": partial(checkpoint, policy=keep_attention),
+            "products": partial(checkpoint, policy=keep_products),
             "offload": partial(checkpoint, policy=offload_inputs),
         }[self.config.remat]
 

@@ -40,7 +40,7 @@ IMAGE_NORM_EPS = 1e-5
 
 Activation = Callable[[jax.Array], jax.Array]
 KeysValues = tuple[Float[Array, "*l b _ h k"], Float[Array, "*l b _ h k"]]
-Remat = Literal["none", "full", "attention", "offload"]
+Remat = Literal["none", "products", "attention", "full", "offload"]
 
 xavier = nnx.initializers.xavier_uniform()
 normal = nnx.initializers.normal(0.02)
@@ -77,8 +77,9 @@ class WanDiTConfig:
     attention: Kernel = "xla"
     """Attention kernel."""
     remat: Remat = "none"
-    """What the backward pass computes again: nothing, every block, blocks but self-attention, or
-    every block from its input, which waits in the host's memory."""
+    """What the backward pass computes again: nothing, all but products with weights and
+    self-attention, all but self-attention, every block, or every block from its input, which waits
+    in the host's memory."""
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other and the kernel fits the dtype."""
