@@ -55,21 +55,17 @@ def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
     return jax.make_mesh(shape, axes, axis_types=(AxisType.Auto,) * 3, devices=devices)
 
 
-def check_batch(size: int, mesh: Mesh | AbstractMesh) -> None:
-    """Raise `InputError` unless a batch can be dealt out in equal parts over data x fsdp."""
-    parts = batch_parts(mesh)
-    if size % parts:
+def check_batch(size: int, mesh: Mesh | AbstractMesh, accumulate: int = 1) -> None:
+    """Raise `InputError` unless data x fsdp can share a batch, each taking its in equal parts."""
+    unit = parts("batch", mesh) * accumulate
+    if size % unit:
+        in_turn = f", each in {accumulate} parts" if accumulate > 1 else ""
         raise InputError(
             f"A batch of {size} cannot be shared by a mesh of data {mesh.shape['data']} x fsdp "
-            f"{mesh.shape['fsdp']}: it must be a multiple of their product, {parts}. Nearest: "
-            f"{-(-size // parts) * parts}. (--batch-size, or another mesh: devices along context "
-            "share one sample)"
+            f"{mesh.shape['fsdp']}{in_turn}: it must be a multiple of their product, {unit}. "
+            f"Nearest: {-(-size // unit) * unit}. (--batch-size, in training --accumulate, or "
+            "another mesh: devices along context share one sample)"
         )
-
-
-def batch_parts(mesh: Mesh | AbstractMesh) -> int:
-    """Into how many parts a mesh splits a batch."""
-    return prod(mesh.shape[name] for name in ACTIVATIONS["batch"])
 
 
 def several_devices() -> bool:
@@ -87,9 +83,9 @@ def spec(*axes: str | None) -> PartitionSpec:
     return PartitionSpec(*(ACTIVATIONS[axis] if axis else None for axis in axes))
 
 
-def parts(axis: str) -> int:
-    """Into how many parts the mesh splits a logical axis of activations."""
-    mesh = jax.sharding.get_abstract_mesh()
+def parts(axis: str, mesh: Mesh | AbstractMesh | None = None) -> int:
+    """Into how many parts a mesh, or that of what is traced, splits an axis of activations."""
+    mesh = jax.sharding.get_abstract_mesh() if mesh is None else mesh
     return prod(mesh.shape[name] for name in ACTIVATIONS[axis])
 
 

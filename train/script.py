@@ -35,9 +35,10 @@ from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
 from egosim_jax.models.layers import initialise
 from egosim_jax.sharding import (
     MeshConfig,
-    batch_parts,
     batch_sharding,
+    check_batch,
     make_mesh,
+    parts,
     state_sharding,
 )
 from egosim_jax.train.clock import Clock
@@ -93,7 +94,7 @@ class Training:
     """Project of Weights & Biases to log to, too."""
 
     def __post_init__(self) -> None:
-        """Check that every count is positive, and that parts of a batch are whole."""
+        """Check that every count is positive."""
         counts = ("steps", "batch_size", "accumulate", "log_every", "save_every", "validate_every")
         optional = ("sample_every", "keep", "keep_every")
         check_counts({name: getattr(self, name) for name in (*counts, *optional)})
@@ -136,7 +137,7 @@ def train(
     mesh = make_mesh(training.mesh)
     placed = batch_sharding(mesh)
     source = ShardReader(data)
-    _check_batch(training, mesh)
+    check_batch(training.batch_size, mesh, training.accumulate)
     load = partial(_load, task=task, placed=placed)
     clock = Clock(flops=float("nan"))
 
@@ -265,16 +266,6 @@ def train(
     return nnx.merge(graph, state.best, frozen)
 
 
-def _check_batch(training: Training, mesh: jax.sharding.Mesh) -> None:
-    devices, parts = batch_parts(mesh), training.accumulate
-    if training.batch_size % (devices * parts):
-        raise InputError(
-            f"A batch of {training.batch_size} does not divide among data x fsdp = {devices} "
-            f"devices, {parts} parts each: it must be a multiple of {devices * parts}. "
-            "(--training.batch-size, --training.accumulate, --training.mesh)"
-        )
-
-
 def _load(
     source: ShardReader | Path, training: Training, *, task: Task, placed: Any, peek: bool = False
 ) -> Loader:
@@ -283,7 +274,7 @@ def _load(
     reader = ShardReader(source) if isinstance(source, Path) else source
     size = training.batch_size
     if once:
-        devices = batch_parts(placed.mesh)
+        devices = parts("batch", placed.mesh)
         size = min(size, max(devices, len(reader) // devices * devices))
     index, count = _part(placed, size)
     return make_loader(

@@ -147,10 +147,10 @@ class Generate:
 
     def _placing(self) -> tuple[Mesh, int]:
         """The devices, and how many clips they make together."""
-        from egosim_jax.sharding import batch_parts, check_batch, make_mesh
+        from egosim_jax.sharding import check_batch, make_mesh, parts
 
         mesh = make_mesh(self.mesh)
-        size = batch_parts(mesh) if self.batch_size is None else self.batch_size
+        size = parts("batch", mesh) if self.batch_size is None else self.batch_size
         check_batch(size, mesh)
         return mesh, size
 
@@ -190,10 +190,10 @@ class Generate:
     ) -> list[tuple[_Item, str]]:
         """Generate `size` clips after `size` clips; the items that failed."""
         from egosim_jax.generator import batches
-        from egosim_jax.sharding import batch_parts
+        from egosim_jax.sharding import parts
 
-        parts = batch_parts(mesh)
-        size = min(size, -(-len(items) // parts) * parts)  # what the mesh divides and is enough
+        unit = parts("batch", mesh)
+        size = min(size, -(-len(items) // unit) * unit)  # what the mesh divides and is enough
         generator = self._generator(config, mesh)
         then = time.monotonic()
         generator.compile(size)
