@@ -113,7 +113,7 @@ def test_a_run_goes_on_with_other_habits_but_not_with_another_seed(points, tmp_p
 
 
 def test_a_batch_that_devices_cannot_share_says_what_would_do(points, tmp_path):
-    with pytest.raises(InputError, match=r"A batch of 8 .* 3 parts.* multiple of 3"):
+    with pytest.raises(InputError, match=r"A batch of 8 .* 3 parts.* multiple of their product, 3"):
         fit(tmp_path, points, accumulate=3)
 
 
