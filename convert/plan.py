@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -79,7 +79,7 @@ def to_theirs(
     that the network does not have.
     """
     shape = _shape(config, network)
-    if problems := mismatches(tensors, flat_shapes(skeleton(network, shape))):
+    if problems := mismatches(tensors, _shapes(network, shape)):
         raise WeightsError(problems, source=f"{network}.safetensors")
     parts: dict[str, dict[int, _Part]] = {}
     for rule in _rules(network, naming, shape):
@@ -181,7 +181,7 @@ def _leaves(found: Found, shape: Any) -> dict[str, Leaf]:
         found.tensors,
         _rules(found.network, found.naming, shape),
         ignore=_table(found.network).ignored(shape),
-        want=flat_shapes(skeleton(found.network, shape)),
+        want=_shapes(found.network, shape),
         source=found.source.name,
     )
 
@@ -203,6 +203,12 @@ def _rules(network: Network, naming: Naming, shape: Any) -> list[Rule]:
 
 def _table(network: Network) -> ModuleType:
     return importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
+
+
+@cache
+def _shapes(network: Network, shape: Any) -> dict[str, tuple[int, ...]]:
+    """Of every weight of a config's network, by its path."""
+    return flat_shapes(skeleton(network, shape))
 
 
 def skeleton(network: Network, shape: Any) -> nnx.Module:

@@ -1,8 +1,11 @@
-"""Compiled programs are shared by the test workers, the programs they start and the next run."""
+"""Programs compile quickly; workers, what they start and the next run share them."""
 
 import os
 from pathlib import Path
 
+from tests.flags import QUICK
+
+os.environ.setdefault("XLA_FLAGS", QUICK)
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "compiled")
 )

@@ -8,6 +8,7 @@ that the network does not use.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 from flax import nnx
 
@@ -71,9 +72,8 @@ def _rules(
     config: WanVAEConfig, words: dict[str, str], place: Callable[[str, str, int], str]
 ) -> list[Rule]:
     """A rule for each of our paths, `[half.[group.index.]]part.leaf`."""
-    vae = nnx.eval_shape(lambda: WanVAE(config, rngs=nnx.Rngs(0)))
     rules = []
-    for path, shape in flat_shapes(vae).items():
+    for path, shape in _shapes(config).items():
         *where, part, leaf = path.split(".")
         if len(where) == 3:
             half, group, index = where
@@ -81,6 +81,11 @@ def _rules(
         source = ".".join([*where, words.get(part, part), LEAVES[leaf]])
         rules.append(Rule(source, path, _layout(part, leaf, len(shape))))
     return rules
+
+
+@cache  # making the modules takes most of a second
+def _shapes(config: WanVAEConfig) -> dict[str, tuple[int, ...]]:
+    return flat_shapes(nnx.eval_shape(lambda: WanVAE(config, rngs=nnx.Rngs(0))))
 
 
 def _layout(part: str, leaf: str, axes: int) -> str:

@@ -17,7 +17,6 @@ from egosim_jax.generator import Networks
 from egosim_jax.io.mapped import read_metadata, read_safetensors
 from egosim_jax.train.__main__ import main as egosim_train
 from egosim_jax.train.distributed import own_address
-from tests.training.killing import QUICK
 
 DEBUG = configs.get("debug")
 HABITS = "--training.steps 4 --training.batch-size 2 --training.log-every 1 --training.save-every 2"
@@ -120,7 +119,7 @@ def test_two_processes_tune_together_and_draw_what_they_share(folder):
             [sys.executable, "-m", "egosim_jax.train", *command.split()],
             env=os.environ
             | {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
-            | {"JAX_PROCESS_ID": str(index), "XLA_FLAGS": QUICK},
+            | {"JAX_PROCESS_ID": str(index)},
             stderr=subprocess.PIPE,
             text=True,
         )

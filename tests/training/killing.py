@@ -10,10 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from egosim_jax.train.distributed import own_address
+from tests.flags import QUICK
 
 ROOT = Path(__file__).parents[2]
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-"""Compiling is what takes time in these runs."""
 
 
 def logged(out: Path) -> list[dict[str, float]]:

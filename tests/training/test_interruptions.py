@@ -15,6 +15,7 @@ from egosim_jax.command import DONE, HUNG, RESUBMIT
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.train.distributed import own_address
+from tests import flags
 from tests.training.killing import logged
 from tests.training.line import write_points
 
@@ -30,11 +31,10 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def start(out: Path, data: Path, *, devices: int = 1, env: dict[str, str] | None = None, **changes):
     command = [sys.executable, "-m", "tests.training.line", str(out), str(data)]
-    flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
     return subprocess.Popen(
         [*command, json.dumps(changes)],
         cwd=ROOT,
-        env=os.environ | flags | (env or {}),
+        env=os.environ | flags.devices(devices) | (env or {}),
         stderr=subprocess.PIPE,
         text=True,
     )

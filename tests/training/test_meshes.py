@@ -1,5 +1,6 @@
 """What is computed does not depend on how it is shared among devices."""
 
+import math
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.killing import QUICK
+from tests.flags import devices
 
 ROOT = Path(__file__).parents[2]
 MESHES = [(1, 8, 1, 1), (4, 2, 1, 1), (1, 4, 2, 2), (2, 2, 2, 1)]
@@ -17,9 +18,8 @@ MESHES = [(1, 8, 1, 1), (4, 2, 1, 1), (1, 4, 2, 2), (2, 2, 2, 1)]
 
 def run(mesh: tuple[int, int, int, int], out: Path) -> tuple[dict[str, np.ndarray], str]:
     """The numbers of a mesh, and what the compiler said."""
-    flags = f"--xla_force_host_platform_device_count={np.prod(mesh[:3])} {QUICK}"
     command = [sys.executable, "-m", "tests.training.run_mesh", *map(str, mesh), str(out)]
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | devices(math.prod(mesh[:3]))
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return dict(np.load(out)), done.stderr

@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.flags import devices
+
 ROOT = Path(__file__).parents[2]
-FLAGS = (
-    "--xla_force_host_platform_device_count=8 "
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-)
-"""Compiling is what takes time here."""
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +18,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     """Everything that `run_generator` computes, in one program that imports jax once."""
     folder = tmp_path_factory.mktemp("meshes")
     command = [sys.executable, "-m", "tests.unit.run_generator", str(folder)]
-    environment = os.environ | {"XLA_FLAGS": FLAGS, "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | devices(8)
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "full rematerialization" not in done.stderr

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -37,13 +38,18 @@ CONFIG = configs.get("debug")
 NETWORKS = ("dit", "vae", "text", "image")
 
 
+@cache
+def all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:
+    parts = nnx.eval_shape(lambda: Networks(CONFIG, rngs=nnx.Rngs(0))).parts()
+    return {network: flat_shapes(part) for network, part in parts.items()}
+
+
 def foreign(network, naming, dtype=torch.float32) -> dict[str, torch.Tensor]:
     """A network of `debug` with random weights, in foreign names."""
-    parts = nnx.eval_shape(lambda: Networks(CONFIG, rngs=nnx.Rngs(0))).parts()
     rng = np.random.default_rng(NETWORKS.index(network))
     ours = {
         path: rng.normal(size=shape).astype(np.float32)
-        for path, shape in flat_shapes(parts[network]).items()
+        for path, shape in all_shapes()[network].items()
     }
     table = importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
     theirs = translate_back(ours, getattr(table, naming)(getattr(CONFIG, network)))

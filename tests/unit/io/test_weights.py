@@ -12,6 +12,7 @@ from egosim_jax.io import weights
 from egosim_jax.io.weights import WeightsError
 from egosim_jax.models.layers import Linear, RMSNorm, stack
 from egosim_jax.types import InputError
+from tests.flags import devices
 
 
 class Net(nnx.Module):
@@ -99,8 +100,8 @@ assert {shard.data.shape for shard in kernel.addressable_shards} == {(2, 4)}
 np.testing.assert_array_equal(kernel, np.float16(net.dit.kernel.get_value()))
 assert jax.tree.structure(placed) == jax.tree.structure(abstract)
 """
-    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=os.environ | flags, check=True)
+    environment = os.environ | devices(8)
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=environment, check=True)
     weights.save(tmp_path / "dit.safetensors", Net(rngs=nnx.Rngs(0)))
     other = nnx.State({"dit": nnx.state(skeleton().blocks)})
     with pytest.raises(WeightsError, match=r"head\.kernel: have \(3, 2\), want nothing"):
