@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from egosim_jax import configs
 from egosim_jax.cli import doctor
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
-from egosim_jax.generator import Networks
 from egosim_jax.io.video import probe_video
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
@@ -147,11 +145,11 @@ def test_without_metadata_a_scene_is_drawn_by_seed(tmp_path):
         assert sheet.size == (6 * 240, 2 * (16 + 3 * 160))
 
 
-def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(tmp_path, capsys):
-    config = configs.get("debug")
-    Networks.random(config, seed=0).save(tmp_path / "weights")
+def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
+    weights, tmp_path, capsys
+):
     out = tmp_path / "out"
-    fixed = ["--config", "debug", "--weights", str(tmp_path / "weights"), "--out", str(out)]
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
     counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2"]
     assert main(["experiment", "tabletop", *fixed, *counts]) == 0
     tables = json.loads((out / "report.json").read_text("utf-8"))["tables"]
@@ -167,8 +165,8 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(tmp_pa
     assert "without hands" in capsys.readouterr().out
 
 
-def test_the_doctor_says_what_is_there_and_what_is_not(tmp_path, capsys, monkeypatch):
-    Networks.random(configs.get("debug"), seed=0).save(tmp_path / "mine")
+def test_the_doctor_says_what_is_there_and_what_is_not(weights, tmp_path, capsys, monkeypatch):
+    (tmp_path / "mine").symlink_to(weights)
     monkeypatch.setattr(doctor, "find_spec", lambda name: None)
     assert main(["doctor", str(tmp_path / "mine")]) == 0
     said = capsys.readouterr().out

@@ -16,18 +16,17 @@ MODELS = {"people", "full", "lora", "scratch"}
 ALIKE = {"steps": 2, "batch-size": 2, "warmup": 1, "learning-rate": 0.01}
 
 
-def experiment(run: Path, *more: str) -> list[str]:
-    fixed = ["--config", "debug", "--weights", str(run.parent / "weights"), "--out", str(run)]
+def experiment(weights: Path, run: Path, *more: str) -> list[str]:
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(run)]
     counts = ["--human-scenes", "2", "--robot-scenes", "2", "--held-out", "2", "--batch-size", "2"]
     stages = [str(x) for model in MODELS for k, v in ALIKE.items() for x in (f"--{model}.{k}", v)]
     return ["experiment", "embodiment", *fixed, *counts, "--rank", "2", *stages, *more]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("embodiment")
-    Networks.random(configs.get("debug"), seed=1).save(folder / "weights")
-    assert main(experiment(folder / "run")) == 0
+    assert main(experiment(weights, folder / "run")) == 0
     return folder / "run"
 
 
@@ -81,33 +80,35 @@ def test_the_sheet_has_a_row_for_each_model_between_conditions_and_truth(run):
     assert (run / "curves.png").exists()
 
 
-def test_started_again_it_trains_nothing_and_reports_the_same(run, report, capsys, monkeypatch):
+def test_started_again_it_trains_nothing_and_reports_the_same(
+    weights, run, report, capsys, monkeypatch
+):
     for name in ("train.script.train", "generator.Generator.generate"):
         monkeypatch.setattr(f"egosim_jax.{name}", lambda *_, **__: pytest.fail("it was done"))
     (run / "report.json").unlink()
-    assert main(experiment(run)) == 0
+    assert main(experiment(weights, run)) == 0
     assert json.loads((run / "report.json").read_text("utf-8")) == report
     said = capsys.readouterr().out
     assert "people, then a LoRA: training on robots" in said
     assert "robots alone" in said
 
 
-def test_a_stage_that_was_lost_is_made_again_alike(run):
+def test_a_stage_that_was_lost_is_made_again_alike(weights, run):
     path = run / "lora" / "lora.safetensors"
     before = load_file(path)
     path.unlink()
-    assert main(experiment(run)) == 0
+    assert main(experiment(weights, run)) == 0
     again = load_file(path)
     assert again.keys() == before.keys()
     assert all((again[name] == before[name]).all() for name in before)
 
 
-def test_another_config_is_refused(run, capsys):
-    assert main(experiment(run, "--lora.learning-rate", "0.5")) == 2
+def test_another_config_is_refused(weights, run, capsys):
+    assert main(experiment(weights, run, "--lora.learning-rate", "0.5")) == 2
     assert "experiment.lora.learning_rate" in capsys.readouterr().err
 
 
-def test_a_stage_that_cannot_be_is_refused_before_clips_are_made(tmp_path, capsys):
-    assert main(experiment(tmp_path / "run", "--scratch.learning-rate", "-1")) == 2
+def test_a_stage_that_cannot_be_is_refused_before_clips_are_made(weights, tmp_path, capsys):
+    assert main(experiment(weights, tmp_path / "run", "--scratch.learning-rate", "-1")) == 2
     assert "learning_rate must be positive" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

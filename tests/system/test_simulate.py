@@ -10,20 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egosim_jax import configs
 from egosim_jax.cli import accuracy, view
 from egosim_jax.cli.__main__ import main
-from egosim_jax.generator import Networks
 from egosim_jax.io.video import probe_video
 from egosim_jax.state.snapshot import load, read_ply
 from egosim_jax.types import SceneState, VideoSpec
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("weights")
-    Networks.random(configs.get("debug"), seed=0).save(folder)
-    return folder
 
 
 def simulate(weights: Path, out: Path, *more: str) -> int:

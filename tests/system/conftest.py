@@ -1,0 +1,16 @@
+"""What every command can start from."""
+
+from pathlib import Path
+
+import pytest
+
+from egosim_jax import configs
+from egosim_jax.generator import Networks
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights of `debug`."""
+    folder = tmp_path_factory.mktemp("weights")
+    Networks.random(configs.get("debug"), seed=0).save(folder)
+    return folder
