@@ -17,7 +17,8 @@ import numpy as np
 from einops import rearrange
 
 from egosim_jax.convert.layouts import Found, naming_in
-from egosim_jax.convert.plan import BASE_CHANNELS, MASK, Widening, skeleton, to_theirs
+from egosim_jax.convert.plan import BASE_CHANNELS, MASK, Widening, to_theirs
+from egosim_jax.convert.skeleton import skeleton
 from egosim_jax.generator import ModelConfig, Program
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import fill, flat_shapes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,14 +13,13 @@ import numpy as np
 
 from egosim_jax.convert.layouts import Found, Naming, Network
 from egosim_jax.convert.rules import Leaf, Rule, assign, outline
+from egosim_jax.convert.skeleton import shapes, skeleton
 from egosim_jax.convert.stream import Weight, stored_as
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from flax import nnx
-
     from egosim_jax.generator import ModelConfig
     from egosim_jax.models.lora import Delta
     from egosim_jax.models.wan_dit import WanDiTConfig
@@ -79,7 +78,7 @@ def to_theirs(
     that the network does not have.
     """
     shape = _shape(config, network)
-    if problems := mismatches(tensors, _shapes(network, shape)):
+    if problems := mismatches(tensors, shapes(network, shape)):
         raise WeightsError(problems, source=f"{network}.safetensors")
     parts: dict[str, dict[int, _Part]] = {}
     for rule in _rules(network, naming, shape):
@@ -181,7 +180,7 @@ def _leaves(found: Found, shape: Any) -> dict[str, Leaf]:
         found.tensors,
         _rules(found.network, found.naming, shape),
         ignore=_table(found.network).ignored(shape),
-        want=_shapes(found.network, shape),
+        want=shapes(found.network, shape),
         source=found.source.name,
     )
 
@@ -203,25 +202,6 @@ def _rules(network: Network, naming: Naming, shape: Any) -> list[Rule]:
 
 def _table(network: Network) -> ModuleType:
     return importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
-
-
-@cache
-def _shapes(network: Network, shape: Any) -> dict[str, tuple[int, ...]]:
-    """Of every weight of a config's network, by its path."""
-    return flat_shapes(skeleton(network, shape))
-
-
-def skeleton(network: Network, shape: Any) -> nnx.Module:
-    """The network of a config, without weights."""
-    from flax import nnx
-
-    from egosim_jax.models.clip_vision import CLIPVision
-    from egosim_jax.models.umt5 import UMT5
-    from egosim_jax.models.wan_dit import WanDiT
-    from egosim_jax.models.wan_vae import WanVAE
-
-    made = {"dit": WanDiT, "vae": WanVAE, "text": UMT5, "image": CLIPVision}[network]
-    return nnx.eval_shape(lambda: made(shape, rngs=nnx.Rngs(0)))
 
 
 def _narrow(config: ModelConfig, found: Found) -> Any:

@@ -8,13 +8,10 @@ that the network does not use.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-
-from flax import nnx
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.io.weights import flat_shapes
-from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.convert.skeleton import shapes
+from egosim_jax.models.wan_vae import WanVAEConfig
 
 LEAVES = {"kernel": "weight", "bias": "bias", "scale": "gamma"}
 SHARED = {"space": "resample.1", "time": "time_conv", "qkv": "to_qkv", "out": "proj"}
@@ -73,7 +70,7 @@ def _rules(
 ) -> list[Rule]:
     """A rule for each of our paths, `[half.[group.index.]]part.leaf`."""
     rules = []
-    for path, shape in _shapes(config).items():
+    for path, shape in shapes("vae", config).items():
         *where, part, leaf = path.split(".")
         if len(where) == 3:
             half, group, index = where
@@ -81,11 +78,6 @@ def _rules(
         source = ".".join([*where, words.get(part, part), LEAVES[leaf]])
         rules.append(Rule(source, path, _layout(part, leaf, len(shape))))
     return rules
-
-
-@cache  # making the modules takes most of a second
-def _shapes(config: WanVAEConfig) -> dict[str, tuple[int, ...]]:
-    return flat_shapes(nnx.eval_shape(lambda: WanVAE(config, rngs=nnx.Rngs(0))))
 
 
 def _layout(part: str, leaf: str, axes: int) -> str:

@@ -38,7 +38,8 @@ from safetensors.torch import save_file
 from egosim_jax import configs
 from egosim_jax.convert.commands import STEMS
 from egosim_jax.convert.layouts import Network
-from egosim_jax.convert.plan import TABLES, skeleton, to_theirs
+from egosim_jax.convert.plan import TABLES, to_theirs
+from egosim_jax.convert.skeleton import skeleton
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import flat_shapes
 

