@@ -12,8 +12,11 @@ from pathlib import Path
 
 from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.recipes.real_tiny import CLIP_FRAMES, RealTiny
+from egosim_jax.train.recipes.real_tiny import RealTiny
 from egosim_jax.train.script import Training
+
+CLIP_FRAMES, STRIDE = 25, 8
+"""Of a clip, three windows of 9 frames to train on and two to test on."""
 
 
 def _training(steps: int) -> Training:
@@ -64,7 +67,8 @@ class Debug:
             metadata=self.metadata,
             out=self.out,
             config="debug",
-            stride=8,
+            clip_frames=CLIP_FRAMES,
+            stride=STRIDE,
             vae=self.vae,
             denoiser=self.denoiser,
             weights=self.weights,

@@ -21,9 +21,6 @@ from egosim_jax.train.script import Training, may_differ
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
 
-CLIP_FRAMES = 61
-"""Frames of a whole clip, of which windows are cut."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RealTiny:
@@ -33,11 +30,13 @@ class RealTiny:
     """
 
     metadata: Path
-    """CSV or JSONL in EgoSim's columns, with video and split; clips of 61 frames."""
+    """CSV or JSONL in EgoSim's columns, with video and split."""
     out: Path
     """Folder of the run."""
     config: str = "real_tiny"
     """Name of the model; it must train its own encoders."""
+    clip_frames: int = 61
+    """Frames of every clip, of which windows are cut."""
     stride: int = 2
     """Frames between the windows of a clip that the denoiser is trained on."""
     vae: Training = field(
@@ -96,7 +95,7 @@ class RealTiny:
         out = self.out / "frames" / split
         if not (out / MANIFEST).exists():
             items = select(read_metadata(self.metadata), where=f"split={split}")
-            spec = dataclasses.replace(config.video, frames=CLIP_FRAMES)
+            spec = dataclasses.replace(config.video, frames=self.clip_frames)
             provenance = {"metadata": str(self.metadata)}
             progress = pack(items, out=out, spec=spec, provenance=provenance)
             for problem in track(progress, f"packing {split}", total=len(items)):
