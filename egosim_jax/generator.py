@@ -253,19 +253,24 @@ class Program:
         self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
         self._compiled: dict[Any, Any] = {}
 
-    def compile(self, *args: Any) -> Any:
-        """Compile for these arguments, arrays or shapes, and give the shapes of the answer."""
-        signature, mesh = _signature(args), self._mesh
+    def trace(self, *args: Any) -> Any:
+        """The program for these arguments, arrays or shapes, as `jax.jit` traces it."""
+        mesh = self._mesh
         if mesh is not None:
             check_batch(jax.tree.leaves(args)[0].shape[0], mesh)
             placed = batch_sharding(mesh)
             args = jax.tree.map(
                 lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed), args
             )
-        with contextlib.nullcontext() if mesh is None else jax.set_mesh(mesh):
-            lowered = self._jit.lower(self._params, *args)
-            self._compiled[signature] = lowered.compile()
-        return lowered.out_info
+        with self._on_mesh():
+            return self._jit.trace(self._params, *args)
+
+    def compile(self, *args: Any) -> Any:
+        """Compile for these arguments, arrays or shapes."""
+        traced = self.trace(*args)
+        with self._on_mesh():
+            self._compiled[_signature(args)] = traced.lower().compile()
+        return self._compiled[_signature(args)]
 
     def __call__(self, *args: Any) -> Any:
         """Run, compiling first if nobody has."""
@@ -275,17 +280,31 @@ class Program:
             args = jax.device_put(args, batch_sharding(self._mesh))
         return self._compiled[signature](self._params, *args)
 
+    def _on_mesh(self) -> contextlib.AbstractContextManager[Any]:
+        return contextlib.nullcontext() if self._mesh is None else jax.set_mesh(self._mesh)
+
 
 def _signature(args: Any) -> Any:
     return tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(args))
 
 
 def place(networks: Module, mesh: Mesh | None) -> Module:
-    """Networks whose weights lie on a mesh as the rules say; the same ones without a mesh."""
+    """Networks whose weights lie on a mesh as the rules say; the same ones without a mesh.
+
+    The weights may be shapes: then they are those of weights that would lie there.
+    """
     if mesh is None:
         return networks
     graph, params = nnx.split(networks, nnx.Param)
-    return nnx.merge(graph, jax.device_put(params, state_sharding(mesh, params)))
+    placed = jax.tree.map(_put, params, state_sharding(mesh, params))
+    return nnx.merge(graph, placed)
+
+
+def _put(leaf: Any, sharding: Any) -> Any:
+    """An array on its devices; a shape, of an array that would lie there."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+    return jax.device_put(leaf, sharding)
 
 
 class Generator:
@@ -306,11 +325,22 @@ class Generator:
         )
         self._decode = Program(lambda vae, x: to_uint8(vae.decode(x)), networks.vae, mesh=mesh)
 
+    def programs(self, batch: int) -> dict[str, tuple[Program, tuple]]:
+        """What `generate` runs for a batch of this size, and the shapes that it is given."""
+        inputs = Inputs.shapes(batch, self.config)
+        condition = self._encode.trace(inputs).out_info
+        noise = jax.eval_shape(lambda: self.noise(range(batch)))
+        latents = self._denoise.trace(condition, noise).out_info
+        return {
+            "encode": (self._encode, (inputs,)),
+            "denoise": (self._denoise, (condition, noise)),
+            "decode": (self._decode, (latents,)),
+        }
+
     def compile(self, batch: int) -> None:
         """Compile everything that `generate` needs for batches of this size."""
-        condition = self._encode.compile(Inputs.shapes(batch, self.config))
-        noise = jax.eval_shape(lambda: self.noise(range(batch)))
-        self._decode.compile(self._denoise.compile(condition, noise))
+        for program, given in self.programs(batch).values():
+            program.compile(*given)
 
     def generate(
         self,

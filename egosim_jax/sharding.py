@@ -73,6 +73,12 @@ def several_devices() -> bool:
     return jax.sharding.get_abstract_mesh().size > 1
 
 
+def platform() -> str:
+    """What a program that is traced will run on: `cpu`, `gpu` or `tpu`."""
+    device = jax.sharding.get_abstract_mesh().abstract_device
+    return jax.default_backend() if device is None else device.platform
+
+
 def constrain(x: jax.Array, axes: tuple[str | None, ...]) -> jax.Array:
     """Place an activation as its logical axes say; on one device nothing happens."""
     return jax.lax.with_sharding_constraint(x, spec(*axes)) if several_devices() else x

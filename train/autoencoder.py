@@ -76,6 +76,11 @@ class Autoencoding:
         """Cut one random piece out of a record."""
         return _RandomPiece(self)
 
+    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
+        """Pieces of videos."""
+        shape = (batch, self.video.frames, *self.crop, 3)
+        return {"video": jax.ShapeDtypeStruct(shape, np.uint8)}
+
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " b"]:
         """A key of each sample, of which the first one's draws the noise of all."""
         others = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(1, batch))
@@ -95,7 +100,7 @@ class Autoencoding:
         metrics = {"squared": squared, "edges": edges, "kl": kl, "psnr": _psnr(decoded, video)}
         return squared + self.edges * edges + self.kl * kl, metrics
 
-    def flops(self, batch: Batch) -> float:
+    def flops(self, samples: int) -> float:
         """Not counted."""
         return float("nan")
 

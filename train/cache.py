@@ -109,6 +109,20 @@ def _encode(encoders: Encoders, inputs: Inputs, truth: jax.Array) -> dict[str, j
     return arrays
 
 
+def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeStruct]:
+    """What a batch of records that were encoded for a model holds, before any are."""
+    inputs, video = Inputs.shapes(batch, config), config.video
+    truth = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
+    graph, params = nnx.split(nnx.eval_shape(lambda: Encoders(config, rngs=nnx.Rngs(0))))
+    encoded = jax.eval_shape(
+        lambda params, *given: _encode(nnx.merge(graph, params), *given), params, inputs, truth
+    )
+    given = {"mask": inputs.mask}
+    if config.encoders == "joint":
+        given |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
+    return {name: shape for name, shape in {**given, **encoded}.items() if shape is not None}
+
+
 def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     """Record number and first frame of every window of `frames` frames, `stride` apart.
 

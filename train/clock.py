@@ -11,7 +11,7 @@ from typing import Literal
 
 import jax
 
-from egosim_jax.train.flops import peak
+from egosim_jax.preflight.targets import peak
 
 Phase = Literal["start", "compile", "data", "step", "validate", "sample", "save"]
 PHASES: dict[Phase, str] = {

@@ -6,6 +6,7 @@ from which prior, mask, hands and text are dropped at random (`conditioning/drop
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,7 @@ from egosim_jax.models.clip_vision import CLIPVision
 from egosim_jax.models.layers import LowRankParam
 from egosim_jax.models.umt5 import UMT5
 from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.train.cache import example_shapes
 from egosim_jax.train.flops import count_forward
 from egosim_jax.train.step import Batch, Metrics
 from egosim_jax.types import Condition
@@ -95,6 +97,10 @@ class Denoising:
     def examples(self) -> None:
         """A record of latents is an example as it is."""
 
+    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
+        """Those of cached latents."""
+        return example_shapes(self.model, batch)
+
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, "b 2"]:
         """For each sample, what drops its conditions and what draws its noise."""
         drop, draw = jax.random.split(key)
@@ -123,7 +129,7 @@ class Denoising:
         }
         return {"loss": jnp.mean(jnp.stack(list(errors.values()))), **errors}
 
-    def flops(self, batch: Batch) -> float:
+    def flops(self, samples: int) -> float:
         """Model FLOPs of an update, of the transformer alone, which has nearly all of them."""
         image = self.model.image
         forward = count_forward(
@@ -134,7 +140,6 @@ class Denoising:
         )
         # Backward: by activations and by weights, of which a LoRA's are few.
         weights = 3 if self.rank is None else 2
-        samples = len(batch["truth"])
         return samples * (weights * forward.weights + 3 * forward.attention)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -10,7 +11,8 @@ from egosim_jax.command import DONE
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.models.wan_layers import Remat
-from egosim_jax.train.script import Training
+from egosim_jax.train.recipe import Recipe
+from egosim_jax.train.settings import Stage, Training
 
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FineTuning:
+class FineTuning(Recipe):
     """Train a denoiser from weights, all of it or a LoRA, on cached latents.
 
     Writes OUT/weights, a folder that is complete, or OUT/lora.safetensors; beside it the log,
@@ -52,11 +54,23 @@ class FineTuning:
     samples: int = 2
     """Clips of the validation that are generated every `sample_every` updates."""
 
-    def run(self) -> int:
-        """Check the latents, train, write the weights."""
+    def stages(self) -> Mapping[str, Stage]:
+        """The denoiser's only."""
         from egosim_jax.diffusion.objective import Objective
-        from egosim_jax.train.cache import check_encoders
         from egosim_jax.train.denoiser import Denoising
+
+        model = self._model()
+        task = Denoising(
+            model=model,
+            objective=Objective(schedule=model.schedule, times=self.times),
+            dropout=self.dropout,
+            rank=self.rank,
+        )
+        return {"training": Stage(task, self.training)}
+
+    def train(self) -> int:
+        """Check the latents, train, write the weights."""
+        from egosim_jax.train.cache import check_encoders
         from egosim_jax.train.samples import Samples
         from egosim_jax.train.script import train
 
@@ -65,13 +79,7 @@ class FineTuning:
             if shards is not None:
                 check_encoders(shards, model, self.weights)
         trained = train(
-            Denoising(
-                model=model,
-                objective=Objective(schedule=model.schedule, times=self.times),
-                dropout=self.dropout,
-                rank=self.rank,
-            ),
-            self.training,
+            *self.stages()["training"],
             data=self.latents,
             validation=self.validation,
             out=self.out,

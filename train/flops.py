@@ -1,4 +1,4 @@
-"""Model FLOPs of the video transformer, and what devices can do: for TFLOP/s and MFU.
+"""Model FLOPs of the video transformer.
 
 With N tokens of width d, an MLP of width f, T text and I image tokens and L blocks, a forward has
 
@@ -17,19 +17,6 @@ from typing import NamedTuple
 
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.models.wan_layers import PATCH
-
-PEAKS = {
-    "NVIDIA A100": 312e12,
-    "NVIDIA H100": 989.4e12,
-    "NVIDIA H200": 989.4e12,
-    "NVIDIA B200": 2250e12,
-    "TPU v4": 275e12,
-    "TPU v5 lite": 197e12,
-    "TPU v5p": 459e12,
-    "TPU v5": 459e12,
-    "TPU v6 lite": 918e12,
-}
-"""Dense bfloat16 FLOP/s by the beginning of a device's kind, from the makers' data sheets."""
 
 
 class Flops(NamedTuple):
@@ -63,9 +50,3 @@ def count_forward(
         weights=float(depth * block + embeddings),
         attention=float(depth * 4 * n * (n + text + image) * d),
     )
-
-
-def peak(kind: str) -> float:
-    """FLOP/s of a device of this kind; NaN if it is not known."""
-    known = [name for name in PEAKS if kind.startswith(name)]
-    return PEAKS[max(known, key=len)] if known else float("nan")

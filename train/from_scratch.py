@@ -22,7 +22,8 @@ from egosim_jax.models.wan_vae import WanVAE, standardise_latents
 from egosim_jax.train.autoencoder import Autoencoding, latent_statistics
 from egosim_jax.train.cache import cache
 from egosim_jax.train.denoiser import Denoising
-from egosim_jax.train.script import Training, train
+from egosim_jax.train.script import train
+from egosim_jax.train.settings import Stage, Training
 
 BATCH = 8
 """Clips that are encoded together."""
@@ -55,19 +56,26 @@ class FromScratch:
     weights: Path | None = None
     """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
+    def stages(self) -> Mapping[str, Stage]:
+        """The autoencoder's, unless it comes with the weights, and the denoiser's."""
+        # Pieces as long as the model's clips: a VAE that has only seen shorter ones drifts later.
+        vae = Autoencoding(vae=self.config.vae, video=self.config.video, crop=self.crop)
+        denoiser = Denoising(
+            model=self.config,
+            objective=Objective(schedule=self.config.schedule),
+            dropout=self.dropout,
+            change=self.change,
+        )
+        stages = {"vae": Stage(vae, self.vae), "denoiser": Stage(denoiser, self.denoiser)}
+        return {name: stages[name] for name in stages if name == "denoiser" or not self.weights}
+
     def run(self) -> Path:
         """Autoencoder, latents, denoiser; the folder of the weights."""
         networks = Networks.random(self.config, seed=0)
         networks.vae = self._autoencoder()
         latents = {split: self._encode(split) for split in self.frames}
         trained = train(
-            Denoising(
-                model=self.config,
-                objective=Objective(schedule=self.config.schedule),
-                dropout=self.dropout,
-                change=self.change,
-            ),
-            self.denoiser,
+            *self.stages()["denoiser"],
             data=latents["train"],
             validation=latents["test"],
             out=self.out / "denoiser",
@@ -91,10 +99,8 @@ class FromScratch:
         return vae
 
     def _train_autoencoder(self) -> WanVAE:
-        # Pieces as long as the model's clips: a VAE that has only seen shorter ones drifts later.
         vae = train(
-            Autoencoding(vae=self.config.vae, video=self.config.video, crop=self.crop),
-            self.vae,
+            *self.stages()["vae"],
             data=self.frames["train"],
             validation=self.frames["test"],
             out=self.out / "vae",

@@ -15,7 +15,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,84 +33,22 @@ from egosim_jax.io.weights import hashes, place
 from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
 from egosim_jax.models.layers import initialise
 from egosim_jax.sharding import (
-    MeshConfig,
     batch_sharding,
-    check_batch,
     make_mesh,
     parts,
-    state_sharding,
 )
 from egosim_jax.train.clock import Clock
-from egosim_jax.train.optimizer import OptimizerConfig, learning_rate
+from egosim_jax.train.optimizer import learning_rate
+from egosim_jax.train.programs import Programs
 from egosim_jax.train.samples import Samples
+from egosim_jax.train.settings import HOW_COMPUTED, Training, may_differ
 from egosim_jax.train.state import TrainState
-from egosim_jax.train.step import Task, make_update, make_validation
+from egosim_jax.train.step import Task
 from egosim_jax.train.watchdog import Watchdog
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError
 
 MOST_LEFT_OUT = 3
 """Updates in a row that may be left out: then the run stops."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Training:
-    """How long, how fast and how often."""
-
-    steps: int
-    """Updates in all."""
-    batch_size: int = 32
-    """Examples per update, over all devices."""
-    accumulate: int = 1
-    """Parts in which an update takes its batch, one after the other, to save memory."""
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    """Update rule and learning rate."""
-    mesh: MeshConfig = field(default_factory=MeshConfig)
-    """Layout of the devices."""
-    seed: int = 0
-    """Seed of the initial weights, the order of the data and the noise."""
-    log_every: int = 10
-    """Updates between lines of the log."""
-    save_every: int = 500
-    """Updates between checkpoints."""
-    validate_every: int = 500
-    """Updates between validations."""
-    sample_every: int | None = None
-    """Updates between sample clips; None: none are made."""
-    keep: int = 2
-    """Checkpoints to keep, the newest ones."""
-    keep_every: int | None = None
-    """Also keep the checkpoints whose step is a multiple of this."""
-    fallback: bool = False
-    """If the newest checkpoint is damaged, go on from the one before it."""
-    workers: int = 0
-    """Processes that prepare data; part of the data's order, so keep it when resuming."""
-    patience: float = 300.0
-    """Seconds without a finished step, and ten times what one takes, after which a run counts as
-    hung and ends with exit code 70."""
-    tensorboard: bool = False
-    """Also write for TensorBoard, to OUT/tensorboard."""
-    wandb: str | None = None
-    """Project of Weights & Biases to log to, too."""
-
-    def __post_init__(self) -> None:
-        """Check that every count is positive."""
-        counts = ("steps", "batch_size", "accumulate", "log_every", "save_every", "validate_every")
-        optional = ("sample_every", "keep", "keep_every")
-        check_counts({name: getattr(self, name) for name in (*counts, *optional)})
-
-
-MAY_DIFFER = (
-    "mesh", "accumulate", "log_every", "save_every", "validate_every", "sample_every", "keep",
-    "keep_every", "fallback", "patience", "tensorboard", "wandb",
-)  # fmt: skip
-"""Fields of `Training` that a resumed run may change: they do not change what is computed."""
-HOW_COMPUTED = tuple(f"task.model.dit.{name}" for name in ("dtype", "remat", "attention"))
-"""Fields of a task that change how it is computed."""
-
-
-def may_differ(*names: str) -> tuple[str, ...]:
-    """What a resumed run may change, in fields of these names that are a `Training`."""
-    return tuple(f"{name}.{free}" for name in names for free in MAY_DIFFER)
 
 
 def train(
@@ -137,41 +74,14 @@ def train(
     mesh = make_mesh(training.mesh)
     placed = batch_sharding(mesh)
     source = ShardReader(data)
-    check_batch(training.batch_size, mesh, training.accumulate)
     load = partial(_load, task=task, placed=placed)
     clock = Clock(flops=float("nan"))
 
-    graph, _, frozen = nnx.split(
-        nnx.eval_shape(lambda: task.networks(nnx.Rngs(0))), task.trained, ...
-    )
-    frozen = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, task.frozen_dtype), frozen)
+    programs = Programs.of(task, training, mesh)
+    graph, abstract, sharding = programs.graph, programs.state, programs.state_sharding
+    frozen, update, validate = programs.frozen, programs.update, programs.validate
     if weights is None and jax.tree.leaves(frozen):
         raise InputError("Weights that stay as they are have to come from somewhere. (--weights)")
-
-    def create() -> TrainState:
-        networks = task.networks(nnx.Rngs(training.seed))
-        return TrainState.create(
-            nnx.state(networks, task.trained), training.optimizer, training.steps
-        )
-
-    abstract = jax.eval_shape(create)
-    sharding, frozen_sharding = state_sharding(mesh, abstract), state_sharding(mesh, frozen)
-    update = jax.jit(
-        make_update(
-            task,
-            graph,
-            training.optimizer,
-            steps=training.steps,
-            seed=training.seed,
-            accumulate=training.accumulate,
-        ),
-        in_shardings=(sharding, frozen_sharding, placed),
-        out_shardings=(sharding, None),
-        donate_argnums=0,
-    )
-    validate = jax.jit(
-        make_validation(task, graph), in_shardings=(sharding.params, frozen_sharding, placed)
-    )
 
     with jax.set_mesh(mesh), ExitStack() as opened:
         batches = opened.enter_context(closing(load(source, training)))
@@ -182,20 +92,20 @@ def train(
         if max(checkpoints.steps, default=0) < training.steps:
             with clock.phase("data"), closing(load(source, training, peek=True)) as peek:
                 example = _to_devices(next(peek), placed)
-            clock.flops = task.flops(example)
+            clock.flops = task.flops(training.batch_size)
             with clock.phase("compile"):
                 update = update.lower(abstract, frozen, example).compile()
             _say(f"compiled in {clock.seconds['compile']:.1f} s{_need(update)}")
         checkpoints.check_room(abstract)
         with clock.phase("start"):
             if weights is not None:
-                frozen = place(weights, frozen, frozen_sharding)
+                frozen = place(weights, frozen, programs.frozen_sharding)
             if checkpoints.steps:
                 state = checkpoints.restore(
                     _placed(abstract, sharding), batches, fallback=training.fallback
                 )
             elif weights is None or jax.tree.leaves(frozen):
-                state = initialise(create, out_shardings=sharding)
+                state = initialise(programs.create, out_shardings=sharding)
             else:
                 params = place(weights, abstract.params, sharding.params)
                 begin = partial(TrainState.create, config=training.optimizer, steps=training.steps)

@@ -45,6 +45,10 @@ class Task(Protocol):
         """The Grain transform from a shard's record to an example of arrays."""
         ...
 
+    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
+        """The arrays of a batch of examples, to compile for before there is one."""
+        ...
+
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " *keys"]:
         """The random keys of each sample of a batch."""
         ...
@@ -59,8 +63,8 @@ class Task(Protocol):
         """Numbers that depend on nothing random, the same at every call."""
         ...
 
-    def flops(self, batch: Batch) -> float:
-        """Model FLOPs of an update on a batch; NaN if nobody counted them."""
+    def flops(self, samples: int) -> float:
+        """Model FLOPs of an update on so many samples; NaN if nobody counted them."""
         ...
 
 

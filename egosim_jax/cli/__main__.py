@@ -19,6 +19,7 @@ from egosim_jax.cli.embodiment import Embodiment
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
+from egosim_jax.cli.plan import Plan
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.view import View
 
@@ -61,6 +62,7 @@ class Experiment:
 
 Commands = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from egosim_jax.generator import Generator, ModelConfig
-    from egosim_jax.train.script import Training
+    from egosim_jax.train.settings import Training
     from egosim_jax.types import Kind
 
 Videos = Mapping[str, Sequence["np.ndarray"]]
@@ -77,7 +77,7 @@ class Stage:
     def training(self) -> Training:
         """The same for the training script, with eight validations and checkpoints."""
         from egosim_jax.train.optimizer import OptimizerConfig
-        from egosim_jax.train.script import Training
+        from egosim_jax.train.settings import Training
 
         every = max(1, self.steps // 8)
         return Training(

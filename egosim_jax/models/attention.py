@@ -2,7 +2,7 @@
 
     out = softmax(s) v,    s = scale · q kᵀ
 
-Neither kernel keeps the scores for the backward pass. From out and the log-sum-exp l of each row
+No kernel keeps the scores for the backward pass. From out and the log-sum-exp l of each row
 of s, p = exp(s - l) gives, for the cotangent g of out,
 
     dv = pᵀ g,    ds = p · (g vᵀ - rowsum(g · out)),    dq = scale · ds k,    dk = scale · dsᵀ q
@@ -19,17 +19,26 @@ from einops import rearrange
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from egosim_jax.sharding import ACTIVATIONS, constrain, parts, several_devices, spec
+from egosim_jax.models import flash
+from egosim_jax.sharding import (
+    ACTIVATIONS,
+    constrain,
+    parts,
+    platform,
+    several_devices,
+    spec,
+)
 from egosim_jax.types import InputError
 
-Kernel = Literal["xla", "cudnn"]
+Kernel = Literal["auto", "xla", "cudnn", "splash"]
 """`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`);
-`cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only)."""
+`cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only), `splash` that of TPUs
+(elsewhere it is interpreted, for tests); `auto` is the platform's, where it can be used."""
 SCORES = 2**26
 """Bytes of scores that the `xla` kernel makes at a time, if a single head's are not more: a small
 model's heads all at once, which is faster, and those of a long video one by one."""
 SELF_ATTENTION = "self_attention"
-"""The name, for checkpoint policies, of what the `xla` kernel's backward pass needs."""
+"""The name, for checkpoint policies, of what a kernel's backward pass needs of the forward pass."""
 CUDNN_FORWARD = "dot_product_attention_fwd_wrapper"
 """The primitive whose results are the output and the log-sum-exp of jax's cuDNN kernel."""
 
@@ -44,12 +53,12 @@ def attention(
     kernel: Kernel = "xla",
     over: Literal["heads", "queries"] | None = None,
 ) -> Float[Array, "b n h k"]:
-    """Attend without a mask; scores and softmax are float32 in both kernels.
+    """Attend without a mask; scores and softmax are float32 in every kernel.
 
-    `bias` is added to the scores; `scale` is 1/sqrt(k) unless given. A dense bias keeps the flash
-    kernels from being used well, so that only the text encoder passes one. `over` says what the
-    devices that share a sample divide among them, on a mesh that has such: heads, if there are as
-    many keys as queries, or queries, if there are few keys. Each then runs the kernel by itself.
+    `bias` is added to the scores; `scale` is 1/sqrt(k) unless given. The flash kernels take no
+    dense bias, so that only the text encoder, which has few tokens, passes one. `over` says what
+    the devices that share a sample divide among them, on a mesh that has such: heads, if there are
+    as many keys as queries, or queries, if there are few keys. Each then runs the kernel by itself.
     """
     if over is not None and several_devices():
         _check_parts(q.shape, over)
@@ -69,11 +78,25 @@ def attention(
         if over == "heads":
             k, v = tokens(k), tokens(v)
         return tokens(shared(tokens(q), k, v))
-    if bias is not None or kernel == "cudnn":
-        return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation=kernel)
-    scale = q.shape[-1] ** -0.5 if scale is None else scale
+    if bias is not None:
+        return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation="xla")
+    scale = float(q.shape[-1] ** -0.5) if scale is None else scale
+    kernel = _best(q) if kernel == "auto" else kernel
+    if kernel == "cudnn":
+        return flash.cudnn(q, k, v, scale=scale)
+    if kernel == "splash":
+        name = SELF_ATTENTION if q.shape == k.shape else None
+        return flash.splash(q, k, v, scale=scale, name=name, interpret=platform() != "tpu")
     heads = (rearrange(x, "b n h k -> h b n k") for x in (q, k, v))
     return rearrange(_by_head(*heads, scale), "h b n k -> b n h k")
+
+
+def _best(q: jax.Array) -> Kernel:
+    """The kernel of the platform, if it can compute this."""
+    size = q.shape[-1]
+    if platform() == "gpu" and q.dtype.itemsize == 2 and size % 8 == 0 and size <= 128:
+        return "cudnn"
+    return "splash" if platform() == "tpu" and size % flash.LANES == 0 else "xla"
 
 
 def _check_parts(shape: tuple[int, ...], over: Literal["heads", "queries"]) -> None:

@@ -74,7 +74,7 @@ class WanDiTConfig:
     """Epsilon of the norms."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products and the residual stream."""
-    attention: Kernel = "xla"
+    attention: Kernel = "auto"
     """Attention kernel."""
     remat: Remat = "none"
     """What the backward pass computes again: nothing, all but products with weights and

@@ -21,7 +21,8 @@ from egosim_jax.models.layers import Linear
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.distributed import joined
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training, train
+from egosim_jax.train.script import train
+from egosim_jax.train.settings import Training
 
 WIDTH, POINTS = 8, 40
 
@@ -46,6 +47,14 @@ class Line:
 
         return read if self.pause or self.hang >= 0 else None
 
+    def shapes(self, batch):
+        sizes = {"x": (4,), "y": (WIDTH,), "number": (), "record": ()}
+        dtypes = {"number": np.int32, "record": np.int32}
+        return {
+            name: jax.ShapeDtypeStruct((batch, *size), dtypes.get(name, np.float32))
+            for name, size in sizes.items()
+        }
+
     def keys(self, key, batch):
         return jax.random.split(key, batch)
 
@@ -58,8 +67,8 @@ class Line:
     def validate(self, networks, batch):
         return {"loss": jnp.square(networks(batch["x"]) - batch["y"]).mean()}
 
-    def flops(self, batch):
-        return 6.0 * 4 * WIDTH * len(batch["x"])
+    def flops(self, samples):
+        return 6.0 * 4 * WIDTH * samples
 
 
 def write_points(folder: Path, *, huge: tuple[int, ...] = (), factor: float = 1e30) -> Path:

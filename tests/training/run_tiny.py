@@ -15,7 +15,8 @@ from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.train.denoiser import Denoising
 from egosim_jax.train.distributed import joined
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training, train
+from egosim_jax.train.script import train
+from egosim_jax.train.settings import Training
 from egosim_jax.types import VideoSpec
 
 DEBUG = configs.get("debug")

@@ -10,9 +10,10 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
+from egosim_jax.preflight.targets import peak
 from egosim_jax.train.clock import Clock
 from egosim_jax.train.denoiser import Denoising
-from egosim_jax.train.flops import count_forward, peak
+from egosim_jax.train.flops import count_forward
 
 
 def test_a_forward_of_the_14b_takes_1126_tflop():
@@ -42,8 +43,7 @@ def test_the_count_is_the_compilers_of_a_small_network(image):
 
 def test_an_update_takes_three_forwards_and_a_loras_spares_the_gradients_of_weights():
     model = configs.get("debug")
-    batch = {"truth": jnp.zeros((3, 1))}
-    whole, low = Denoising(model=model).flops(batch), Denoising(model=model, rank=2).flops(batch)
+    whole, low = Denoising(model=model).flops(3), Denoising(model=model, rank=2).flops(3)
     tokens = {"text": model.tokenizer.max_tokens, "image": 5}
     forward = count_forward(model.dit, latents=model.video.latent_shape, **tokens)
     assert whole == pytest.approx(9 * forward.total)

@@ -9,7 +9,7 @@ import tyro
 
 from egosim_jax.cli.__main__ import Commands
 from egosim_jax.convert.__main__ import Commands as Conversions
-from egosim_jax.train.__main__ import Recipes
+from egosim_jax.train.__main__ import Recipes, with_paths
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = {"egosim": Commands, "egosim-train": Recipes, "egosim-convert": Conversions}
@@ -40,4 +40,5 @@ def test_there_are_commands_of_every_program():
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_is_understood(command):
     program, *args = shlex.split(command)
+    args = with_paths(args) if "--preflight" in args else args
     tyro.cli(PROGRAMS[program], args=args, config=(tyro.conf.OmitSubcommandPrefixes,))

@@ -7,13 +7,15 @@ takes minutes on 2 CPU cores.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
+from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.recipes.real_tiny import RealTiny
-from egosim_jax.train.script import Training
+from egosim_jax.train.settings import Stage, Training
 
 CLIP_FRAMES, STRIDE = 25, 8
 """Of a clip, three windows of 9 frames to train on and two to test on."""
@@ -31,7 +33,7 @@ def _training(steps: int) -> Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Debug:
+class Debug(Recipe):
     """Train `debug` for a few steps on a few clips of the tabletop world."""
 
     out: Path
@@ -50,7 +52,11 @@ class Debug:
         """The clips, as files."""
         return self.out / "clips" / "metadata.csv"
 
-    def run(self) -> int:
+    def stages(self) -> Mapping[str, Stage]:
+        """Those of `real_tiny`."""
+        return self._real_tiny().stages()
+
+    def train(self) -> int:
         """Make the clips, then do as `real_tiny` does."""
         from egosim_jax import configs
         from egosim_jax.data.clips import write_clips
@@ -63,6 +69,9 @@ class Debug:
             splits = ({"split": "test" if n % 4 == 3 else "train"} for n in range(self.clips))
             clips = (replace(clip, extra=extra) for clip, extra in zip(made, splits, strict=True))
             write_clips(self.metadata.parent, clips, fps=spec.fps)
+        return self._real_tiny().train()
+
+    def _real_tiny(self) -> RealTiny:
         return RealTiny(
             metadata=self.metadata,
             out=self.out,
@@ -72,4 +81,4 @@ class Debug:
             vae=self.vae,
             denoiser=self.denoiser,
             weights=self.weights,
-        ).run()
+        )

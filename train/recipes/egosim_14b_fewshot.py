@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from egosim_jax.train.fine_tuning import FineTuning
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training
+from egosim_jax.train.settings import Training
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,14 +17,15 @@ from typing import TYPE_CHECKING
 from egosim_jax.command import DONE
 from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training, may_differ
+from egosim_jax.train.recipe import Recipe
+from egosim_jax.train.settings import Stage, Training, may_differ
 
 if TYPE_CHECKING:
-    from egosim_jax.generator import ModelConfig
+    from egosim_jax.train.from_scratch import FromScratch
 
 
 @dataclass(frozen=True, kw_only=True)
-class RealTiny:
+class RealTiny(Recipe):
     """Train `real_tiny` from scratch on the clips of a metadata file.
 
     Writes OUT/weights, and beside it the shards, logs and checkpoints of each stage.
@@ -64,29 +66,37 @@ class RealTiny:
     weights: Path | None = None
     """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
-    def run(self) -> int:
+    def stages(self) -> Mapping[str, Stage]:
+        """The autoencoder's and the denoiser's."""
+        return self._from_scratch({}).stages()
+
+    def train(self) -> int:
         """Frames, autoencoder, latents, denoiser, weights."""
-        from egosim_jax import configs
         from egosim_jax.io.run import open_folder
-        from egosim_jax.train.from_scratch import FromScratch
 
         check_alone("real_tiny")
-        config = configs.get(self.config)
-        open_folder(self.out, self, may_differ=may_differ("vae", "denoiser"))
-        stages = FromScratch(
-            config=config,
-            frames={split: self._pack(split, config) for split in ("train", "test")},
+        open_folder(self.out, self, may_differ=[*may_differ("vae", "denoiser"), "json"])
+        frames = {split: self._pack(split) for split in ("train", "test")}
+        print(self._from_scratch(frames).run())
+        return DONE
+
+    def _from_scratch(self, frames: Mapping[str, Path]) -> FromScratch:
+        from egosim_jax import configs
+        from egosim_jax.train.from_scratch import FromScratch
+
+        return FromScratch(
+            config=configs.get(self.config),
+            frames=frames,
             out=self.out,
             vae=self.vae,
             denoiser=self.denoiser,
             weights=self.weights,
             stride=self.stride,
         )
-        print(stages.run())
-        return DONE
 
-    def _pack(self, split: str, config: ModelConfig) -> Path:
+    def _pack(self, split: str) -> Path:
         """Decode the clips of a split at the model's size."""
+        from egosim_jax import configs
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.data.pack import pack
         from egosim_jax.data.shards import MANIFEST
@@ -95,7 +105,7 @@ class RealTiny:
         out = self.out / "frames" / split
         if not (out / MANIFEST).exists():
             items = select(read_metadata(self.metadata), where=f"split={split}")
-            spec = dataclasses.replace(config.video, frames=self.clip_frames)
+            spec = dataclasses.replace(configs.get(self.config).video, frames=self.clip_frames)
             provenance = {"metadata": str(self.metadata)}
             progress = pack(items, out=out, spec=spec, provenance=provenance)
             for problem in track(progress, f"packing {split}", total=len(items)):

@@ -9,20 +9,26 @@ resumes: run the same command again after an interruption.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from egosim_jax.command import DONE
 from egosim_jax.train.distributed import check_alone
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import Training, may_differ
+from egosim_jax.train.recipe import Recipe
+from egosim_jax.train.settings import Stage, Training, may_differ
+
+if TYPE_CHECKING:
+    from egosim_jax.train.from_scratch import FromScratch
 
 FIRST_TRAINED = 1000
 """Seed of the first scene that is trained on; those below are held out."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tabletop:
+class Tabletop(Recipe):
     """Train `tabletop` from scratch on scenes of the tabletop world, a quarter of them a robot's.
 
     Writes OUT/weights, and beside it the shards, logs and checkpoints of each stage.
@@ -66,21 +72,31 @@ class Tabletop:
     weights: Path | None = None
     """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
 
-    def run(self) -> int:
+    def stages(self) -> Mapping[str, Stage]:
+        """The autoencoder's and the denoiser's."""
+        return self._from_scratch({}).stages()
+
+    def train(self) -> int:
         """Clips, autoencoder, latents, denoiser, weights."""
-        from egosim_jax import configs
-        from egosim_jax.conditioning.dropout import ConditionDropout
         from egosim_jax.io.run import open_folder
-        from egosim_jax.train.from_scratch import FromScratch
 
         check_alone("tabletop")
-        open_folder(self.out, self, may_differ=may_differ("vae", "denoiser"))
-        stages = FromScratch(
+        open_folder(self.out, self, may_differ=[*may_differ("vae", "denoiser"), "json"])
+        frames = {
+            "train": self._make("train", range(FIRST_TRAINED, FIRST_TRAINED + self.scenes), 2),
+            "test": self._make("test", range(self.held_out), 1),
+        }
+        print(self._from_scratch(frames).run())
+        return DONE
+
+    def _from_scratch(self, frames: Mapping[str, Path]) -> FromScratch:
+        from egosim_jax import configs
+        from egosim_jax.conditioning.dropout import ConditionDropout
+        from egosim_jax.train.from_scratch import FromScratch
+
+        return FromScratch(
             config=configs.get(self.config),
-            frames={
-                "train": self._make("train", range(FIRST_TRAINED, FIRST_TRAINED + self.scenes), 2),
-                "test": self._make("test", range(self.held_out), 1),
-            },
+            frames=frames,
             out=self.out,
             vae=self.vae,
             denoiser=self.denoiser,
@@ -89,8 +105,6 @@ class Tabletop:
             change=self.change,
             dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
         )
-        print(stages.run())
-        return DONE
 
     def _make(self, split: str, seeds: range, clips: int) -> Path:
         """The clips of a split, decoded."""

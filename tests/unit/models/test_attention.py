@@ -1,5 +1,7 @@
 """Attention against the textbook formula in float64."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
 from egosim_jax.models import attention as module
+from egosim_jax.models import flash
 from egosim_jax.models.attention import attention, keep_attention
 
 ROUNDING = 2e-6
@@ -74,7 +77,57 @@ def test_a_bias_is_added_to_the_scores():
     np.testing.assert_allclose(have, np.repeat(v[:, 3:4], 5, 1), rtol=0, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("kernel", ["xla", "cudnn"])
+def value_and_gradients(attend, q, k, v):
+    """Of a sum whose parts count differently."""
+    weights = jnp.float32(draw(*q.shape, seed=3))
+    return jax.value_and_grad(lambda *x: (weights * attend(*x)).sum(), argnums=(0, 1, 2))(q, k, v)
+
+
+@pytest.mark.parametrize(("queries", "keys"), [(128, 128), (200, 200), (200, 257), (1280, 1280)])
+def test_splash_is_the_same_as_xla(queries, keys):
+    shapes = [(1, tokens, 2, 128) for tokens in (queries, keys, keys)]
+    arrays = [jnp.float32(draw(*shape, seed=n)) for n, shape in enumerate(shapes)]
+    have, want = (
+        value_and_gradients(partial(attention, kernel=kernel), *arrays)
+        for kernel in ("splash", "xla")
+    )
+    for a, b in zip(jax.tree.leaves(have), jax.tree.leaves(want), strict=True):
+        assert np.linalg.norm(a - b) <= 1e-5 * np.linalg.norm(b)
+
+
+@pytest.mark.parametrize(("tokens", "length", "block"), [(24960, 24960, 640), (25000, 25088, 896)])
+def test_splash_pads_as_little_as_it_can(tokens, length, block):
+    assert flash._blocks(tokens) == (length, block)
+
+
+@pytest.mark.parametrize("keys", [7, 8, 257])
+def test_keys_that_are_added_for_cudnn_change_nothing(keys):
+    q, k, v = inputs(keys)
+    arrays = list(map(jnp.float32, (q, k, v)))
+    padded = partial(flash.cudnn, scale=8**-0.5, implementation="xla")
+    np.testing.assert_allclose(padded(*arrays), formula(q, k, v, 8**-0.5), rtol=0, atol=ROUNDING)
+    have, want = (value_and_gradients(attend, *arrays) for attend in (padded, attention))
+    for a, b in zip(jax.tree.leaves(have), jax.tree.leaves(want), strict=True):
+        assert np.linalg.norm(a - b) <= 1e-5 * np.linalg.norm(b)
+
+
+@pytest.mark.parametrize(
+    ("platform", "dtype", "size", "kernel"),
+    [
+        ("cpu", "float32", 128, "xla"),
+        ("gpu", "bfloat16", 128, "cudnn"),
+        ("gpu", "float32", 128, "xla"),
+        ("gpu", "bfloat16", 36, "xla"),
+        ("tpu", "bfloat16", 128, "splash"),
+        ("tpu", "float32", 24, "xla"),
+    ],
+)
+def test_each_platform_has_its_kernel(platform, dtype, size, kernel, monkeypatch):
+    monkeypatch.setattr(module, "platform", lambda: platform)
+    assert module._best(jnp.zeros((1, 2, 3, size), dtype)) == kernel
+
+
+@pytest.mark.parametrize("kernel", ["xla", "cudnn", "splash"])
 def test_the_checkpoint_policy_keeps_output_and_log_sum_of_self_attention(kernel, monkeypatch):
     # The kernel is traced, not run: no GPU is needed but for its version.
     monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
@@ -88,9 +141,12 @@ def test_the_checkpoint_policy_keeps_output_and_log_sum_of_self_attention(kernel
     def kept(policy):
         remat = jax.checkpoint(block, policy=policy)
         pull = jax.eval_shape(lambda *x: jax.vjp(remat, *x)[1], video, video, video, text, text)
-        return sorted(leaf.size for leaf in jax.tree.leaves(pull))
+        # Splash also keeps what it knows of its mask, which is small.
+        return sorted(leaf.size for leaf in jax.tree.leaves(pull) if leaf.size > 128)
 
     arguments = [2 * 32 * 4 * 128] * 2 + [2 * 64 * 4 * 128] * 3
     log_sum, output = 2 * 64 * 4, 2 * 64 * 4 * 128
+    if kernel == "splash":  # which pads to its lanes
+        log_sum, output = 2 * log_sum, 2 * output
     assert kept(None) == sorted(arguments)
     assert kept(keep_attention) == sorted([*arguments, log_sum, output])

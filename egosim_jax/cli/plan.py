@@ -1,0 +1,138 @@
+"""`egosim plan`: whether generating clips fits a machine, and how fast it can be there."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from math import prod
+from typing import TYPE_CHECKING, Any
+
+from egosim_jax.command import DONE, FAILED
+from egosim_jax.types import MeshConfig, check_counts
+
+if TYPE_CHECKING:
+    from flax import nnx
+    from jax.sharding import Mesh
+
+    from egosim_jax.generator import ModelConfig
+    from egosim_jax.preflight.report import Report, TooLarge
+    from egosim_jax.preflight.targets import Target
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Compile what `generate` runs for a machine that need not be there; say whether it fits.
+
+    Prints, for encoding, denoising and decoding: memory of a device with the weights of all four
+    networks, the largest arrays, collectives, FLOPs and the least time. Exit code 1 if one of them
+    does not fit.
+    """
+
+    config: str
+    """Name of the model."""
+    target: str
+    """The machine, as in h200:1, h200:8, v5p:2x2x2 or cpu:1."""
+    batch_size: int | None = None
+    """Clips generated together; by default one for each device that has one of its own."""
+    steps: int | None = None
+    """Denoising steps, if not the model's own."""
+    mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
+    """Layout of the devices; by default each makes clips of its own. Less time for one clip:
+    --mesh.data 1 --mesh.context -1. Weights too large for one device: --mesh.data 1
+    --mesh.fsdp -1."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> int:
+        """Compile and print."""
+        from egosim_jax import configs
+        from egosim_jax.preflight import report as reports
+        from egosim_jax.preflight.targets import find
+        from egosim_jax.sharding import make_mesh, parts
+
+        check_counts({"--batch-size": self.batch_size, "--steps": self.steps})
+        config, target = configs.get(self.config), find(self.target)
+        config = replace(config, steps=self.steps or config.steps)
+        mesh = make_mesh(self.mesh, target.devices)
+        size = self.batch_size or parts("batch", mesh)
+        found = {}
+        for name, report in plan(config, target, mesh, size):
+            found[name] = report
+            if not self.json:
+                text = reports.text(report)
+                print(f"{name} on {target.name}, {size} clips\n\n{text}\n", flush=True)
+        if self.json:
+            values = {name: reports.plain(report) for name, report in found.items()}
+            print(json.dumps(values, indent=2))
+        else:
+            print(_summary(found, size))
+        return DONE if all(report.fits for report in found.values()) else FAILED
+
+
+def plan(
+    config: ModelConfig, target: Target, mesh: Mesh, size: int
+) -> Iterator[tuple[str, Report | TooLarge]]:
+    """What each program of generation takes, beside the weights of all networks."""
+    import jax
+    from flax import nnx
+
+    from egosim_jax.generator import Generator, Networks, place
+    from egosim_jax.preflight import flops
+    from egosim_jax.preflight.report import inspect, refusal
+
+    networks = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0)))
+    for name, network in networks.parts().items():
+        setattr(networks, name, _stored(network, getattr(config, name).dtype))
+    networks = place(networks, mesh)
+    generator, weights = Generator(config, networks, mesh), _on_a_device(nnx.state(networks))
+    for name, (program, given) in generator.programs(size).items():
+        traced, begun = program.trace(*given), time.perf_counter()
+        try:
+            compiled = program.compile(*given)
+        except jax.errors.JaxRuntimeError as error:
+            yield name, refusal(error, target)
+            continue
+        yield (
+            name,
+            inspect(
+                compiled,
+                target,
+                model_flops=float("nan"),
+                hardware_flops=flops.count(traced.jaxpr),
+                compile_s=time.perf_counter() - begun,
+                resident=weights,
+            ),
+        )
+
+
+def _stored(network: nnx.Module, dtype: str) -> nnx.Module:
+    """The network with weights in the dtype in which it computes, as converted ones are."""
+    import jax
+    from flax import nnx
+
+    graph, params = nnx.split(network)
+    return nnx.merge(
+        graph, jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype), params)
+    )
+
+
+def _on_a_device(shapes: Any) -> int:
+    """Bytes that arrays of these shapes and shardings take of each device."""
+    import jax
+
+    return sum(
+        prod(leaf.sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize
+        for leaf in jax.tree.leaves(shapes)
+    )
+
+
+def _summary(found: Mapping[str, Report | TooLarge], size: int) -> str:
+    """The least time of a batch, if the target's speed is known."""
+    seconds = {name: getattr(report, "least_s", math.nan) for name, report in found.items()}
+    if any(map(math.isnan, seconds.values())):
+        return ""
+    parts = ", ".join(f"{name} {least:.3g}" for name, least in seconds.items())
+    return f"{size} clips take at least {sum(seconds.values()):.3g} s: {parts}"

@@ -1,0 +1,202 @@
+"""What fits where: the README's tables, compiled cell by cell by the targets' own compilers.
+
+    pip install -e '.[cuda,tpu]'
+    python -m tests.benchmarks.fits [--only TEXT]
+    python -m tests.benchmarks.fits --write
+
+A cell takes from 20 s to 2 minutes on two cores. Cells are kept in `.fits.json`, so that a run that
+was interrupted goes on; `--write` puts what is known into the README.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from egosim_jax import configs
+from egosim_jax.cli.plan import plan
+from egosim_jax.io.run import write_json, write_text
+from egosim_jax.preflight.report import Report, plain
+from egosim_jax.preflight.targets import find
+from egosim_jax.sharding import make_mesh, parts
+from egosim_jax.train import recipes
+from egosim_jax.train.preflight import compile_step
+from egosim_jax.train.recipe import Recipe
+from egosim_jax.types import MeshConfig
+
+CELLS = Path(".fits.json")
+BEGIN, END = "<!-- python -m tests.benchmarks.fits --write -->", "<!-- end -->"
+ROOT = Path(__file__).parents[2]
+REMATS = ("full", "attention", "products", "none", "offload")
+TARGETS = ("h200:8", "h100:8", "h200:1", "h100:1", "b200:8", "v5p:2x2x2", "v6e:4x4", "v6e:8x8")
+RECIPES: dict[str, type[Recipe]] = {
+    "egosim_14b": recipes.Egosim14B,
+    "egosim_1_3b": recipes.Egosim1B,
+    "egosim_14b_robot": recipes.Egosim14BRobot,
+    "egosim_14b_fewshot": recipes.Egosim14BFewshot,
+    "egosim_14b_lora": recipes.Egosim14BLora,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """A recipe's update: clips on a device at a time and remat are its own unless given."""
+
+    recipe: str
+    target: str
+    clips: int | None = None
+    remat: str | None = None
+
+    def measure(self) -> dict[str, Any]:
+        paths = {name: Path() for name in ("latents", "weights", "out")}
+        recipe: Any = RECIPES[self.recipe](**paths, remat=self.remat)
+        (stage,) = recipe.stages().values()
+        target = find(self.target)
+        groups = parts("batch", make_mesh(stage.training.mesh, target.devices))
+        batch = max(stage.training.batch_size, groups)  # one clip a device at least
+        accumulate = stage.training.accumulate
+        if self.clips is not None:
+            accumulate = max(1, batch // groups // self.clips)
+        elif batch % (groups * accumulate):
+            accumulate = batch // groups
+        training = replace(stage.training, batch_size=batch, accumulate=accumulate)
+        report = compile_step(stage._replace(training=training), target)
+        return {**plain(report), "clips": batch // groups // accumulate, "batch": batch}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generation:
+    """Making clips: one for each device, or one that all devices share."""
+
+    config: str
+    target: str
+    shared: bool
+
+    def measure(self) -> dict[str, Any]:
+        target, config = find(self.target), configs.get(self.config)
+        layout = (
+            MeshConfig(data=1, fsdp=1, context=-1) if self.shared else MeshConfig(data=-1, fsdp=1)
+        )
+        mesh = make_mesh(layout, target.devices)
+        size = parts("batch", mesh)
+        reports = dict(plan(config, target, mesh, size))
+        worst = max(reports.values(), key=lambda report: _peak(plain(report)))
+        seconds = [r.least_s if isinstance(r, Report) else float("nan") for r in reports.values()]
+        return {**plain(worst), "least_s": sum(seconds), "batch": size}
+
+
+Cell = Training | Generation
+
+
+def all_cells() -> Iterator[Cell]:
+    for target in ("h200:8", "h100:8"):
+        for clips in (1, 2, 4):
+            for remat in REMATS:
+                yield Training(recipe="egosim_14b", target=target, clips=clips, remat=remat)
+    for shared, target in (
+        (False, "h200:1"),
+        (True, "h200:8"),
+        (False, "h100:1"),
+        (True, "h100:8"),
+    ):
+        yield Generation(config="egosim_14b", target=target, shared=shared)
+    for target in TARGETS:
+        for recipe in RECIPES:
+            yield Training(recipe=recipe, target=target)
+
+
+def _peak(values: dict[str, Any]) -> float:
+    return values.get("peak") or values["needs"]
+
+
+def _cell(values: dict[str, Any] | None) -> str:
+    """GiB of a device, and what there are if that is more."""
+    if values is None:
+        return ""
+    need, have = (f"{x / 2**30:.0f}" for x in (_peak(values), values["capacity"]))
+    return need if values["fits"] else f"{need} > {have}"
+
+
+def _rows(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def tables(known: dict[str, dict[str, Any]]) -> str:
+    """All cells as Markdown."""
+
+    def found(cell: Cell) -> dict[str, Any] | None:
+        return known.get(repr(cell))
+
+    by_remat = [
+        [f"`{target}`, {clips}"]
+        + [
+            _cell(found(Training(recipe="egosim_14b", target=target, clips=clips, remat=remat)))
+            for remat in REMATS
+        ]
+        for target in ("h200:8", "h100:8")
+        for clips in (1, 2, 4)
+    ]
+    by_target = []
+    for recipe in RECIPES:
+        cells = [found(Training(recipe=recipe, target=target)) for target in TARGETS]
+        shown = [f"{_cell(c)} ({c['clips']})" if c else "" for c in cells]
+        by_target.append([f"`{recipe}`", *shown])
+    makes = [cell for cell in all_cells() if isinstance(cell, Generation) and found(cell)]
+    generation = [
+        [f"`{cell.target}`", "one, shared" if cell.shared else "one a device"]
+        + [_cell(found(cell)), f"{known[repr(cell)]['least_s']:.0f} s"]
+        for cell in makes
+    ]
+    return "\n\n".join(
+        [
+            "All weights of `egosim_14b` trained, batch 32, GiB of a device by `--remat` and by\n"
+            "clips on a device at a time; what does not fit stands beside what there is:",
+            _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
+            "Every recipe as it is, GiB of a device (clips on a device at a time):",
+            _rows(["recipe", *(f"`{target}`" for target in TARGETS)], by_target),
+            "Generation with `egosim_14b`, 50 steps, with the weights of all networks; the time\n"
+            "is the least that the devices' peak allows:",
+            _rows(["target", "clips", "GiB", "least"], generation),
+        ]
+    )
+
+
+def write(known: dict[str, dict[str, Any]]) -> None:
+    """Put the tables between the marks in the README."""
+    path = ROOT / "README.md"
+    before, _, rest = path.read_text("utf-8").partition(BEGIN)
+    _, _, after = rest.partition(END)
+    write_text(path, f"{before}{BEGIN}\n\n{tables(known)}\n\n{END}{after}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="measure cells whose name has this text")
+    parser.add_argument("--write", action="store_true", help="only write what is known")
+    options = parser.parse_args()
+    known = json.loads(CELLS.read_text("utf-8")) if CELLS.exists() else {}
+    if options.write:
+        write(known)
+        return
+    todo = [cell for cell in all_cells() if repr(cell) not in known and options.only in repr(cell)]
+    for number, cell in enumerate(todo, start=1):
+        begun = time.monotonic()
+        values = cell.measure()
+        known[repr(cell)] = {**values, "seconds": time.monotonic() - begun}
+        write_json(CELLS, known)
+        verdict = "fits" if values["fits"] else "does not fit"
+        print(
+            f"{number}/{len(todo)} {cell}: {_peak(values) / 2**30:.1f} GiB, {verdict}, "
+            f"{time.monotonic() - begun:.0f} s",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

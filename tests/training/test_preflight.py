@@ -1,0 +1,136 @@
+"""Preflights on this machine's CPU, whose memory can be measured."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.preflight import targets
+from egosim_jax.train import preflight as module
+from egosim_jax.train.__main__ import main as egosim_train
+from egosim_jax.train.__main__ import with_paths
+from egosim_jax.train.preflight import Setting
+from egosim_jax.train.recipes import Debug
+from tests.flags import devices
+
+SCRIPT = Path(__file__).parent / "run_memory.py"
+
+
+def test_the_memory_of_a_step_is_what_was_foretold():
+    """Within 15 %: the libraries' own buffers are not XLA's."""
+    program = [sys.executable, "-m", "tests.training.run_memory"]
+    ran = subprocess.run(
+        program,
+        env={**os.environ, **devices(1)},
+        cwd=SCRIPT.parents[2],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    found = json.loads(ran.stdout)
+    assert found["taken"] == pytest.approx(found["foretold"], rel=0.15)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """This machine with 1 MB of memory."""
+    machine = targets._this_processor()
+    monkeypatch.setattr(targets, "_this_processor", lambda: replace(machine, memory=1e6))
+
+
+def test_a_recipe_is_compiled_without_any_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert egosim_train(["debug", "--preflight", "cpu:1"]) == 0
+    printed = capsys.readouterr().out
+    assert "vae on cpu:1, 1 x cpu: batch 2" in printed
+    assert "denoiser on cpu:1, 1 x cpu: batch 2" in printed
+    assert printed.count(": fits") == 2
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("small")
+def test_json_has_the_memory_and_what_does_not_fit_ends_with_1(capsys):
+    assert egosim_train(["debug", "--preflight", "cpu:1", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)["denoiser"]["asked"]
+    assert not report["fits"]
+    assert report["peak"] == sum(report["memory"].values()) > report["capacity"] == 1e6
+    assert report["hardware_flops"] > report["model_flops"] > 0
+    assert len(report["largest"]) == 10
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["debug", "--preflight", "h20:8"], "Nearest device: h200"),
+        (["debug", "--preflight", "cpu:1", "--vae.batch-size", "3", "--vae.accumulate", "2"], "3"),
+        (["debug", "--preflight", "cpu:1", "--vae.mesh.fsdp", "2"], "does not fit 1 devices"),
+    ],
+)
+def test_what_cannot_be_compiled_is_refused(args, said, capsys):
+    assert egosim_train(args) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_only_the_paths_that_a_recipe_needs_are_left_out():
+    given = ["egosim_14b", "--preflight", "h200:8", "--out", "runs/a"]
+    assert with_paths(given) == [*given, "--latents", "-", "--weights", "-"]
+    assert with_paths(["tabletop", "--preflight", "h200:1"])[3:] == ["--out", "-"]
+
+
+def test_settings_that_fit_are_found_and_what_needs_more_is_not_tried(monkeypatch):
+    """Of a batch of 8 on one device, with room for 2 clips, or for 1 with attention's output."""
+    room = {(1, "full"), (1, "attention"), (2, "full")}
+    tried = []
+
+    def compile_step(stage, target):
+        setting = module._setting(stage, target)
+        tried.append((setting.clips, setting.remat))
+        return report((setting.clips, setting.remat) in room, setting)
+
+    def report(fits, setting):
+        needed = replace(measured.memory, temporaries=0 if fits else 10**12)
+        seconds = {"full": 4.0, "attention": 3.5}.get(setting.remat, 3.0) + 0.2 / setting.clips
+        return replace(measured, memory=needed, compute_s=seconds, memory_s=0.0, link_s=0.0)
+
+    stage, target = Debug(out=Path()).stages()["denoiser"], targets.find("cpu:1")
+    stage = stage._replace(training=replace(stage.training, batch_size=8))
+    measured = module.compile_step(stage, target)
+    monkeypatch.setattr(module, "compile_step", compile_step)
+    asked = report(False, Setting(clips=8, remat="none"))
+    found = module._others(stage, target, asked)
+    assert [(setting.clips, setting.remat) for setting in found] == [
+        (1, "attention"),
+        (2, "full"),
+        (1, "full"),
+    ]
+    assert tried == [
+        (1, "full"),
+        (1, "attention"),
+        (1, "products"),
+        (2, "full"),
+        (2, "attention"),
+        (4, "full"),
+    ]
+
+
+def test_generation_is_planned_program_by_program(capsys):
+    assert egosim(["plan", "--config", "debug", "--target", "cpu:1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert list(report) == ["encode", "denoise", "decode"]
+    weights = min(program["memory"]["arguments"] for program in report.values())
+    for program in report.values():
+        assert program["fits"]
+        assert weights <= program["memory"]["arguments"] < 2 * weights
+        assert program["hardware_flops"] > 0
+
+
+@pytest.mark.usefixtures("small")
+def test_a_plan_that_does_not_fit_ends_with_1(capsys):
+    assert egosim(["plan", "--config", "debug", "--target", "cpu:1"]) == 1
+    assert "does not fit" in capsys.readouterr().out

@@ -1,0 +1,162 @@
+"""Whether a training step fits a machine, compiled for it by its own compiler.
+
+The step is the one that training runs: the same function, mesh, shardings and donation. After the
+recipe's own setting come the others that take the same batch: as many clips at a time on a device,
+and as much kept for the backward pass, as there is memory for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+
+from egosim_jax.command import DONE, FAILED
+from egosim_jax.models.wan_layers import Remat
+from egosim_jax.preflight import flops
+from egosim_jax.preflight.report import Report, TooLarge, inspect, plain, refusal, size, text
+from egosim_jax.preflight.targets import Target, find
+from egosim_jax.progress import track
+from egosim_jax.sharding import batch_sharding, make_mesh, parts
+from egosim_jax.train.denoiser import Denoising
+from egosim_jax.train.programs import Programs
+from egosim_jax.train.settings import Stage
+
+KEEPING: tuple[Remat, ...] = ("full", "attention", "products", "none")
+"""What a backward pass may compute again, by the memory that it takes, least first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """How a step takes its batch."""
+
+    clips: int
+    """On a device at a time; those that share a clip count as one."""
+    remat: Remat
+    """What the backward pass computes again."""
+
+
+def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool) -> int:
+    """Print what the stages of a recipe take on a target; 1 if one of them does not fit."""
+    target, fit = find(name), True
+    found: dict[str, dict[str, Any]] = {}
+    for title, stage in stages.items():
+        report = compile_step(stage, target)
+        fit &= report.fits
+        found[title] = {"asked": plain(report)}
+        if not as_json:
+            print(f"{_heading(title, stage, target)}\n\n{text(report)}", flush=True)
+        # Settings are ordered by the target's speed.
+        if isinstance(stage.task, Denoising) and not math.isnan(target.device.flops):
+            others = _others(stage, target, report)
+            found[title]["settings"] = [
+                {"clips": setting.clips, "remat": setting.remat, **plain(report)}
+                for setting, report in others.items()
+            ]
+            if not as_json:
+                print(_table(others, stage.training.batch_size))
+    if as_json:
+        print(json.dumps(found, indent=2))
+    return DONE if fit else FAILED
+
+
+def compile_step(stage: Stage, target: Target) -> Report | TooLarge:
+    """Compile an update for a target. Raises `InputError` if batch and mesh do not fit it."""
+    task, training = stage
+    mesh = make_mesh(training.mesh, target.devices)
+    programs, placed = Programs.of(task, training, mesh), batch_sharding(mesh)
+    batch = {
+        name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed)
+        for name, leaf in task.shapes(training.batch_size).items()
+    }
+    with jax.set_mesh(mesh):
+        traced = programs.update.trace(programs.state, programs.frozen, batch)
+        begun = time.perf_counter()
+        try:
+            compiled = traced.lower().compile()
+        except jax.errors.JaxRuntimeError as error:
+            return refusal(error, target)
+    return inspect(
+        compiled,
+        target,
+        model_flops=task.flops(training.batch_size),
+        hardware_flops=flops.count(traced.jaxpr),
+        compile_s=time.perf_counter() - begun,
+    )
+
+
+def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Setting, Report]:
+    """The settings that fit, best first."""
+    mesh = make_mesh(stage.training.mesh, target.devices)
+    share = stage.training.batch_size // parts("batch", mesh)
+    counts = [clips for clips in range(1, share + 1) if share % clips == 0]
+    known = {_setting(stage, target): asked}
+    fitting: dict[Setting, Report] = {}
+    keeping = KEEPING
+
+    def tries() -> Iterator[None]:
+        nonlocal keeping
+        for clips in counts:
+            for place, remat in enumerate(keeping):
+                setting = Setting(clips=clips, remat=remat)
+                report = known.get(setting)
+                if report is None:
+                    report = compile_step(_with(stage, setting, share), target)
+                yield
+                if not isinstance(report, Report) or not report.fits:
+                    # What keeps more does not fit either, nor does it with more clips.
+                    keeping = keeping[:place]
+                    break
+                fitting[setting] = report
+
+    for _ in track(tries(), "compiling other settings", total=len(counts) * len(keeping)):
+        pass
+    return dict(sorted(fitting.items(), key=lambda item: _order(item[1])))
+
+
+def _order(report: Report) -> tuple[float, int]:
+    """Less work first, then less memory; of what waits for what nothing is known."""
+    return report.compute_s + report.memory_s + report.link_s, report.memory.peak
+
+
+def _heading(title: str, stage: Stage, target: Target) -> str:
+    setting, device = _setting(stage, target), target.devices[0].device_kind
+    return (
+        f"{title} on {target.name}, {len(target.devices)} x {device}: batch "
+        f"{stage.training.batch_size}, {setting.clips} on a device at a time, remat {setting.remat}"
+    )
+
+
+def _setting(stage: Stage, target: Target) -> Setting:
+    task, training = stage
+    groups = parts("batch", make_mesh(training.mesh, target.devices))
+    remat = task.model.dit.remat if isinstance(task, Denoising) else "none"
+    return Setting(clips=training.batch_size // groups // training.accumulate, remat=remat)
+
+
+def _with(stage: Stage, setting: Setting, share: int) -> Stage:
+    task: Any = stage.task
+    dit = replace(task.model.dit, remat=setting.remat)
+    return Stage(
+        replace(task, model=replace(task.model, dit=dit)),
+        replace(stage.training, accumulate=share // setting.clips),
+    )
+
+
+def _table(settings: Mapping[Setting, Report], batch: int) -> str:
+    if not settings:
+        return "  no setting of this batch fits: more devices, or --training.mesh.context"
+    columns = f"{'clips a device':<16}{'--remat':<12}{'peak':>10}{'least s':>10}{'clips/s':>9}"
+    lines = ["", "  settings that fit, best first", f"    {columns}"]
+    for setting, report in settings.items():
+        least = report.least_s
+        lines.append(
+            f"    {setting.clips:<16}{setting.remat:<12}{size(report.memory.peak):>10}"
+            f"{least:10.3g}{batch / least:9.3g}"
+        )
+    return "\n".join(lines)
