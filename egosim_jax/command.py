@@ -70,10 +70,14 @@ def main(
     return guarded(run)
 
 
+def cache_folder() -> Path:
+    """Of everything that can be made again."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "egosim_jax"
+
+
 def _keep_compiled_programs() -> None:
     """Let jax keep what it compiles in a folder that only its user can read and write."""
-    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    folder = home / "egosim_jax" / "compiled"
+    folder = cache_folder() / "compiled"
     with contextlib.suppress(OSError):  # without it everything works, but compiles each time
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))

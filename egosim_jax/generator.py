@@ -35,6 +35,7 @@ from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.schedule import FlowSchedule, VelocityFn
 from egosim_jax.diffusion.solver import Euler, UniPC, integrate
 from egosim_jax.io import weights
+from egosim_jax.io.executables import kept
 from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
 from egosim_jax.models.layers import initialise
 from egosim_jax.models.umt5 import UMT5, UMT5Config
@@ -235,7 +236,8 @@ class Program:
     """A function of the networks and arrays, compiled once for each shape of its arguments.
 
     On a mesh, on which `place` has put the networks, all arrays have a leading batch axis. Raises
-    `InputError` before compiling for a batch that the mesh does not divide.
+    `InputError` before compiling for a batch that the mesh does not divide. What is `about` tells
+    the function from others; a program that has it is kept between starts (`io/executables.py`).
     """
 
     def __init__(
@@ -244,10 +246,11 @@ class Program:
         networks: nnx.Module,
         *,
         mesh: Mesh | None = None,
+        about: Any = None,
         **options: Any,
     ):
         graph, self._params = nnx.split(networks, nnx.Param)
-        self._mesh = mesh
+        self._mesh, self._about = mesh, about
         if mesh is not None:
             options["out_shardings"] = batch_sharding(mesh)
         self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
@@ -255,22 +258,39 @@ class Program:
 
     def trace(self, *args: Any) -> Any:
         """The program for these arguments, arrays or shapes, as `jax.jit` traces it."""
-        mesh = self._mesh
-        if mesh is not None:
-            check_batch(jax.tree.leaves(args)[0].shape[0], mesh)
-            placed = batch_sharding(mesh)
-            args = jax.tree.map(
-                lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed), args
-            )
         with self._on_mesh():
-            return self._jit.trace(self._params, *args)
+            return self._jit.trace(self._params, *self._placed(args))
 
     def compile(self, *args: Any) -> Any:
-        """Compile for these arguments, arrays or shapes."""
-        traced = self.trace(*args)
+        """Compile for these arguments, arrays or shapes, or find what was compiled before."""
+        given = self._placed(args)
+
+        def compile() -> Any:
+            return self._jit.lower(self._params, *given).compile()
+
         with self._on_mesh():
-            self._compiled[_signature(args)] = traced.lower().compile()
-        return self._compiled[_signature(args)]
+            compiled = (
+                compile()
+                if self._about is None
+                else kept(self._about, (self._params, given), compile)
+            )
+        self._compiled[_signature(args)] = compiled
+        return compiled
+
+    def shapes(self, *args: Any) -> Any:
+        """The shapes of the answer."""
+        compiled = self._compiled.get(_signature(args))
+        return (compiled or self.trace(*args)).out_info
+
+    def _placed(self, args: tuple) -> tuple:
+        """The shapes of arguments, on their devices."""
+        placed = None
+        if self._mesh is not None:
+            check_batch(jax.tree.leaves(args)[0].shape[0], self._mesh)
+            placed = batch_sharding(self._mesh)
+        return jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed), args
+        )
 
     def __call__(self, *args: Any) -> Any:
         """Run, compiling first if nobody has."""
@@ -313,33 +333,46 @@ class Generator:
     def __init__(self, config: ModelConfig, networks: Networks, mesh: Mesh | None = None):
         self.config = config
         networks = place(networks, mesh)
-        self._encode = Program(encode_condition, networks, mesh=mesh)
+        self._encode = Program(encode_condition, networks, mesh=mesh, about=("encode", config))
         self._latents = Program(
             lambda vae, video: vae.encode(to_model(video)), networks.vae, mesh=mesh
+        )
+        shape = (*config.video.latent_shape, config.vae.z_dim)
+        self._noise = Program(
+            lambda _, seeds: jax.vmap(lambda seed: jax.random.normal(jax.random.key(seed), shape))(
+                seeds
+            ),
+            nnx.Module(),
+            mesh=mesh,
+            about=("noise", shape),
         )
         self._denoise = Program(
             lambda dit, condition, noise: denoise(dit, condition, noise, config),
             networks.dit,
             mesh=mesh,
+            about=("denoise", config),
             donate_argnums=2,
         )
-        self._decode = Program(lambda vae, x: to_uint8(vae.decode(x)), networks.vae, mesh=mesh)
+        self._decode = Program(
+            lambda vae, x: to_uint8(vae.decode(x)),
+            networks.vae,
+            mesh=mesh,
+            about=("decode", config),
+        )
 
-    def programs(self, batch: int) -> dict[str, tuple[Program, tuple]]:
-        """What `generate` runs for a batch of this size, and the shapes that it is given."""
+    def programs(self, batch: int) -> Iterator[tuple[str, Program, tuple]]:
+        """What `generate` runs for a batch of this size, by name, and the shapes it is given."""
         inputs = Inputs.shapes(batch, self.config)
-        condition = self._encode.trace(inputs).out_info
-        noise = jax.eval_shape(lambda: self.noise(range(batch)))
-        latents = self._denoise.trace(condition, noise).out_info
-        return {
-            "encode": (self._encode, (inputs,)),
-            "denoise": (self._denoise, (condition, noise)),
-            "decode": (self._decode, (latents,)),
-        }
+        yield "encode", self._encode, (inputs,)
+        seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
+        yield "noise", self._noise, (seeds,)
+        given = self._encode.shapes(inputs), self._noise.shapes(seeds)
+        yield "denoise", self._denoise, given
+        yield "decode", self._decode, (self._denoise.shapes(*given),)
 
     def compile(self, batch: int) -> None:
         """Compile everything that `generate` needs for batches of this size."""
-        for program, given in self.programs(batch).values():
+        for _, program, given in self.programs(batch):
             program.compile(*given)
 
     def generate(
@@ -397,9 +430,8 @@ class Generator:
         return self._clips(self._latents(truths(triplets)))
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w 16"]:
-        """The starting noise of each seed."""
-        shape = (*self.config.video.latent_shape, self.config.vae.z_dim)
-        return jnp.stack([jax.random.normal(jax.random.key(seed), shape) for seed in seeds])
+        """The starting noise of each seed, of which the last 32 bits count."""
+        return self._noise(np.array([seed & 0xFFFFFFFF for seed in seeds], np.uint32))
 
     def _clips(self, latents: Float[Array, "b f h w 16"]) -> list[Clip]:
         frames = np.asarray(self._decode(latents))

@@ -6,6 +6,6 @@ from pathlib import Path
 from tests.flags import QUICK
 
 os.environ.setdefault("XLA_FLAGS", QUICK)
-os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "compiled")
-)
+CACHE = Path(__file__).parents[1] / ".pytest_cache"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
+os.environ["XDG_CACHE_HOME"] = str(CACHE / "home")

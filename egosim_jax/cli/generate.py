@@ -194,10 +194,14 @@ class Generate:
 
         unit = parts("batch", mesh)
         size = min(size, -(-len(items) // unit) * unit)  # what the mesh divides and is enough
-        generator = self._generator(config, mesh)
         then = time.monotonic()
+        generator = self._generator(config, mesh)
+        read = time.monotonic()
         generator.compile(size)
-        print(f"compiled in {time.monotonic() - then:.1f} s", file=sys.stderr)
+        print(
+            f"weights in {read - then:.1f} s, programs in {time.monotonic() - read:.1f} s",
+            file=sys.stderr,
+        )
 
         bad: list[tuple[_Item, str]] = []
         began, done = time.monotonic(), 0

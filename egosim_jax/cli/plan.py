@@ -88,10 +88,12 @@ def plan(
         setattr(networks, name, _stored(network, getattr(config, name).dtype))
     networks = place(networks, mesh)
     generator, weights = Generator(config, networks, mesh), _on_a_device(nnx.state(networks))
-    for name, (program, given) in generator.programs(size).items():
+    for name, program, given in generator.programs(size):
+        if name == "noise":  # as large as the latents
+            continue
         traced, begun = program.trace(*given), time.perf_counter()
         try:
-            compiled = program.compile(*given)
+            compiled = traced.lower().compile()
         except jax.errors.JaxRuntimeError as error:
             yield name, refusal(error, target)
             continue

@@ -132,7 +132,8 @@ def encode_video(
     with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": str(crf)}
+        # x264's macroblock tree gives other bits at every run on some processors.
+        stream.options = {"crf": str(crf), "x264-params": "mbtree=0"}
         stream.codec_context.colorspace = _SMPTE170M
         stream.codec_context.color_range = _LIMITED_RANGE
         for frame in frames:

@@ -4,8 +4,9 @@
     python -m tests.benchmarks.fits [--only TEXT]
     python -m tests.benchmarks.fits --write
 
-A cell takes from 20 s to 2 minutes on two cores. Cells are kept in `.fits.json`, so that a run that
-was interrupted goes on; `--write` puts what is known into the README.
+A cell takes from 20 s to 2 minutes on two cores. Cells are kept in docs/fits.json, so that a run
+that was interrupted goes on, and one cell can be made again by removing it there; `--write` puts
+what is known into the README.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from egosim_jax.train.preflight import compile_step
 from egosim_jax.train.recipe import Recipe
 from egosim_jax.types import MeshConfig
 
-CELLS = Path(".fits.json")
 BEGIN, END = "<!-- python -m tests.benchmarks.fits --write -->", "<!-- end -->"
 ROOT = Path(__file__).parents[2]
+CELLS = ROOT / "docs" / "fits.json"
 REMATS = ("full", "attention", "products", "none", "offload")
 TARGETS = ("h200:8", "h100:8", "h200:1", "h100:1", "b200:8", "v5p:2x2x2", "v6e:4x4", "v6e:8x8")
 RECIPES: dict[str, type[Recipe]] = {
@@ -143,8 +144,9 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
         for clips in (1, 2, 4)
     ]
     by_target = []
+    targets = [t for t in TARGETS if any(found(Training(recipe=r, target=t)) for r in RECIPES)]
     for recipe in RECIPES:
-        cells = [found(Training(recipe=recipe, target=target)) for target in TARGETS]
+        cells = [found(Training(recipe=recipe, target=target)) for target in targets]
         shown = [f"{_cell(c)} ({c['clips']})" if c else "" for c in cells]
         by_target.append([f"`{recipe}`", *shown])
     makes = [cell for cell in all_cells() if isinstance(cell, Generation) and found(cell)]
@@ -159,7 +161,7 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
             "clips on a device at a time; what does not fit stands beside what there is:",
             _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
             "Every recipe as it is, GiB of a device (clips on a device at a time):",
-            _rows(["recipe", *(f"`{target}`" for target in TARGETS)], by_target),
+            _rows(["recipe", *(f"`{target}`" for target in targets)], by_target),
             "Generation with `egosim_14b`, 50 steps, with the weights of all networks; the time\n"
             "is the least that the devices' peak allows:",
             _rows(["target", "clips", "GiB", "least"], generation),

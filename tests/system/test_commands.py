@@ -2,8 +2,11 @@
 
 import csv
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +52,24 @@ def generate(metadata: Path, out: Path, *more: str) -> list[str]:
 def results(out: Path) -> dict[str, dict]:
     lines = (out / "results.jsonl").read_text("utf-8").splitlines()
     return {line["video_id"]: line for line in map(json.loads, lines)}
+
+
+def test_the_second_start_compiles_nothing_and_makes_the_same_clip(clips, weights, tmp_path):
+    made = {}
+    for name in ("first", "second"):
+        args = generate(clips, tmp_path / name, "--weights", str(weights), "--limit", "1")
+        ran = subprocess.run(
+            [sys.executable, "-m", "egosim_jax.cli", *args],
+            env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_LOG_COMPILES": "1"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        compiled = ran.stderr.count("Finished XLA compilation")
+        made[name] = compiled, (tmp_path / name / "sample_0.mp4").read_bytes()
+    assert made["first"][0] >= 4
+    assert made["second"][0] == 0
+    assert made["first"][1] == made["second"][1]
 
 
 def test_one_bad_clip_is_reported_and_the_others_are_made(generated):
