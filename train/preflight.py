@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,8 +17,7 @@ import jax
 
 from egosim_jax.command import DONE, FAILED
 from egosim_jax.models.wan_layers import Remat
-from egosim_jax.preflight import flops
-from egosim_jax.preflight.report import Report, TooLarge, inspect, plain, refusal, size, text
+from egosim_jax.preflight.report import Report, TooLarge, compile_for, plain, size, text
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.progress import track
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
@@ -76,18 +74,7 @@ def compile_step(stage: Stage, target: Target) -> Report | TooLarge:
     }
     with jax.set_mesh(mesh):
         traced = programs.update.trace(programs.state, programs.frozen, batch)
-        begun = time.perf_counter()
-        try:
-            compiled = traced.lower().compile()
-        except jax.errors.JaxRuntimeError as error:
-            return refusal(error, target)
-    return inspect(
-        compiled,
-        target,
-        model_flops=task.flops(training.batch_size),
-        hardware_flops=flops.count(traced.jaxpr),
-        compile_s=time.perf_counter() - begun,
-    )
+        return compile_for(target, traced, model_flops=task.flops(training.batch_size))
 
 
 def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Setting, Report]:

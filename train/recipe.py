@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ from egosim_jax.train.settings import Stage
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class Recipe(ABC):
     """A training that one command runs."""
 
     preflight: str | None = None
@@ -26,10 +27,10 @@ class Recipe:
 
         return preflight(self.stages(), self.preflight, as_json=self.json)
 
+    @abstractmethod
     def train(self) -> int:
         """Train to the end, or go on."""
-        raise NotImplementedError
 
+    @abstractmethod
     def stages(self) -> Mapping[str, Stage]:
         """What is trained, by the names of the recipe's options."""
-        raise NotImplementedError

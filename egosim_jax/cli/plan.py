@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from math import prod
@@ -76,12 +75,10 @@ def plan(
     config: ModelConfig, target: Target, mesh: Mesh, size: int
 ) -> Iterator[tuple[str, Report | TooLarge]]:
     """What each program of generation takes, beside the weights of all networks."""
-    import jax
     from flax import nnx
 
     from egosim_jax.generator import Generator, Networks, place
-    from egosim_jax.preflight import flops
-    from egosim_jax.preflight.report import inspect, refusal
+    from egosim_jax.preflight.report import compile_for
 
     networks = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0)))
     for name, network in networks.parts().items():
@@ -91,23 +88,7 @@ def plan(
     for name, program, given in generator.programs(size):
         if name == "noise":  # as large as the latents
             continue
-        traced, begun = program.trace(*given), time.perf_counter()
-        try:
-            compiled = traced.lower().compile()
-        except jax.errors.JaxRuntimeError as error:
-            yield name, refusal(error, target)
-            continue
-        yield (
-            name,
-            inspect(
-                compiled,
-                target,
-                model_flops=float("nan"),
-                hardware_flops=flops.count(traced.jaxpr),
-                compile_s=time.perf_counter() - begun,
-                resident=weights,
-            ),
-        )
+        yield name, compile_for(target, program.trace(*given), resident=weights)
 
 
 def _stored(network: nnx.Module, dtype: str) -> nnx.Module:

@@ -101,6 +101,7 @@ def _write(path: Path, compiled: Any) -> None:
         files = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
         for old in files[:-MOST]:
             old.unlink(missing_ok=True)
+    # A full disk, or a platform whose programs cannot be serialised.
     except (OSError, ValueError, NotImplementedError) as error:
         warnings.warn(f"{path} was not kept: {error}", stacklevel=2)
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import jax
+
+from egosim_jax.preflight import flops
 from egosim_jax.preflight.hlo import Big, Moved, Program
 from egosim_jax.preflight.targets import GIB, Target
 
@@ -98,6 +102,25 @@ class TooLarge:
         return False
 
 
+def compile_for(
+    target: Target, traced: Any, *, model_flops: float = math.nan, resident: int = 0
+) -> Report | TooLarge:
+    """Compile what `jax.jit` traced, on the target's devices, and read off it what it takes."""
+    begun = time.perf_counter()
+    try:
+        compiled = traced.lower().compile()
+    except jax.errors.JaxRuntimeError as error:
+        return refusal(error, target)
+    return inspect(
+        compiled,
+        target,
+        model_flops=model_flops,
+        hardware_flops=flops.count(traced.jaxpr),
+        compile_s=time.perf_counter() - begun,
+        resident=resident,
+    )
+
+
 def inspect(
     compiled: Any,
     target: Target,
@@ -105,7 +128,7 @@ def inspect(
     model_flops: float,
     hardware_flops: float,
     compile_s: float,
-    resident: int = 0,
+    resident: int,
 ) -> Report:
     """Read everything off a program that was compiled for a target.
 

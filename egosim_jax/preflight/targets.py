@@ -131,7 +131,6 @@ ALONE = {
     "TPU_ACCELERATOR_TYPE": "v5p-8",
     "TPU_WORKER_HOSTNAMES": "localhost",
     "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",
-    "TF_CPP_MIN_LOG_LEVEL": "2",
 }
 """Environment in which the compilers look for no driver and no TPU host, and for no other user."""
 GPU_SHARE = 0.95
