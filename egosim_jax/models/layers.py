@@ -116,8 +116,10 @@ class RMSNorm(nnx.Module):
     def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
         """Normalise; the answer is float32."""
         x = x.astype(jnp.float32)
-        x = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
-        return x * self.scale[...].astype(jnp.float32)
+        inverse = jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
+        # Behind the barrier is one number per row. Without it, a GPU's compiler makes the sum and the
+        # scaling one kernel, and writes and reads x again for what follows, such as the rotation.
+        return x * jax.lax.optimization_barrier(inverse) * self.scale[...].astype(jnp.float32)
 
 
 def initialise(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:

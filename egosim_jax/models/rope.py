@@ -23,25 +23,27 @@ def pairs(head_dim: int) -> tuple[int, int, int]:
     return head_dim // 2 - 2 * side, side, side
 
 
-def rotations(frames: int, rows: int, columns: int, head_dim: int) -> Float[Array, "n p 2"]:
-    """The (cosine, sine) of every pair at every token, in row-major order (frame, row, column).
+def rotations(frames: int, rows: int, columns: int, head_dim: int) -> Float[Array, "n k 2"]:
+    """For every token, in the order (frame, row, column), what turns each channel of a head.
 
-    Angles are taken in float64 on the host; only one small table per axis enters the program.
+    Channels x_2j and x_2j+1 have the same cosine c; their sines are -s and s, so that a turned
+    channel is its own value times the cosine plus the other's of the pair times the sine. Angles
+    are taken in float64 on the host; only one small table per axis enters the program.
     """
     size = (frames, rows, columns)
     parts = []
     for axis, p in enumerate(pairs(head_dim)):
         angle = np.arange(size[axis])[:, None] * THETA ** (-np.arange(p) / p)
-        table = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
-        shape = [1, 1, 1, p, 2]
+        c, s = np.cos(angle), np.sin(angle)
+        table = np.stack([c, -s, c, s], axis=-1).astype(np.float32)
+        shape = [1, 1, 1, 2 * p, 2]
         shape[axis] = size[axis]
-        parts.append(jnp.broadcast_to(table.reshape(shape), (*size, p, 2)))
-    return rearrange(jnp.concatenate(parts, axis=3), "f r c p two -> (f r c) p two")
+        parts.append(jnp.broadcast_to(table.reshape(shape), (*size, 2 * p, 2)))
+    return rearrange(jnp.concatenate(parts, axis=3), "f r c k two -> (f r c) k two")
 
 
-def rotate(x: Float[Array, "b n h k"], rotation: Float[Array, "n p 2"]) -> Float[Array, "b n h k"]:
+def rotate(x: Float[Array, "b n h k"], rotation: Float[Array, "n k 2"]) -> Float[Array, "b n h k"]:
     """Turn the pairs of every head by their token's angles, in float32."""
-    x = rearrange(x.astype(jnp.float32), "b n h (p two) -> b n h p two", two=2)
-    cos, sin = rotation[:, None, :, :1], rotation[:, None, :, 1:]
-    turned = x * cos + x[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)
-    return rearrange(turned, "b n h p two -> b n h (p two)")
+    x = x.astype(jnp.float32)
+    other = rearrange(x, "b n h (p two) -> b n h p two", two=2)[..., ::-1].reshape(x.shape)
+    return x * rotation[:, None, :, 0] + other * rotation[:, None, :, 1]
