@@ -79,6 +79,12 @@ def platform() -> str:
     return jax.default_backend() if device is None else device.platform
 
 
+def device_kind() -> str:
+    """The name of the devices that what is traced will run on."""
+    device = jax.sharding.get_abstract_mesh().abstract_device
+    return (jax.devices()[0] if device is None else device).device_kind
+
+
 def constrain(x: jax.Array, axes: tuple[str | None, ...]) -> jax.Array:
     """Place an activation as its logical axes say; on one device nothing happens."""
     return jax.lax.with_sharding_constraint(x, spec(*axes)) if several_devices() else x

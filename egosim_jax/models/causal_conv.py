@@ -2,10 +2,11 @@
 
     y[t, p] = sum_(k, s) x[t + k, p + s] W[k, s]        VALID in time, SAME in space
 
-The caller puts the frames of the past in front of `x`. GPUs and TPUs have a kernel for it. XLA's
-CPU backend has a good one for images only, so that there the sum over k is one over images: of
-convolutions or, where x has few channels, of channels, with the frames' channels side by side. It
-is also slow at the gradient for large images,
+The caller puts the frames of the past in front of `x`. TPUs have a kernel for it. cuDNN turns
+videos into another layout and back, and XLA's CPU backend has a good kernel for images only, so
+that there the sum over k is one over images: of convolutions or, where x has few channels, of
+channels, with the frames' channels side by side. The CPU is also slow at the gradient for large
+images,
 
     dW[k, s] = sum_(t, p) x[t + k, p + s] dy[t, p]
 
@@ -24,6 +25,8 @@ import jax.numpy as jnp
 from einops import rearrange
 from jaxtyping import Array, Float
 
+from egosim_jax.sharding import platform
+
 FEW_CHANNELS = 8
 """Up to this many input channels, the CPU puts the frames' channels side by side."""
 LARGE_IMAGE = 32 * 32
@@ -34,7 +37,7 @@ def convolve(
     x: Float[Array, "b f h w i"], kernel: Float[Array, "kt kh kw i o"]
 ) -> Float[Array, "b g h w o"]:
     """Convolve a video with a kernel of odd height and width; g = f - kt + 1 frames."""
-    return by_image(x, kernel) if jax.default_backend() == "cpu" else direct(x, kernel)
+    return {"cpu": by_image, "gpu": sum_of_images, "tpu": direct}[platform()](x, kernel)
 
 
 def direct(
