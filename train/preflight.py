@@ -25,7 +25,7 @@ from egosim_jax.train.denoiser import Denoising
 from egosim_jax.train.programs import Programs
 from egosim_jax.train.settings import Stage
 
-KEEPING: tuple[Remat, ...] = ("full", "attention", "products", "none")
+KEEPING: tuple[Remat, ...] = ("full", "attention", "projections", "products", "none")
 """What a backward pass may compute again, by the memory that it takes, least first."""
 
 

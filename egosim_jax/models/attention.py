@@ -19,10 +19,11 @@ from einops import rearrange
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from egosim_jax.models import flash
+from egosim_jax.models import flash, hopper
 from egosim_jax.sharding import (
     ACTIVATIONS,
     constrain,
+    device_kind,
     parts,
     platform,
     several_devices,
@@ -30,15 +31,18 @@ from egosim_jax.sharding import (
 )
 from egosim_jax.types import InputError
 
-Kernel = Literal["auto", "xla", "cudnn", "splash"]
+Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
 """`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`);
-`cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only), `splash` that of TPUs
-(elsewhere it is interpreted, for tests); `auto` is the platform's, where it can be used."""
+`cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only), `hopper` that of H100 and
+H200, which is faster where it can be used and cuDNN's elsewhere, `splash` that of TPUs (elsewhere
+it is interpreted, for tests); `auto` is the device's, where it can be used."""
 SCORES = 2**26
 """Bytes of scores that the `xla` kernel makes at a time, if a single head's are not more: a small
 model's heads all at once, which is faster, and those of a long video one by one."""
 SELF_ATTENTION = "self_attention"
 """The name, for checkpoint policies, of what a kernel's backward pass needs of the forward pass."""
+HOPPER = ("NVIDIA H100", "NVIDIA H200")
+"""How jax's names of the devices begin that have the `hopper` kernel."""
 CUDNN_FORWARD = "dot_product_attention_fwd_wrapper"
 """The primitive whose results are the output and the log-sum-exp of jax's cuDNN kernel."""
 
@@ -82,7 +86,9 @@ def attention(
         return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation="xla")
     scale = float(q.shape[-1] ** -0.5) if scale is None else scale
     kernel = _best(q) if kernel == "auto" else kernel
-    if kernel == "cudnn":
+    if kernel == "hopper" and hopper.fits(q, k):
+        return hopper.attend(q, k, v, scale)
+    if kernel in ("cudnn", "hopper"):
         return flash.cudnn(q, k, v, scale=scale)
     if kernel == "splash":
         name = SELF_ATTENTION if q.shape == k.shape else None
@@ -92,10 +98,10 @@ def attention(
 
 
 def _best(q: jax.Array) -> Kernel:
-    """The kernel of the platform, if it can compute this."""
+    """The kernel of the device, if it can compute this."""
     size = q.shape[-1]
     if platform() == "gpu" and q.dtype.itemsize == 2 and size % 8 == 0 and size <= 128:
-        return "cudnn"
+        return "hopper" if device_kind().startswith(HOPPER) else "cudnn"
     return "splash" if platform() == "tpu" and size % flash.LANES == 0 else "xla"
 
 

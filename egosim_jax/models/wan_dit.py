@@ -29,6 +29,7 @@ from egosim_jax.models.layers import scan_blocks, stack
 from egosim_jax.models.wan_layers import (
     MLP,
     PATCH,
+    PROJECTION,
     Block,
     CrossAttention,
     Head,
@@ -49,6 +50,9 @@ TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
 keep_products = jax.checkpoint_policies.save_from_both_policies(
     jax.checkpoint_policies.dots_with_no_batch_dims_saveable, keep_attention
 )
+keep_projections = jax.checkpoint_policies.save_from_both_policies(
+    jax.checkpoint_policies.save_only_these_names(PROJECTION), keep_attention
+)
 BLOCK_INPUT = "block_input"
 offload_inputs = jax.checkpoint_policies.save_and_offload_only_these_names(
     names_which_can_be_saved=[],
@@ -68,7 +72,7 @@ class DiTContext:
     """The condition's share of the patch embedding, with its bias."""
     sources: tuple[KeysValues, ...]
     """Cross-attention keys and values of all layers: of the text, then of the image if any."""
-    rotation: Float[Array, "n p 2"]
+    rotation: Float[Array, "n k 2"]
     """Rotary table of the tokens."""
 
 
@@ -156,6 +160,7 @@ class WanDiT(nnx.Module):
             "full": checkpoint,
             "attention": partial(checkpoint, policy=keep_attention),
             "products": partial(checkpoint, policy=keep_products),
+            "projections": partial(checkpoint, policy=keep_projections),
             "offload": partial(checkpoint, policy=offload_inputs),
         }[self.config.remat]
 

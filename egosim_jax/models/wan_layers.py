@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from einops import rearrange
 from flax import nnx
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from egosim_jax.models import rope
@@ -35,12 +36,14 @@ from egosim_jax.types import InputError, check_counts
 
 PATCH = 2
 """Latent rows and columns of a token; a token has one latent frame."""
+PROJECTION = "projection"
+"""The name, for checkpoint policies, of what attention's linear layers answer."""
 IMAGE_NORM_EPS = 1e-5
 """Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
 
 Activation = Callable[[jax.Array], jax.Array]
 KeysValues = tuple[Float[Array, "*l b _ h k"], Float[Array, "*l b _ h k"]]
-Remat = Literal["none", "products", "attention", "full", "offload"]
+Remat = Literal["none", "products", "projections", "attention", "full", "offload"]
 
 xavier = nnx.initializers.xavier_uniform()
 normal = nnx.initializers.normal(0.02)
@@ -77,9 +80,9 @@ class WanDiTConfig:
     attention: Kernel = "auto"
     """Attention kernel."""
     remat: Remat = "none"
-    """What the backward pass computes again: nothing, all but products with weights and
-    self-attention, all but self-attention, every block, or every block from its input, which waits
-    in the host's memory."""
+    """What the backward pass computes again: nothing; all but self-attention and products with
+    weights; all but self-attention and attention's linear layers (`PROJECTION`); all but
+    self-attention; every block; or every block from its input, which waits in the host's memory."""
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other and the kernel fits the dtype."""
@@ -97,8 +100,10 @@ class WanDiTConfig:
             )
         if self.freq_dim % 2:
             raise InputError(f"freq_dim must be even (cosines and sines), not {self.freq_dim}.")
-        if self.attention == "cudnn" and self.dtype == "float32":
-            raise InputError('The cudnn attention kernel needs dtype "bfloat16", not "float32".')
+        if self.attention in ("cudnn", "hopper") and self.dtype == "float32":
+            raise InputError(
+                f'The {self.attention} attention kernel needs dtype "bfloat16", not "float32".'
+            )
 
     @property
     def head_dim(self) -> int:
@@ -127,6 +132,11 @@ def linear(
 ) -> Linear:
     """Make a linear layer in the compute dtype."""
     return Linear(*sizes, axes=axes, dtype=config.dtype, kernel_init=init, rngs=rngs)
+
+
+def kept(x: jax.Array) -> jax.Array:
+    """What a checkpointed block may keep under the name of `PROJECTION`."""
+    return checkpoint_name(x, PROJECTION)
 
 
 def modulation_table(rows: int, dim: int, rngs: nnx.Rngs) -> nnx.Param:
@@ -226,11 +236,11 @@ class KeyValue(nnx.Module):
 
     def keys(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
         """Keys, in float32."""
-        return self._by_head(self.norm_k(self.k(tokens)))
+        return self._by_head(self.norm_k(kept(self.k(tokens))))
 
     def values(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
         """Values, in the compute dtype."""
-        return self._by_head(self.v(tokens))
+        return self._by_head(kept(self.v(tokens)))
 
     def keys_values(self, tokens: Float[Array, "b m d"]) -> KeysValues:
         """Keys and values, both in the compute dtype."""
@@ -253,7 +263,7 @@ class Attention(KeyValue):
 
     def queries(self, x: Float[Array, "b n d"]) -> Float[Array, "b n h k"]:
         """Normalised queries, in float32."""
-        return self._by_head(self.norm_q(self.q(x)))
+        return self._by_head(self.norm_q(kept(self.q(x))))
 
     def attend(
         self,
@@ -272,11 +282,11 @@ class SelfAttention(Attention):
     """Attention among the video's tokens, with rotary positions."""
 
     def __call__(
-        self, x: Float[Array, "b n d"], rotation: Float[Array, "n p 2"]
+        self, x: Float[Array, "b n d"], rotation: Float[Array, "n k 2"]
     ) -> Float[Array, "b n d"]:
         """Attend."""
         q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
-        return self.o(self.attend(q, k, self.values(x), "heads"))
+        return kept(self.o(self.attend(q, k, self.values(x), "heads")))
 
 
 class CrossAttention(Attention):
@@ -297,7 +307,7 @@ class CrossAttention(Attention):
         """Attend to each source by itself and add the results."""
         q = self.queries(x)
         attended = (self.attend(q, *keys_values, "queries") for keys_values in sources)
-        return self.o(reduce(jnp.add, attended))
+        return kept(self.o(reduce(jnp.add, attended)))
 
 
 class Block(nnx.Module):
@@ -316,7 +326,7 @@ class Block(nnx.Module):
         self,
         x: Float[Array, "b n d"],
         modulation: Float[Array, "b 6 d"],
-        rotation: Float[Array, "n p 2"],
+        rotation: Float[Array, "n k 2"],
         sources: tuple[KeysValues, ...],
     ) -> Float[Array, "b n d"]:
         """Update the residual stream; sums are taken in float32 and kept in x's dtype."""

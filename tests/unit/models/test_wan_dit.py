@@ -129,7 +129,7 @@ def gradients(config):
     return jax.tree.leaves(jax.jit(jax.grad(loss_of(config)))(weights()))
 
 
-@pytest.mark.parametrize("remat", ["products", "attention", "full", "offload"])
+@pytest.mark.parametrize("remat", ["products", "projections", "attention", "full", "offload"])
 def test_gradients_do_not_depend_on_what_is_recomputed(remat):
     recomputed = gradients(replace(TINY, remat=remat))
     for have, want in zip(recomputed, gradients(TINY), strict=True):

@@ -24,7 +24,7 @@ def counted(function, *args):
 
 
 @pytest.mark.parametrize(
-    ("kernel", "tolerance"), [("xla", 1e-9), ("cudnn", 1e-3), ("splash", 3e-3)]
+    ("kernel", "tolerance"), [("xla", 1e-9), ("cudnn", 1e-3), ("hopper", 1e-3), ("splash", 3e-3)]
 )
 def test_a_forward_of_the_14b_is_that_of_the_formula(kernel, tolerance, monkeypatch):
     """The kernels pad the image's 257 keys, cuDNN's to 264 and splash to 384, and compute those."""

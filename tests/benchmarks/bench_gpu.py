@@ -1,0 +1,394 @@
+"""EgoSim-14B on the one GPU that is there: seconds, TFLOP/s and memory.
+
+    python -m tests.benchmarks.bench_gpu parts                       what the device can do
+    python -m tests.benchmarks.bench_gpu forward --layers 40 --kernels cudnn
+    python -m tests.benchmarks.bench_gpu step --layers 18 --remats full attention
+    python -m tests.benchmarks.bench_gpu clip
+
+All of it at full width and with 24,960 tokens, on random weights. TFLOP/s and MFU count what the
+model needs (`train/flops.py`), and not what is computed again. `--profile` says where the time of
+the last case went, kernel by kernel. Beside the memory that was taken stands what the program was
+compiled to take.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.generator import Generator, Inputs, ModelConfig, Networks
+from egosim_jax.models.attention import attention
+from egosim_jax.models.layers import initialise
+from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.preflight.report import compile_for
+from egosim_jax.preflight.targets import GIB, find, peak
+from egosim_jax.sharding import batch_sharding, make_mesh
+from egosim_jax.train import recipes
+from egosim_jax.train.programs import Programs
+from egosim_jax.train.settings import Stage
+from egosim_jax.types import MeshConfig
+
+BFLOAT16 = 4e-3
+"""Relative error that a kernel may have."""
+TOKENS, HEADS, WIDTH, MLP, IMAGE = 24960, 40, 5120, 13824, 257
+
+
+def main() -> None:
+    """Measure what was asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["parts", "forward", "step", "clip"])
+    parser.add_argument("--config", default="egosim_14b")
+    parser.add_argument("--layers", type=int, help="fewer blocks than the model has")
+    parser.add_argument("--kernels", nargs="+", default=["cudnn"])
+    parser.add_argument("--remats", nargs="+", default=["full"])
+    parser.add_argument("--clips", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--profile", action="store_true")
+    parser.add_argument("--target", help="only compile, for this: what the preflight foretells")
+    options = parser.parse_args()
+    if options.target is None:
+        device = jax.devices()[0]
+        print(f"{device.device_kind}, jax {jax.__version__}", flush=True)
+    for line in {"parts": parts, "forward": forward, "step": step, "clip": clip}[options.what](
+        options
+    ):
+        print(json.dumps(line), flush=True)
+
+
+def parts(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The kernels that a block consists of, one by one, forward and backward."""
+    one = lambda *shape: jax.random.normal(jax.random.key(len(shape)), shape, jnp.bfloat16)  # noqa: E731
+    x = one(1, TOKENS, WIDTH)
+    for name, inner, outer in (("square", WIDTH, WIDTH), ("up", WIDTH, MLP), ("down", MLP, WIDTH)):
+        a, w = one(TOKENS, inner), one(inner, outer)
+        seconds = _seconds(jax.jit(jnp.matmul), (a, w), options.repeats)
+        yield {
+            "part": name,
+            "ms": seconds * 1e3,
+            "tflops": _tera(2 * TOKENS * inner * outer, seconds),
+        }
+    q, k, v, g = (one(1, TOKENS, HEADS, WIDTH // HEADS) * (1 + i / 8) for i in range(4))
+    flops = 4 * TOKENS**2 * WIDTH
+    some = slice(None, None, TOKENS // 64)
+    with jax.default_matmul_precision("highest"):
+        exact = attention(*(x.astype(jnp.float32) for x in (q[:, some], k, v)))
+    for kernel in options.kernels:
+        attend = jax.jit(lambda q, k, v, kernel=kernel: attention(q, k, v, kernel=kernel))
+        seconds = _seconds(attend, (q, k, v), options.repeats)
+        error = jnp.linalg.norm(attend(q, k, v)[:, some] - exact) / jnp.linalg.norm(exact)
+        if not error < BFLOAT16:
+            raise SystemExit(f"{kernel} is {error:.1e} from what float32 gives.")
+        yield {
+            "part": f"{kernel} forward",
+            "ms": seconds * 1e3,
+            "tflops": _tera(flops, seconds),
+            "error": float(error),
+        }
+
+        def both(q: Any, k: Any, v: Any, g: Any, kernel: Any = kernel) -> Any:
+            return jax.vjp(lambda *qkv: attention(*qkv, kernel=kernel), q, k, v)[1](g)
+
+        both_s = _seconds(jax.jit(both), (q, k, v, g), options.repeats)
+        yield {
+            "part": f"{kernel} forward and backward",
+            "ms": both_s * 1e3,
+            "tflops backward": _tera(2.5 * flops, both_s - seconds),
+        }
+    copied = _seconds(jax.jit(lambda x: x + 1), (jnp.tile(x, (8, 1, 1)),), options.repeats)
+    yield {"part": "copy", "terabytes_s": 2 * 8 * x.nbytes / copied / 1e12}
+
+
+def forward(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A forward of the transformer, in bfloat16 with bfloat16 weights."""
+    for kernel in options.kernels:
+        config = _model(options, kernel, "none")
+        graph, params = nnx.split(nnx.eval_shape(lambda c=config: WanDiT(c.dit, rngs=nnx.Rngs(0))))
+        dit = config.dit
+        size = (*config.video.latent_shape, dit.in_channels)
+        shapes = (
+            jax.ShapeDtypeStruct((options.clips, *size), jnp.bfloat16),
+            jax.ShapeDtypeStruct((options.clips,), jnp.float32),
+            jax.ShapeDtypeStruct(
+                (options.clips, config.tokenizer.max_tokens, dit.text_dim), "bfloat16"
+            ),
+            jax.ShapeDtypeStruct((options.clips, IMAGE, dit.image_dim), "bfloat16"),
+        )
+        mesh = make_mesh(MeshConfig(), _devices(options))
+        run = jax.jit(
+            lambda p, *x, graph=graph: nnx.merge(graph, p)(*x), in_shardings=batch_sharding(mesh)
+        )
+        needed = options.clips * _forward_flops(config, options)
+        args = (_half(params), *shapes)
+        with jax.set_mesh(mesh):
+            line = {"kernel": kernel, "layers": dit.layers}
+            yield from _measure(options, run, args, needed, line)
+
+
+def step(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A whole update of full fine-tuning: float32 weights, AdamW, clipping."""
+    for kernel in options.kernels:
+        for remat in options.remats:
+            stage = _stage(_model(options, kernel, remat), options.clips)
+            mesh = make_mesh(stage.training.mesh, _devices(options))
+            programs = Programs.of(*stage, mesh)
+            batch = stage.task.shapes(options.clips)
+            with jax.set_mesh(mesh):
+                yield from _measure(
+                    options,
+                    programs.update,
+                    (programs.state, programs.frozen, batch),
+                    stage.task.flops(options.clips),
+                    {"kernel": kernel, "remat": remat, "layers": stage.task.model.dit.layers},
+                    make=lambda programs=programs: initialise(
+                        programs.create, out_shardings=programs.state_sharding
+                    ),
+                )
+
+
+def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """All of EgoSim-14B: conditions encoded, 50 steps, decoded, with all networks on the device."""
+    config = replace(configs.get(options.config), steps=options.steps)
+    shapes = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0)))
+    graph, params = nnx.split(shapes)
+    begun = time.perf_counter()
+    networks = nnx.merge(graph, _draw(_half(params)))
+    jax.block_until_ready(nnx.state(networks))
+    yield {"weights_s": time.perf_counter() - begun}
+    generator = Generator(config, networks)
+    programs: dict[str, Any] = {}
+    line: dict[str, Any] = {}
+    for name, program, given in generator.programs(options.clips):
+        _timed(line, f"{name}_compile_s", lambda p=program, g=given: p.compile(*g) and None)
+        programs[name] = program
+    yield line
+    inputs = _draw(Inputs.shapes(options.clips, config))
+    seeds = jnp.arange(options.clips, dtype=jnp.uint32)
+    needed = options.clips * options.steps * _forward_flops(config, options)
+    for attempt in range(options.repeats):
+        line = {"clip": attempt, "steps": options.steps}
+        condition = _timed(line, "encode_s", lambda: programs["encode"](inputs))
+        noise = _timed(line, "noise_s", lambda: programs["noise"](seeds))
+        latents = _timed(line, "denoise_s", lambda c=condition, n=noise: programs["denoise"](c, n))
+        frames = _timed(line, "decode_s", lambda x=latents: programs["decode"](x))
+        finite = bool(jnp.isfinite(latents).all()) and int(frames.max()) > int(frames.min())
+        yield {
+            **line,
+            "step_s": line["denoise_s"] / options.steps,
+            **_speed(needed, line["denoise_s"]),
+            "peak_gib": _taken(),
+            "finite": finite,
+        }
+    if options.profile:
+        condition, noise = programs["encode"](inputs), programs["noise"](seeds)
+        given_to = {"encode": (inputs,), "decode": (latents,), "denoise": (condition, noise)}
+        for name, given in given_to.items():
+            with _profile() as kernels:
+                jax.block_until_ready(programs[name](*given))
+            yield {"profile of": name}
+            yield from kernels
+
+
+def _measure(
+    options: argparse.Namespace,
+    run: Any,
+    args: tuple,
+    needed: float,
+    line: dict[str, Any],
+    make: Callable[[], Any] | None = None,
+) -> Iterator[dict[str, Any]]:
+    """Compile for shapes, then draw arguments of these shapes and run; `make` makes the first.
+
+    What is made is given away at each run, and comes back as the first result.
+    """
+    traced = run.trace(*args)
+    if options.target is not None:
+        report = compile_for(find(options.target), traced, model_flops=needed)
+        yield {**line, "preflight_gib": report.memory.peak / GIB, "least_s": report.least_s}
+        return
+    begun = time.perf_counter()
+    compiled = traced.lower().compile()
+    line["compile_s"] = time.perf_counter() - begun
+    memory = compiled.memory_analysis()
+    line["compiled_gib"] = (
+        memory.argument_size_in_bytes
+        + memory.output_size_in_bytes
+        - memory.alias_size_in_bytes
+        + memory.temp_size_in_bytes
+    ) / GIB
+    if make is None:
+        given = _draw(args)
+        call = lambda: compiled(*given)  # noqa: E731
+    else:
+        state, rest = [make()], _draw(args[1:])
+
+        def call() -> Any:
+            state[0], metrics = compiled(state[0], *rest)
+            return metrics
+
+    answer = jax.block_until_ready(call())
+    seconds = []
+    for _ in range(options.repeats):
+        begun = time.perf_counter()
+        answer = jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - begun)
+    least = statistics.median(seconds)
+    finite = all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(answer))
+    yield {
+        **line,
+        "seconds": least,
+        "spread": (max(seconds) - min(seconds)) / least,
+        **_speed(needed, least),
+        "peak_gib": _taken(),
+        "finite": finite,
+    }
+    if options.profile:
+        with _profile() as kernels:
+            jax.block_until_ready(call())
+        yield from kernels
+    # What is left would lie there in the next case.
+    if make is not None:
+        jax.tree.map(lambda leaf: leaf.delete(), state[0])
+
+
+def _devices(options: argparse.Namespace) -> Sequence[Any] | None:
+    return options.target and find(options.target).devices
+
+
+def _model(options: argparse.Namespace, kernel: Any, remat: Any) -> ModelConfig:
+    config = configs.get(options.config)
+    layers = options.layers or config.dit.layers
+    return replace(config, dit=replace(config.dit, layers=layers, attention=kernel, remat=remat))
+
+
+def _stage(model: ModelConfig, clips: int) -> Stage:
+    paths = {name: Path() for name in ("latents", "weights", "out")}
+    task, training = recipes.Egosim14B(**paths).stages()["training"]
+    return Stage(replace(task, model=model), replace(training, batch_size=clips, accumulate=1))
+
+
+def _forward_flops(config: ModelConfig, options: argparse.Namespace) -> float:
+    return _stage(config, 1).task.flops(1) / 3
+
+
+def _half(params: Any) -> Any:
+    """The same shapes in bfloat16."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.bfloat16), params)
+
+
+def _draw(shapes: Any) -> Any:
+    """Random arrays of these shapes; zeros would be multiplied faster.
+
+    What is a weight is as large as weights are, and data have a deviation of 1: on smaller numbers
+    a GPU takes less power, and is faster.
+    """
+    paths, tree = jax.tree.flatten_with_path(shapes)
+    drawn = []
+    for seed, (path, leaf) in enumerate(paths):
+        name = jax.tree_util.keystr(path)
+        x = _random(seed, leaf.shape, leaf.dtype)
+        if "kernel" in name or "embedding" in name or "bias" in name or "modulation" in name:
+            x = x * jnp.asarray(0.02, x.dtype)
+        elif "scale" in name:
+            x = jnp.ones_like(x)
+        drawn.append(x)
+    return jax.tree.unflatten(tree, drawn)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _random(seed: int, shape: tuple[int, ...], dtype: Any) -> jax.Array:
+    key = jax.random.key(seed, impl="rbg")
+    if jnp.issubdtype(dtype, jnp.floating):
+        return jax.random.normal(key, shape, dtype)
+    if dtype == jnp.bool_:
+        return jnp.ones(shape, dtype)
+    return jax.random.randint(key, shape, 0, 256).astype(dtype)
+
+
+def _seconds(run: Callable[..., Any], args: tuple, repeats: int) -> float:
+    """Median seconds of a call, among several that wait for each other on the device only."""
+    jax.block_until_ready(run(*args))
+    found = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        for _ in range(4):
+            answer = run(*args)
+        jax.block_until_ready(answer)
+        found.append((time.perf_counter() - begun) / 4)
+    return statistics.median(found)
+
+
+def _timed(line: dict[str, Any], name: str, run: Callable[[], Any]) -> Any:
+    begun = time.perf_counter()
+    answer = jax.block_until_ready(run())
+    line[name] = time.perf_counter() - begun
+    return answer
+
+
+def _tera(flops: float, seconds: float) -> float:
+    return flops / seconds / 1e12
+
+
+def _speed(flops: float, seconds: float) -> dict[str, float]:
+    rate = flops / seconds
+    return {"tflops": rate / 1e12, "mfu": rate / peak(jax.devices()[0].device_kind)}
+
+
+def _taken() -> float:
+    """GiB at the worst moment since the process began."""
+    return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0) / GIB
+
+
+@contextmanager
+def _profile() -> Iterator[list[dict[str, Any]]]:
+    """Fill a list with the kernels that ran meanwhile, those that took longest first."""
+    found: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            yield found
+        (path,) = Path(folder).rglob("*.xplane.pb")
+        data = jax.profiler.ProfileData.from_file(str(path))
+        time_ns, count = Counter[str](), Counter[str]()
+        for plane in data.planes:
+            if not plane.name.startswith("/device:GPU"):
+                continue
+            for line in plane.lines:
+                if not line.name.startswith("Stream"):
+                    continue
+                for event in line.events:
+                    name = re.sub(r"[_.]?\d+$", "", event.name)[:120]
+                    time_ns[name] += event.duration_ns
+                    count[name] += 1
+        total = sum(time_ns.values())
+        found.append({"profile": "all kernels", "ms": total / 1e6, "count": sum(count.values())})
+        for name, taken in time_ns.most_common(40):
+            found.append(
+                {
+                    "kernel": name,
+                    "ms": round(taken / 1e6, 2),
+                    "share": round(taken / total, 4),
+                    "count": count[name],
+                }
+            )
+
+
+if __name__ == "__main__":
+    main()
