@@ -2,7 +2,8 @@
 
 The step is the one that training runs: the same function, mesh, shardings and donation. After the
 recipe's own setting come the others that take the same batch: as many clips at a time on a device,
-and as much kept for the backward pass, as there is memory for.
+and as much kept for the backward pass, as there is memory for. If there is too little for anything,
+2 devices share a clip, then 4, and so on.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import jax
@@ -24,6 +25,7 @@ from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.denoiser import Denoising
 from egosim_jax.train.programs import Programs
 from egosim_jax.train.settings import Stage
+from egosim_jax.types import MeshConfig
 
 KEEPING: tuple[Remat, ...] = ("full", "attention", "projections", "products", "none")
 """What a backward pass may compute again, by the memory that it takes, least first."""
@@ -37,6 +39,8 @@ class Setting:
     """On a device at a time; those that share a clip count as one."""
     remat: Remat
     """What the backward pass computes again."""
+    context: int = 1
+    """Devices that share a clip."""
 
 
 def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool) -> int:
@@ -53,7 +57,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool) -> int:
         if isinstance(stage.task, Denoising) and not math.isnan(target.device.flops):
             others = _others(stage, target, report)
             found[title]["settings"] = [
-                {"clips": setting.clips, "remat": setting.remat, **plain(report)}
+                {**asdict(setting), **plain(report)}
                 for setting, report in others.items()
             ]
             if not as_json:
@@ -78,11 +82,32 @@ def compile_step(stage: Stage, target: Target) -> Report | TooLarge:
 
 
 def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Setting, Report]:
-    """The settings that fit, best first."""
-    mesh = make_mesh(stage.training.mesh, target.devices)
-    share = stage.training.batch_size // parts("batch", mesh)
-    counts = [clips for clips in range(1, share + 1) if share % clips == 0]
+    """The settings that fit, best first, with as few devices to a clip as any of them needs."""
     known = {_setting(stage, target): asked}
+    for mesh in _meshes(stage, target):
+        fitting = _fitting(stage._replace(training=replace(stage.training, mesh=mesh)), target, known)
+        if fitting:
+            return dict(sorted(fitting.items(), key=lambda item: _order(item[1])))
+    return {}
+
+
+def _meshes(stage: Stage, target: Target) -> Iterator[MeshConfig]:
+    """The mesh as it is, and then with more and more devices to a clip."""
+    task: Any = stage.task
+    own = make_mesh(stage.training.mesh, target.devices).shape
+    context = own["context"]
+    while own["fsdp"] % (context // own["context"]) == 0 and task.model.dit.heads % context == 0:
+        yield MeshConfig(data=own["data"], fsdp=-1, context=context)
+        context *= 2
+
+
+def _fitting(
+    stage: Stage, target: Target, known: Mapping[Setting, Report | TooLarge]
+) -> dict[Setting, Report]:
+    """The settings of a mesh that fit."""
+    mesh = make_mesh(stage.training.mesh, target.devices)
+    share, context = stage.training.batch_size // parts("batch", mesh), parts("tokens", mesh)
+    counts = [clips for clips in range(1, share + 1) if share % clips == 0]
     fitting: dict[Setting, Report] = {}
     keeping = KEEPING
 
@@ -90,7 +115,7 @@ def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Sett
         nonlocal keeping
         for clips in counts:
             for place, remat in enumerate(keeping):
-                setting = Setting(clips=clips, remat=remat)
+                setting = Setting(clips=clips, remat=remat, context=context)
                 report = known.get(setting)
                 if report is None:
                     report = compile_step(_with(stage, setting, share), target)
@@ -101,9 +126,10 @@ def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Sett
                     break
                 fitting[setting] = report
 
-    for _ in track(tries(), "compiling other settings", total=len(counts) * len(keeping)):
+    shared = f", {context} devices to a clip" if context > 1 else ""
+    for _ in track(tries(), f"compiling other settings{shared}", total=len(counts) * len(keeping)):
         pass
-    return dict(sorted(fitting.items(), key=lambda item: _order(item[1])))
+    return fitting
 
 
 def _order(report: Report) -> tuple[float, int]:
@@ -113,17 +139,19 @@ def _order(report: Report) -> tuple[float, int]:
 
 def _heading(title: str, stage: Stage, target: Target) -> str:
     setting, device = _setting(stage, target), target.devices[0].device_kind
+    shared = f", {setting.context} to a clip" if setting.context > 1 else ""
     return (
-        f"{title} on {target.name}, {len(target.devices)} x {device}: batch "
+        f"{title} on {target.name}, {len(target.devices)} x {device}{shared}: batch "
         f"{stage.training.batch_size}, {setting.clips} on a device at a time, remat {setting.remat}"
     )
 
 
 def _setting(stage: Stage, target: Target) -> Setting:
     task, training = stage
-    groups = parts("batch", make_mesh(training.mesh, target.devices))
+    mesh = make_mesh(training.mesh, target.devices)
     remat = task.model.dit.remat if isinstance(task, Denoising) else "none"
-    return Setting(clips=training.batch_size // groups // training.accumulate, remat=remat)
+    clips = training.batch_size // parts("batch", mesh) // training.accumulate
+    return Setting(clips=clips, remat=remat, context=parts("tokens", mesh))
 
 
 def _with(stage: Stage, setting: Setting, share: int) -> Stage:
@@ -137,13 +165,13 @@ def _with(stage: Stage, setting: Setting, share: int) -> Stage:
 
 def _table(settings: Mapping[Setting, Report], batch: int) -> str:
     if not settings:
-        return "  no setting of this batch fits: more devices, or --training.mesh.context"
-    columns = f"{'clips a device':<16}{'--remat':<12}{'peak':>10}{'least s':>10}{'clips/s':>9}"
-    lines = ["", "  settings that fit, best first", f"    {columns}"]
+        return "  no setting of this batch fits: more devices"
+    columns = f"{'clips a device':<16}{'context':<9}{'--remat':<13}{'peak':>10}{'least s':>10}"
+    lines = ["", "  settings that fit, best first", f"    {columns}{'clips/s':>9}"]
     for setting, report in settings.items():
         least = report.least_s
         lines.append(
-            f"    {setting.clips:<16}{setting.remat:<12}{size(report.memory.peak):>10}"
-            f"{least:10.3g}{batch / least:9.3g}"
+            f"    {setting.clips:<16}{setting.context:<9}{setting.remat:<13}"
+            f"{size(report.memory.peak):>10}{least:10.3g}{batch / least:9.3g}"
         )
     return "\n".join(lines)

@@ -2,11 +2,12 @@
 
 Products alone count, a multiplication and an addition as two: those of arrays, convolutions, and
 those inside the flash kernels, which a program names and does not spell out. What is computed again
-in a backward pass is there to be seen, and counts.
+in a backward pass is there to be seen, and counts; what nothing needs does not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import prod
 from typing import Any
 
@@ -22,7 +23,17 @@ SPLASH = {"splash_mha_fwd": 2, "splash_mha_dkv": 5}
 
 def count(jaxpr: Any) -> float:
     """FLOPs of a traced program (`jax.make_jaxpr`, `jax.jit(...).trace`), on all devices."""
-    return sum((_of(equation) for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns), 0.0)
+    return sum((_of(equation) for equation in _used(getattr(jaxpr, "jaxpr", jaxpr))), 0.0)
+
+
+def _used(jaxpr: Any) -> Iterator[Any]:
+    """The equations that an answer needs, last first; what a policy has kept leaves others behind,
+    which no compiler takes over."""
+    needed = {id(var) for var in jaxpr.outvars}
+    for equation in reversed(jaxpr.eqns):
+        if any(id(var) in needed for var in equation.outvars):
+            needed.update(id(var) for var in equation.invars)
+            yield equation
 
 
 def _of(equation: Any) -> float:

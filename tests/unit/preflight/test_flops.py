@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
-from egosim_jax.models.attention import attention
+from egosim_jax.models.attention import attention, keep_attention
 from egosim_jax.models.wan_dit import EGOSIM_14B, WanDiT
 from egosim_jax.preflight.flops import count
 from egosim_jax.train.flops import count_forward
@@ -69,7 +69,7 @@ def test_loops_count_each_turn_and_choices_the_longer_way():
 def test_what_is_computed_again_counts_again():
     w = shape(8, 8)
     step = lambda x, w: jnp.sin(jnp.sin(x @ w) @ w).sum()  # noqa: E731
-    plain, again = (counted(jax.grad(f, (0, 1)), w, w) for f in (step, jax.checkpoint(step)))
+    plain, again = (counted(jax.value_and_grad(f, (0, 1)), w, w) for f in (step, jax.checkpoint(step)))
     assert plain == 6 * 2 * 8**3
     assert again > plain
 
@@ -83,3 +83,18 @@ def test_a_flash_kernel_computes_the_scores_twice(kernel, monkeypatch):
     assert counted(value, q, q, q) == 2 * product
     # Beside the kernel stands a sum over g · out, which splash writes as a product.
     assert counted(jax.grad(value, (0, 1, 2)), q, q, q) == pytest.approx(7 * product, rel=1e-3)
+
+
+@pytest.mark.parametrize("kernel", ["cudnn", "hopper", "splash"])
+@pytest.mark.parametrize(("policy", "products"), [(None, 9), (keep_attention, 7)])
+def test_what_a_policy_keeps_is_not_computed_again(kernel, policy, products, monkeypatch):
+    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
+    q = shape(2, 1024, 4, 128, dtype=jnp.bfloat16)
+
+    @partial(jax.checkpoint, policy=policy)
+    def value(*x):
+        return (attention(*x, kernel=kernel).astype(jnp.float32) ** 2).sum()
+
+    product = 2 * 2 * 4 * 1024 * 1024 * 128
+    found = counted(jax.value_and_grad(value, (0, 1, 2)), q, q, q)
+    assert found == pytest.approx(products * product, rel=1e-3)
