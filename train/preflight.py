@@ -57,8 +57,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool) -> int:
         if isinstance(stage.task, Denoising) and not math.isnan(target.device.flops):
             others = _others(stage, target, report)
             found[title]["settings"] = [
-                {**asdict(setting), **plain(report)}
-                for setting, report in others.items()
+                {**asdict(setting), **plain(report)} for setting, report in others.items()
             ]
             if not as_json:
                 print(_table(others, stage.training.batch_size))
@@ -85,7 +84,8 @@ def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Sett
     """The settings that fit, best first, with as few devices to a clip as any of them needs."""
     known = {_setting(stage, target): asked}
     for mesh in _meshes(stage, target):
-        fitting = _fitting(stage._replace(training=replace(stage.training, mesh=mesh)), target, known)
+        shared = stage._replace(training=replace(stage.training, mesh=mesh))
+        fitting = _fitting(shared, target, known)
         if fitting:
             return dict(sorted(fitting.items(), key=lambda item: _order(item[1])))
     return {}

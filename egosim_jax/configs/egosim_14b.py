@@ -18,7 +18,7 @@ from egosim_jax.types import VideoSpec
 CONFIG = ModelConfig(
     name="egosim_14b",
     video=VideoSpec(frames=61, height=480, width=832, fps=16),
-    dit=WanDiTConfig(dtype="bfloat16", remat="full"),
+    dit=WanDiTConfig(dtype="bfloat16", remat="attention"),
     vae=WanVAEConfig(dtype="bfloat16"),
     text=UMT5Config(dtype="bfloat16"),
     image=CLIPVisionConfig(dtype="bfloat16"),

@@ -117,8 +117,8 @@ class RMSNorm(nnx.Module):
         """Normalise; the answer is float32."""
         x = x.astype(jnp.float32)
         inverse = jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
-        # Behind the barrier is one number per row. Without it, a GPU's compiler makes the sum and the
-        # scaling one kernel, and writes and reads x again for what follows, such as the rotation.
+        # Behind the barrier is one number per row. Without it, a GPU's compiler makes the sum and
+        # the scaling one kernel, and moves x once more for what follows, such as the rotation.
         return x * jax.lax.optimization_barrier(inverse) * self.scale[...].astype(jnp.float32)
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from jax.sharding import AbstractMesh
 
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.preflight import targets
@@ -83,39 +84,66 @@ def test_only_the_paths_that_a_recipe_needs_are_left_out():
     assert with_paths(["tabletop", "--preflight", "h200:1"])[3:] == ["--out", "-"]
 
 
-def test_settings_that_fit_are_found_and_what_needs_more_is_not_tried(monkeypatch):
-    """Of a batch of 8 on one device, with room for 2 clips, or for 1 with attention's output."""
-    room = {(1, "full"), (1, "attention"), (2, "full")}
-    tried = []
-
-    def compile_step(stage, target):
-        setting = module._setting(stage, target)
-        tried.append((setting.clips, setting.remat))
-        return report((setting.clips, setting.remat) in room, setting)
-
-    def report(fits, setting):
-        needed = replace(measured.memory, temporaries=0 if fits else 10**12)
-        seconds = {"full": 4.0, "attention": 3.5}.get(setting.remat, 3.0) + 0.2 / setting.clips
-        return replace(measured, memory=needed, compute_s=seconds, memory_s=0.0, link_s=0.0)
-
+@pytest.fixture
+def room(monkeypatch):
+    """Compile nothing: what fits is what is said here, and what was tried can be read."""
     stage, target = Debug(out=Path()).stages()["denoiser"], targets.find("cpu:1")
     stage = stage._replace(training=replace(stage.training, batch_size=8))
     measured = module.compile_step(stage, target)
-    monkeypatch.setattr(module, "compile_step", compile_step)
-    asked = report(False, Setting(clips=8, remat="none"))
-    found = module._others(stage, target, asked)
-    assert [(setting.clips, setting.remat) for setting in found] == [
-        (1, "attention"),
-        (2, "full"),
-        (1, "full"),
+
+    def look(fits):
+        tried = []
+
+        def report(setting):
+            needed = replace(measured.memory, temporaries=0 if setting in fits else 10**12)
+            seconds = {"full": 4.0, "attention": 3.5}.get(setting.remat, 3.0) + 0.2 / setting.clips
+            return replace(measured, memory=needed, compute_s=seconds, memory_s=0.0, link_s=0.0)
+
+        def compile_step(stage, target):
+            tried.append(module._setting(stage, target))
+            return report(tried[-1])
+
+        monkeypatch.setattr(module, "compile_step", compile_step)
+        asked = module._setting(stage, target)
+        return list(module._others(stage, target, report(asked))), tried
+
+    return look
+
+
+def test_settings_that_fit_are_found_and_what_needs_more_is_not_tried(room):
+    """Of a batch of 8 on one device, with room for 2 clips, or for 1 with attention's output."""
+    fits = [
+        Setting(clips=1, remat="attention"),
+        Setting(clips=2, remat="full"),
+        Setting(clips=1, remat="full"),
     ]
-    assert tried == [
+    found, tried = room(fits)
+    assert found == fits
+    assert [(setting.clips, setting.remat) for setting in tried] == [
         (1, "full"),
         (1, "attention"),
-        (1, "products"),
+        (1, "projections"),
         (2, "full"),
         (2, "attention"),
         (4, "full"),
+    ]
+
+
+def test_where_nothing_fits_more_devices_share_a_clip(room, monkeypatch):
+    """Four devices take a batch of 8 in two parts of four clips, and two devices share a part."""
+
+    def mesh_of_four(config, _):
+        fsdp = 4 // config.context if config.fsdp == -1 else config.fsdp
+        return AbstractMesh((config.data, fsdp, config.context), ("data", "fsdp", "context"))
+
+    monkeypatch.setattr(module, "make_mesh", mesh_of_four)
+    found, tried = room([Setting(clips=1, remat="full", context=2)])
+    assert found == [Setting(clips=1, remat="full", context=2)]
+    assert [(s.clips, s.remat, s.context) for s in tried] == [
+        (1, "full", 1),
+        (1, "full", 2),
+        (1, "attention", 2),
+        (2, "full", 2),
     ]
 
 

@@ -26,7 +26,7 @@ class Egosim14BRobot(FineTuning):
         default_factory=lambda: Training(
             steps=200,
             batch_size=32,
-            accumulate=2,
+            accumulate=4,
             optimizer=OptimizerConfig(learning_rate=1e-5, weight_decay=0.01),
             log_every=5,
             save_every=50,

@@ -29,6 +29,7 @@ class Egosim1B(FineTuning):
         default_factory=lambda: Training(
             steps=4000,
             batch_size=32,
+            accumulate=4,
             optimizer=OptimizerConfig(learning_rate=1e-5, weight_decay=0.01),
             save_every=200,
             keep_every=1000,

@@ -112,19 +112,45 @@ def test_keys_that_are_added_for_cudnn_change_nothing(keys):
 
 
 @pytest.mark.parametrize(
-    ("platform", "dtype", "size", "kernel"),
+    ("platform", "kind", "dtype", "size", "kernel"),
     [
-        ("cpu", "float32", 128, "xla"),
-        ("gpu", "bfloat16", 128, "cudnn"),
-        ("gpu", "float32", 128, "xla"),
-        ("gpu", "bfloat16", 36, "xla"),
-        ("tpu", "bfloat16", 128, "splash"),
-        ("tpu", "float32", 24, "xla"),
+        ("cpu", "cpu", "float32", 128, "xla"),
+        ("gpu", "NVIDIA A100-SXM4-80GB", "bfloat16", 128, "cudnn"),
+        ("gpu", "NVIDIA B200", "bfloat16", 128, "cudnn"),
+        ("gpu", "NVIDIA H100 80GB HBM3", "bfloat16", 128, "hopper"),
+        ("gpu", "NVIDIA H200", "bfloat16", 128, "hopper"),
+        ("gpu", "NVIDIA H200", "float32", 128, "xla"),
+        ("gpu", "NVIDIA H200", "bfloat16", 36, "xla"),
+        ("tpu", "TPU v5", "bfloat16", 128, "splash"),
+        ("tpu", "TPU v5", "float32", 24, "xla"),
     ],
 )
-def test_each_platform_has_its_kernel(platform, dtype, size, kernel, monkeypatch):
+def test_each_device_has_its_kernel(platform, kind, dtype, size, kernel, monkeypatch):
     monkeypatch.setattr(module, "platform", lambda: platform)
+    monkeypatch.setattr(module, "device_kind", lambda: kind)
     assert module._best(jnp.zeros((1, 2, 3, size), dtype)) == kernel
+
+
+@pytest.mark.parametrize(
+    ("queries", "keys", "size", "dtype", "fits"),
+    [
+        (24960, 24960, 128, "bfloat16", True),
+        (3120, 24960, 128, "bfloat16", False),  # queries are taken 128 at a time
+        (24960, 257, 128, "bfloat16", False),
+        (24960, 512, 128, "bfloat16", False),  # too few keys to gain by it
+        (1024, 1024, 64, "float16", True),
+        (1024, 1024, 96, "bfloat16", False),
+    ],
+)
+def test_the_hopper_kernel_takes_whole_tiles_and_leaves_the_rest_to_cudnn(
+    queries, keys, size, dtype, fits, monkeypatch
+):
+    # Traced, not run.
+    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
+    q, k = (jax.ShapeDtypeStruct((1, n, 2, size), dtype) for n in (queries, keys))
+    program = str(jax.make_jaxpr(partial(attention, kernel="hopper"))(q, k, k))
+    assert ("hopper_attention" in program) is fits
+    assert ("dot_product_attention_fwd" in program) is not fits
 
 
 @pytest.mark.parametrize("kernel", ["xla", "cudnn", "splash"])

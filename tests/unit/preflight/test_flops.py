@@ -69,7 +69,9 @@ def test_loops_count_each_turn_and_choices_the_longer_way():
 def test_what_is_computed_again_counts_again():
     w = shape(8, 8)
     step = lambda x, w: jnp.sin(jnp.sin(x @ w) @ w).sum()  # noqa: E731
-    plain, again = (counted(jax.value_and_grad(f, (0, 1)), w, w) for f in (step, jax.checkpoint(step)))
+    plain, again = (
+        counted(jax.value_and_grad(f, (0, 1)), w, w) for f in (step, jax.checkpoint(step))
+    )
     assert plain == 6 * 2 * 8**3
     assert again > plain
 
