@@ -19,7 +19,7 @@ from einops import rearrange
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from egosim_jax.models import flash, hopper
+from egosim_jax.models import flash
 from egosim_jax.sharding import (
     ACTIVATIONS,
     constrain,
@@ -86,9 +86,11 @@ def attention(
         return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation="xla")
     scale = float(q.shape[-1] ** -0.5) if scale is None else scale
     kernel = _best(q) if kernel == "auto" else kernel
-    if kernel == "hopper" and hopper.fits(q, k):
-        return hopper.attend(q, k, v, scale)
-    if kernel in ("cudnn", "hopper"):
+    if kernel == "hopper":
+        from egosim_jax.models import hopper  # which takes a third of a second
+
+        return hopper.attend(q, k, v, scale=scale)
+    if kernel == "cudnn":
         return flash.cudnn(q, k, v, scale=scale)
     if kernel == "splash":
         name = SELF_ATTENTION if q.shape == k.shape else None

@@ -44,6 +44,11 @@ Queries = Float[Array, "b n h k"]
 Keys = Float[Array, "b m h k"]
 
 
+def attend(q: Queries, k: Keys, v: Keys, *, scale: float) -> Queries:
+    """Attend, in bfloat16 or float16 with float32 sums; by cuDNN where the kernel does not fit."""
+    return _attend(q, k, v, scale) if fits(q, k) else flash.cudnn(q, k, v, scale=scale)
+
+
 def fits(q: jax.Array, k: jax.Array) -> bool:
     """Whether the kernel can attend from so many queries to so many keys, and gains by it."""
     _, queries, _, size = q.shape
@@ -53,8 +58,7 @@ def fits(q: jax.Array, k: jax.Array) -> bool:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def attend(q: Queries, k: Keys, v: Keys, scale: float) -> Queries:
-    """Attend, in bfloat16 or float16 with float32 sums, where `fits` says so."""
+def _attend(q: Queries, k: Keys, v: Keys, scale: float) -> Queries:
     return hopper_attention(q, k, v, scale)
 
 
@@ -66,20 +70,20 @@ def _backward(scale: float, pull: Any, g: jax.Array) -> Any:
     return pull(g)
 
 
-attend.defvjp(_forward, _backward)
+_attend.defvjp(_forward, _backward)
 
 
 @partial(jax.jit, static_argnums=3)
 def hopper_attention(q: Queries, k: Keys, v: Keys, scale: float) -> Queries:
     """The kernel; programs know it by this name (`preflight/flops.py`)."""
     batch, queries, heads, size = q.shape
-    swizzled = {"transforms": (gpu.TilingTransform((8, 64)), gpu.SwizzleTransform(128))}
-    blocks = gpu.SMEM((STAGES, BLOCK, size), q.dtype, **swizzled)
+    shared = partial(gpu.SMEM, transforms=(gpu.TilingTransform((8, 64)), gpu.SwizzleTransform(128)))
+    blocks = shared((STAGES, BLOCK, size), q.dtype)
     return gpu.kernel(
         partial(_tile, steps=k.shape[1] // BLOCK, scale=scale * math.log2(math.e)),
         out_type=jax.ShapeDtypeStruct(q.shape, q.dtype),
         scratch_types={
-            "tiles": gpu.SMEM((COMPUTING, ROWS, size), q.dtype, **swizzled),
+            "tiles": shared((COMPUTING, ROWS, size), q.dtype),
             "keys": blocks,
             "values": blocks,
             "queries_here": gpu.Barrier(num_barriers=COMPUTING),
