@@ -1,11 +1,11 @@
-"""From conditions to a clip: encode, denoise, decode. The only place that jits inference.
+"""From conditions to a clip: encode, denoise, decode.
 
     triplet --tokenise, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
 
-Each arrow is one compiled program. All denoising steps are one program, a scan without a round trip
-to the host; what the steps share (embeddings, cross-attention keys and values, the condition's part
-of the patch embedding) is computed before the scan, and the noise is donated. An item's noise
-depends on its own seed only, so that a clip does not depend on the batch it was made in.
+Each arrow is one compiled program (`program.py`). All denoising steps are one, a scan without a
+round trip to the host; what the steps share (embeddings, cross-attention keys and values, the
+condition's part of the patch embedding) is computed before the scan, and the noise is donated. An
+item's noise depends on its own seed only, so that a clip does not depend on its batch.
 
 On a mesh (`sharding.py`) every batch is dealt out over data x fsdp; the devices along context share
 the denoising of a clip, and each of them encodes and decodes it, too.
@@ -13,8 +13,7 @@ the denoising of a clip, and each of them encodes and decodes it, too.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, no_type_check
@@ -35,14 +34,14 @@ from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.schedule import FlowSchedule, VelocityFn
 from egosim_jax.diffusion.solver import Euler, UniPC, integrate
 from egosim_jax.io import weights
-from egosim_jax.io.executables import kept
 from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
 from egosim_jax.models.layers import initialise
 from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.program import Program, place
 from egosim_jax.rendering.reference import draw_hands
-from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
+from egosim_jax.sharding import several_devices
 from egosim_jax.types import Action, Clip, Condition, InputError, Triplet, VideoSpec, View
 
 T = TypeVar("T")
@@ -232,107 +231,12 @@ def denoise(
     )
 
 
-class Program:
-    """A function of the networks and arrays, compiled once for each shape of its arguments.
-
-    On a mesh, on which `place` has put the networks, all arrays have a leading batch axis. Raises
-    `InputError` before compiling for a batch that the mesh does not divide. What is `about` tells
-    the function from others; a program that has it is kept between starts (`io/executables.py`).
-    """
-
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        networks: nnx.Module,
-        *,
-        mesh: Mesh | None = None,
-        about: Any = None,
-        **options: Any,
-    ):
-        graph, self._params = nnx.split(networks, nnx.Param)
-        self._mesh, self._about = mesh, about
-        if mesh is not None:
-            options["out_shardings"] = batch_sharding(mesh)
-        self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
-        self._compiled: dict[Any, Any] = {}
-
-    def trace(self, *args: Any) -> Any:
-        """The program for these arguments, arrays or shapes, as `jax.jit` traces it."""
-        with self._on_mesh():
-            return self._jit.trace(self._params, *self._placed(args))
-
-    def compile(self, *args: Any) -> Any:
-        """Compile for these arguments, arrays or shapes, or find what was compiled before."""
-        given = self._placed(args)
-
-        def compile() -> Any:
-            return self._jit.lower(self._params, *given).compile()
-
-        with self._on_mesh():
-            compiled = (
-                compile()
-                if self._about is None
-                else kept(self._about, (self._params, given), compile)
-            )
-        self._compiled[_signature(args)] = compiled
-        return compiled
-
-    def shapes(self, *args: Any) -> Any:
-        """The shapes of the answer."""
-        compiled = self._compiled.get(_signature(args))
-        return (compiled or self.trace(*args)).out_info
-
-    def _placed(self, args: tuple) -> tuple:
-        """The shapes of arguments, on their devices."""
-        placed = None
-        if self._mesh is not None:
-            check_batch(jax.tree.leaves(args)[0].shape[0], self._mesh)
-            placed = batch_sharding(self._mesh)
-        return jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed), args
-        )
-
-    def __call__(self, *args: Any) -> Any:
-        """Run, compiling first if nobody has."""
-        if (signature := _signature(args)) not in self._compiled:
-            self.compile(*args)
-        if self._mesh is not None:
-            args = jax.device_put(args, batch_sharding(self._mesh))
-        return self._compiled[signature](self._params, *args)
-
-    def _on_mesh(self) -> contextlib.AbstractContextManager[Any]:
-        return contextlib.nullcontext() if self._mesh is None else jax.set_mesh(self._mesh)
-
-
-def _signature(args: Any) -> Any:
-    return tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(args))
-
-
-def place(networks: Module, mesh: Mesh | None) -> Module:
-    """Networks whose weights lie on a mesh as the rules say; the same ones without a mesh.
-
-    The weights may be shapes: then they are those of weights that would lie there.
-    """
-    if mesh is None:
-        return networks
-    graph, params = nnx.split(networks, nnx.Param)
-    placed = jax.tree.map(_put, params, state_sharding(mesh, params))
-    return nnx.merge(graph, placed)
-
-
-def _put(leaf: Any, sharding: Any) -> Any:
-    """An array on its devices; a shape, of an array that would lie there."""
-    if isinstance(leaf, jax.ShapeDtypeStruct):
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-    return jax.device_put(leaf, sharding)
-
-
 class Generator:
     """A model ready to generate, on one device or on those of a mesh."""
 
     def __init__(self, config: ModelConfig, networks: Networks, mesh: Mesh | None = None):
         self.config = config
-        networks = place(networks, mesh)
+        self.networks = networks = place(networks, mesh)
         self._encode = Program(encode_condition, networks, mesh=mesh, about=("encode", config))
         self._latents = Program(
             lambda vae, video: vae.encode(to_model(video)), networks.vae, mesh=mesh

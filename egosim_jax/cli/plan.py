@@ -77,14 +77,14 @@ def plan(
     """What each program of generation takes, beside the weights of all networks."""
     from flax import nnx
 
-    from egosim_jax.generator import Generator, Networks, place
+    from egosim_jax.generator import Generator, Networks
     from egosim_jax.preflight.report import compile_for
 
     networks = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0)))
     for name, network in networks.parts().items():
         setattr(networks, name, _stored(network, getattr(config, name).dtype))
-    networks = place(networks, mesh)
-    generator, weights = Generator(config, networks, mesh), _on_a_device(nnx.state(networks))
+    generator = Generator(config, networks, mesh)
+    weights = _on_a_device(nnx.state(generator.networks))
     for name, program, given in generator.programs(size):
         if name == "noise":  # as large as the latents
             continue

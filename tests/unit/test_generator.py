@@ -16,10 +16,10 @@ from egosim_jax.generator import (
     Inputs,
     ModelConfig,
     Networks,
-    Program,
     denoise,
     encode_condition,
 )
+from egosim_jax.program import Program
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
