@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 from flax import nnx
+from jax.experimental import mesh_utils
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from egosim_jax.types import InputError, MeshConfig
@@ -52,19 +53,25 @@ def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
             "(--mesh.data, --mesh.fsdp, --mesh.context; in training, after the stage's name)"
         )
     axes = ("data", "fsdp", "context")
-    return jax.make_mesh(shape, axes, axis_types=(AxisType.Auto,) * 3, devices=devices)
+    # `jax.make_mesh` would refuse axes that are not whole ones of a TPU's torus.
+    laid = mesh_utils.create_device_mesh(shape, devices, allow_split_physical_axes=True)
+    return Mesh(laid, axes, axis_types=(AxisType.Auto,) * 3)
 
 
 def check_batch(size: int, mesh: Mesh | AbstractMesh, accumulate: int = 1) -> None:
     """Raise `InputError` unless data x fsdp can share a batch, each taking its in equal parts."""
-    unit = parts("batch", mesh) * accumulate
+    groups = parts("batch", mesh)
+    unit = groups * accumulate
     if size % unit:
         in_turn = f", each in {accumulate} parts" if accumulate > 1 else ""
+        fix = f"Nearest: {-(-size // unit) * unit}."
+        if size % groups == 0:
+            fix = f"{fix} Or parts whose number divides {size // groups}."
         raise InputError(
             f"A batch of {size} cannot be shared by a mesh of data {mesh.shape['data']} x fsdp "
             f"{mesh.shape['fsdp']}{in_turn}: it must be a multiple of their product, {unit}. "
-            f"Nearest: {-(-size // unit) * unit}. (--batch-size, in training --accumulate, or "
-            "another mesh: devices along context share one sample)"
+            f"{fix} (--batch-size, in training --accumulate, or another mesh: devices along "
+            "context share one sample)"
         )
 
 

@@ -27,8 +27,8 @@ from egosim_jax.train.programs import Programs
 from egosim_jax.train.settings import Stage
 from egosim_jax.types import MeshConfig
 
-KEEPING: tuple[Remat, ...] = ("full", "attention", "projections", "products", "none")
-"""What a backward pass may compute again, by the memory that it takes, least first."""
+KEEPING: tuple[Remat, ...] = ("offload", "full", "attention", "projections", "products", "none")
+"""What a backward pass may keep, by the memory of a device that it takes, least first."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,7 +96,8 @@ def room(monkeypatch):
 
         def report(setting):
             needed = replace(measured.memory, temporaries=0 if setting in fits else 10**12)
-            seconds = {"full": 4.0, "attention": 3.5}.get(setting.remat, 3.0) + 0.2 / setting.clips
+            seconds = {"offload": 4.5, "full": 4.0, "attention": 3.5}.get(setting.remat, 3.0)
+            seconds += 0.2 / setting.clips
             return replace(measured, memory=needed, compute_s=seconds, memory_s=0.0, link_s=0.0)
 
         def compile_step(stage, target):
@@ -116,16 +117,20 @@ def test_settings_that_fit_are_found_and_what_needs_more_is_not_tried(room):
         Setting(clips=1, remat="attention"),
         Setting(clips=2, remat="full"),
         Setting(clips=1, remat="full"),
+        Setting(clips=2, remat="offload"),
+        Setting(clips=1, remat="offload"),
     ]
     found, tried = room(fits)
     assert found == fits
     assert [(setting.clips, setting.remat) for setting in tried] == [
+        (1, "offload"),
         (1, "full"),
         (1, "attention"),
         (1, "projections"),
+        (2, "offload"),
         (2, "full"),
         (2, "attention"),
-        (4, "full"),
+        (4, "offload"),
     ]
 
 
@@ -137,13 +142,13 @@ def test_where_nothing_fits_more_devices_share_a_clip(room, monkeypatch):
         return AbstractMesh((config.data, fsdp, config.context), ("data", "fsdp", "context"))
 
     monkeypatch.setattr(module, "make_mesh", mesh_of_four)
-    found, tried = room([Setting(clips=1, remat="full", context=2)])
-    assert found == [Setting(clips=1, remat="full", context=2)]
+    found, tried = room([Setting(clips=1, remat="offload", context=2)])
+    assert found == [Setting(clips=1, remat="offload", context=2)]
     assert [(s.clips, s.remat, s.context) for s in tried] == [
-        (1, "full", 1),
+        (1, "offload", 1),
+        (1, "offload", 2),
         (1, "full", 2),
-        (1, "attention", 2),
-        (2, "full", 2),
+        (2, "offload", 2),
     ]
 
 

@@ -53,3 +53,5 @@ def test_a_batch_that_cannot_be_dealt_out_is_refused():
     check_batch(8, mesh)
     with pytest.raises(InputError, match=r"A batch of 6 .*data 2 x fsdp 2.* Nearest: 8"):
         check_batch(6, mesh)
+    with pytest.raises(InputError, match=r"Nearest: 16\. Or parts whose number divides 2"):
+        check_batch(8, mesh, accumulate=4)

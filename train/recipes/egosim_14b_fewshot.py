@@ -4,7 +4,7 @@ r"""EgoSim's adaption to a new wearer or place, from a few dozen clips.
         --out runs/mine
 
 50 updates of one clip a device, as in the paper (section 4.1), which had 30 clips. 8 x H200 with
-some 50 GiB each, a few minutes; on other numbers of devices set `--training.batch-size` to theirs.
+some 62 GiB each, a few minutes; on other numbers of devices set `--training.batch-size` to theirs.
 Estimated, not measured.
 """
 

@@ -3,10 +3,10 @@
     egosim-train egosim_14b_lora --weights weights/egosim_14b --latents latents/mine --out runs/lora
     egosim-convert lora runs/lora/lora.safetensors --config egosim_14b --out mine.safetensors
 
-The weights stay as they are, in bfloat16: 33 GB, and some 15 GiB for the one clip at a time that an
-update of 8 takes in 8 parts; a LoRA of rank 64 has 337 million weights, which are float32 with
-their moments: 4 GB. One H200 or H100, a minute an update. Estimated, not measured. The second
-command writes the names that ComfyUI and diffusers read.
+The weights stay as they are, in bfloat16: 33 GB; a LoRA of rank 64 has 337 million weights, which
+are float32 with their moments: 4 GB. With what the one clip keeps that an update of 8 takes at a
+time, 65 GiB: one H200 or H100, a minute an update. Estimated, not measured. The second command
+writes the names that ComfyUI and diffusers read.
 """
 
 from __future__ import annotations

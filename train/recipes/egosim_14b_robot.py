@@ -4,7 +4,7 @@ r"""EgoSim's cross-embodiment training: the model of people's hands goes on with
         --out runs/robot
 
 200 updates of 32 clips after the main training, as in the paper (section 4.1); hardware and memory
-as in `egosim_14b`, two hours at 40 % of the peak. Estimated, not measured.
+as in `egosim_14b`, two hours at 45 % of the peak. Estimated, not measured.
 """
 
 from __future__ import annotations
