@@ -166,12 +166,14 @@ def _with(stage: Stage, setting: Setting, share: int) -> Stage:
 def _table(settings: Mapping[Setting, Report], batch: int) -> str:
     if not settings:
         return "  no setting of this batch fits: more devices"
-    columns = f"{'clips a device':<16}{'context':<9}{'--remat':<13}{'peak':>10}{'least s':>10}"
-    lines = ["", "  settings that fit, best first", f"    {columns}{'clips/s':>9}"]
+    columns = f"{'clips at a time':<17}{'accumulate':<12}{'context':<9}{'remat':<13}"
+    lines = ["", "  settings that fit, best first"]
+    lines.append(f"    {columns}{'peak':>10}{'least s':>10}{'clips/s':>9}")
     for setting, report in settings.items():
         least = report.least_s
+        accumulate = batch * setting.context // report.devices // setting.clips
         lines.append(
-            f"    {setting.clips:<16}{setting.context:<9}{setting.remat:<13}"
+            f"    {setting.clips:<17}{accumulate:<12}{setting.context:<9}{setting.remat:<13}"
             f"{size(report.memory.peak):>10}{least:10.3g}{batch / least:9.3g}"
         )
     return "\n".join(lines)
