@@ -4,9 +4,9 @@
     python -m tests.benchmarks.fits [--only TEXT]
     python -m tests.benchmarks.fits --write
 
-A cell takes from 20 s to 2 minutes on two cores. Cells are kept in docs/fits.json, so that a run
-that was interrupted goes on, and one cell can be made again by removing it there; `--write` puts
-what is known into the README.
+A cell takes from 10 s to 2 minutes on two cores, half a minute more for 64 chips. Cells are kept in
+docs/fits.json, so that a run that was interrupted goes on, and one cell can be made again by
+removing it there; `--write` puts what is known into the README.
 """
 
 from __future__ import annotations
