@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from egosim_jax.conditioning import condition_channels, pack_mask
@@ -39,13 +39,11 @@ from egosim_jax.models.layers import initialise
 from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
-from egosim_jax.program import Program, place
+from egosim_jax.program import Program, gathered, place
 from egosim_jax.rendering.reference import draw_hands
-from egosim_jax.sharding import several_devices
 from egosim_jax.types import Action, Clip, Condition, InputError, Triplet, VideoSpec, View
 
 T = TypeVar("T")
-Module = TypeVar("Module", bound=nnx.Module)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,19 +191,11 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
         mask=inputs.mask.astype(jnp.float32),
         prior=networks.vae.encode(to_model(inputs.prior)),
         hands=networks.vae.encode(to_model(inputs.hands)),
-        text=_gathered(networks.text)(inputs.ids, inputs.ids_mask),
+        text=gathered(networks.text)(inputs.ids, inputs.ids_mask),
         image=None
         if networks.image is None or inputs.pixels is None
-        else _gathered(networks.image)(inputs.pixels),
+        else gathered(networks.image)(inputs.pixels),
     )
-
-
-def _gathered(network: Module) -> Module:
-    """The network, its weights fetched whole to every device, which then works by itself."""
-    if not several_devices():
-        return network
-    graph, params = nnx.split(network)
-    return nnx.merge(graph, jax.lax.with_sharding_constraint(params, PartitionSpec()))
 
 
 def denoise(

@@ -1,4 +1,4 @@
-"""A function of networks, compiled: the only place that jits inference."""
+"""A function of networks, compiled, and where their weights lie: only here inference is jitted."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from flax import nnx
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
 
 from egosim_jax.io.executables import kept
-from egosim_jax.sharding import batch_sharding, check_batch, state_sharding
+from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
 
 Module = TypeVar("Module", bound=nnx.Module)
 
@@ -110,3 +110,11 @@ def _put(leaf: Any, sharding: Any) -> Any:
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
     return jax.device_put(leaf, sharding)
+
+
+def gathered(network: Module) -> Module:
+    """The network, its weights fetched whole to every device, which then works by itself."""
+    if not several_devices():
+        return network
+    graph, params = nnx.split(network)
+    return nnx.merge(graph, jax.lax.with_sharding_constraint(params, PartitionSpec()))

@@ -82,14 +82,17 @@ def several_devices() -> bool:
 
 def platform() -> str:
     """What a program that is traced will run on: `cpu`, `gpu` or `tpu`."""
-    device = jax.sharding.get_abstract_mesh().abstract_device
-    return jax.default_backend() if device is None else device.platform
+    return _device().platform
 
 
 def device_kind() -> str:
     """The name of the devices that what is traced will run on."""
+    return _device().device_kind
+
+
+def _device() -> Any:
     device = jax.sharding.get_abstract_mesh().abstract_device
-    return (jax.devices()[0] if device is None else device).device_kind
+    return jax.devices()[0] if device is None else device
 
 
 def constrain(x: jax.Array, axes: tuple[str | None, ...]) -> jax.Array:

@@ -102,7 +102,16 @@ def hopper_attention(q: Queries, k: Keys, v: Keys, scale: float) -> Queries:
 
 
 def _tile(
-    q: Any, k: Any, v: Any, out: Any, *, steps: int, scale: float, tiles: Any, **memory: Any
+    q: Any,
+    k: Any,
+    v: Any,
+    out: Any,
+    *,
+    steps: int,
+    scale: float,
+    tiles: Any,
+    queries_here: Any,
+    **memory: Any,
 ) -> None:
     """All of a block of threads: each warpgroup takes its part."""
     warpgroup, head, sample = (lax.axis_index(x) for x in ("warpgroup", "head", "sample"))
@@ -112,7 +121,7 @@ def _tile(
         gpu.set_max_registers(REGISTERS["computing"], action="increase")
         first = (lax.axis_index("tile") * COMPUTING + warpgroup) * ROWS
         rows = (sample, pl.ds(first, ROWS), head)
-        tile, here = tiles.at[warpgroup], memory["queries_here"].at[warpgroup]
+        tile, here = tiles.at[warpgroup], queries_here.at[warpgroup]
         gpu.copy_gmem_to_smem(q.at[rows], tile, here)
         gpu.barrier_wait(here)
         walk = partial(_walk, tile=tile, steps=steps, scale=scale, **memory)
@@ -150,10 +159,8 @@ def _walk(
     values_here: Any,
     keys_done: Any,
     values_done: Any,
-    queries_here: Any,
 ) -> jax.Array:
     """One warpgroup's way over all keys; `o` accumulates. Returns the answer in float32."""
-    del queries_here
     scores = partial(pl.run_scoped, s=gpu.ACC((ROWS, BLOCK), jnp.float32))
     across = lambda x: lax.broadcast_in_dim(x, (ROWS, BLOCK), (0,))  # noqa: E731
     over = lambda x: lax.broadcast_in_dim(x, o.shape, (0,))  # noqa: E731

@@ -13,10 +13,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-CUDNN = {"dot_product_attention_fwd_wrapper": 2, "dot_product_attention_bwd_wrapper": 5}
-"""Products in jax's cuDNN kernels; the scores are computed again in the backward pass."""
-HOPPER = "hopper_attention"
-"""The name of our kernel for Hopper; what it calls in the backward pass is cuDNN's."""
+KERNELS = {
+    "dot_product_attention_fwd_wrapper": 2,
+    "dot_product_attention_bwd_wrapper": 5,
+    "hopper_attention": 2,
+}
+"""Products in jax's cuDNN kernels, whose backward one computes the scores again, and in ours."""
 SPLASH = {"splash_mha_fwd": 2, "splash_mha_dkv": 5}
 """Those in the splash kernels, by how their names begin; the backward one is the fused one."""
 
@@ -44,9 +46,10 @@ def _of(equation: Any) -> float:
         return 2.0 * prod(out) * prod(left[axis] for axis in contracted)
     if name == "conv_general_dilated":
         return _convolution(equation)
-    if name in CUDNN or params.get("name") == HOPPER:
+    kernel = params.get("name") if name in ("jit", "pjit") else name
+    if kernel in KERNELS:
         q, k = (var.aval.shape for var in equation.invars[:2])
-        return 2.0 * CUDNN.get(name, 2) * prod(q) * k[1]
+        return 2.0 * KERNELS[kernel] * prod(q) * k[1]
     if name == "pallas_call":
         return _splash(equation)
     if name == "scan":

@@ -40,6 +40,7 @@ from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train import recipes
+from egosim_jax.train.flops import count_forward
 from egosim_jax.train.programs import Programs
 from egosim_jax.train.settings import Stage
 from egosim_jax.types import MeshConfig
@@ -136,7 +137,7 @@ def forward(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         run = jax.jit(
             lambda p, *x, graph=graph: nnx.merge(graph, p)(*x), in_shardings=batch_sharding(mesh)
         )
-        needed = options.clips * _forward_flops(config, options)
+        needed = options.clips * _forward_flops(config)
         args = (_half(params), *shapes)
         with jax.set_mesh(mesh):
             line = {"kernel": kernel, "layers": dit.layers}
@@ -182,7 +183,7 @@ def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     yield line
     inputs = _draw(Inputs.shapes(options.clips, config))
     seeds = jnp.arange(options.clips, dtype=jnp.uint32)
-    needed = options.clips * options.steps * _forward_flops(config, options)
+    needed = options.clips * options.steps * _forward_flops(config)
     for attempt in range(options.repeats):
         line = {"clip": attempt, "steps": options.steps}
         condition = _timed(line, "encode_s", lambda: programs["encode"](inputs))
@@ -285,8 +286,10 @@ def _stage(model: ModelConfig, clips: int) -> Stage:
     return Stage(replace(task, model=model), replace(training, batch_size=clips, accumulate=1))
 
 
-def _forward_flops(config: ModelConfig, options: argparse.Namespace) -> float:
-    return _stage(config, 1).task.flops(1) / 3
+def _forward_flops(config: ModelConfig) -> float:
+    """Those of one clip."""
+    text, latents = config.tokenizer.max_tokens, config.video.latent_shape
+    return count_forward(config.dit, latents=latents, text=text, image=IMAGE).total
 
 
 def _half(params: Any) -> Any:
