@@ -7,7 +7,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -94,8 +96,52 @@ def guarded(run: Callable[[], int]) -> int:
         print(stop, file=sys.stderr)
         return stop.code
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print(f"interrupted; to continue: {shlex.join(sys.argv)}", file=sys.stderr)
         return FAILED
-    except Exception:  # everything else is a failure of ours; the traceback says where
-        traceback.print_exc()
+    except Exception as error:
+        if (reason := system_failure(error)) is not None:
+            print(f"error: {reason}", file=sys.stderr)
+        else:  # everything else is a failure of ours; the traceback says where
+            traceback.print_exc()
         return FAILED
+
+
+def system_failure(error: BaseException) -> str | None:
+    """Describe in one line what the system refused (disk, permissions, memory); None if it did not.
+
+    Libraries in C++ raise errors of their own, which name the system's reason in their text.
+    """
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, MemoryError):
+            return "not enough memory. Take less at a time, or a machine with more."
+        text = str(seen).replace("\n", " ")
+        for code in REFUSALS:
+            reason = os.strerror(code)
+            if (isinstance(seen, OSError) and seen.errno == code) or reason in text:
+                name = getattr(seen, "filename", None)
+                where = f"{name}: {reason}" if name else text[:300]
+                return f"{where}. {REFUSALS[code]}"
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
+_WRITABLE = "Choose a folder that can be written to. (--out)"
+_RUN_AGAIN = "Free space and run the same command again; what is complete stays."
+REFUSALS = {
+    errno.ENOSPC: _RUN_AGAIN,
+    errno.EDQUOT: _RUN_AGAIN,
+    errno.EFBIG: _RUN_AGAIN,
+    errno.EROFS: _WRITABLE,
+    errno.EACCES: _WRITABLE,
+    errno.EPERM: _WRITABLE,
+    errno.ENOTDIR: "A file is where a folder has to be: choose another path.",
+    errno.EISDIR: "A folder is where a file has to be: choose another path.",
+    errno.EEXIST: "Something is in the way: choose another path.",
+    errno.ENAMETOOLONG: "Choose a shorter path.",
+    errno.ELOOP: "Links are not followed here: give the real path.",
+    errno.ENOENT: "Check the path.",
+    errno.EMFILE: "Raise the limit of open files (ulimit -n).",
+    errno.EIO: "Check the disk.",
+}
+"""What the system may refuse, and the way out."""

@@ -16,8 +16,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.journal import Journal
-from egosim_jax.io.whole import whole
 from egosim_jax.perception import Perception, archive
 from egosim_jax.rendering.reference import render
 from egosim_jax.state import snapshot
@@ -171,7 +171,7 @@ def _afresh(
 
 
 def _save_frames(path: Path, frames: UInt8[np.ndarray, "f h w 3"]) -> None:
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savez(temporary, frames=frames)
 
 

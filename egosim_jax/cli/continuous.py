@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
 from egosim_jax.cli.spread import Line, print_table, summarise
 from egosim_jax.command import DONE
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
 
@@ -125,5 +125,5 @@ def draw(tables: Mapping[str, Sequence[Line]], path: Path) -> None:
         axes.set_xlabel("clip")
         axes.grid(visible=True, alpha=0.3)
     figure.axes[0].legend()
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=100)

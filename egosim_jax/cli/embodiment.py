@@ -23,7 +23,7 @@ from egosim_jax.cli.held_out import (
 from egosim_jax.cli.spread import Line, print_table, summarise
 from egosim_jax.command import DONE
 from egosim_jax.data.sheet import draw_sheet
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
 
@@ -299,7 +299,7 @@ class Embodiment:
         path = self.out / "generated" / f"{name}.npy"
         if not path.exists():
             videos = list(track(make(), f"generating, {name}", total=self.held_out))
-            with whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 np.save(temporary, np.stack(videos))
         return list(np.load(path))
 
@@ -368,5 +368,5 @@ def draw_curves(validations: Mapping[str, Validation], path: Path) -> None:
         axes.grid(visible=True, alpha=0.3)
         axes.legend()
     left.set_ylabel("validation loss, held-out robots")
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=100)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from egosim_jax.command import DONE
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:
     import numpy as np
     from PIL import Image
 
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         Image.fromarray(np.concatenate(list(portrait(state, up=up)), axis=1)).save(temporary)
 
 

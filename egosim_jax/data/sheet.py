@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,5 +49,5 @@ def draw_sheet(
                 ImageDraw.Draw(header).text((2, 2), block.title, fill="black")
                 rows.append(np.asarray(header))
             rows.append(row)
-    with whole(out) as temporary:
+    with atomic_write(out) as temporary:
         Image.fromarray(np.concatenate(rows)).save(temporary)

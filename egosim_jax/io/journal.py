@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -31,7 +31,7 @@ class Journal:
         if self._path.exists():
             lines, _, torn = self._path.read_bytes().rpartition(b"\n")
             if torn:  # the run was killed in the middle of a line
-                with whole(self._path) as temporary:
+                with atomic_write(self._path) as temporary:
                     temporary.write_bytes(lines + b"\n" if lines else b"")
             for line in lines.splitlines():
                 entry = json.loads(line)

@@ -26,7 +26,7 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000
@@ -110,7 +110,7 @@ def write_video(
 ) -> None:
     """Write an H.264 mp4, whole or not at all."""
     data = encode_video(frames, fps, crf=crf)
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(data)
 
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import Tensor, read_metadata, read_safetensors
-from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def write(
     """Write tensors, and what is to be said about them, as safetensors, whole or not at all."""
     from safetensors.numpy import save_file
 
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.touch()
         mode = temporary.stat().st_mode
         save_file(dict(tensors), temporary, dict(about or {}))

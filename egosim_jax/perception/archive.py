@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.state.filter import from_arrays, to_arrays
 from egosim_jax.types import Cameras, InputError, Perceived
 
@@ -32,7 +32,7 @@ def save(path: Path, perceived: Perceived) -> None:
         **{name: getattr(perceived, name) for name in PIXELS},
         **to_arrays(perceived.touched),
     }
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.whole import whole
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.types import InputError, SceneState
 
 VERSION = 1
@@ -114,7 +114,7 @@ def write_ply(path: Path, state: SceneState) -> None:
     for name in ("object_ids", "last_seen"):
         column = np.ascontiguousarray(getattr(state, name).reshape(-1, 1))
         cloud.point[name] = o3d.core.Tensor(column)
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         if not o3d.t.io.write_point_cloud(str(temporary), cloud):
             raise OSError(f"{path} could not be written")
 

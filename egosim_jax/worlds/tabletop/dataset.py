@@ -12,8 +12,8 @@ from typing import Literal
 
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.whole import whole
 from egosim_jax.types import InputError, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, state_after, to_triplet
 
@@ -74,7 +74,7 @@ def _make(plan: Plan, seed: int, parts: Path) -> None:
     state = None
     for number, clip in enumerate(sequence):
         path = _part(parts, seed, number)
-        with whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_bytes(to_bytes(triplet_record(to_triplet(clip, state))))
         state = state_after(clip, state or clip.state)
 

@@ -1,0 +1,150 @@
+"""The one reader of bytes that others wrote: bounded before anything is built from them.
+
+Only regular files are opened, so that a pipe or a device cannot block. Sizes are checked before
+reading, depth and repeated names while parsing, and no message repeats an untrusted value in full.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+from egosim_jax.types import InputError
+
+MAX_JSON_BYTES = 16 << 20
+"""Largest JSON document that is parsed, in bytes; Python objects take up to 30 times as much."""
+MAX_QUOTED = 80
+"""Characters of an untrusted value in a message."""
+
+
+def open_regular(path: Path) -> io.BufferedReader:
+    """Open a regular file for reading.
+
+    Raises `InputError` for what is missing, unreadable, a folder, a pipe, a socket or a device.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError) as error:  # ValueError: a NUL character in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{quote_path(path)} cannot be read: {reason}.") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise InputError(f"{quote_path(path)} is not a regular file.")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_bytes(path: Path, *, limit: int) -> bytes:
+    """Read a regular file of at most `limit` bytes. Raises `InputError` if it is larger."""
+    with open_regular(path) as file:
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise InputError(
+            f"{quote_path(path)} has more than {limit:,} bytes, the most that is read."
+        )
+    return data
+
+
+def read_json(path: Path, *, limit: int = MAX_JSON_BYTES) -> Any:
+    """Parse a JSON file (`parse_json`)."""
+    return parse_json(read_bytes(path, limit=limit), source=quote_path(path), limit=limit)
+
+
+def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
+    """Parse one JSON document in UTF-8.
+
+    Raises `InputError`, naming `source`, for what is too large or too deep, repeats a name, holds
+    half a surrogate pair or is not JSON.
+    """
+    if len(data) > limit:
+        raise InputError(f"{source}: {len(data):,} bytes of JSON, more than {limit:,}.")
+    try:
+        value = json.loads(data.decode("utf-8"), object_pairs_hook=_unique)
+        if b"\\u" in data:
+            _check_surrogates(value)
+    except RecursionError:
+        raise InputError(f"{source} is not read: its JSON is nested too deeply.") from None
+    except ValueError as error:
+        raise InputError(f"{source} is not valid JSON: {quote_text(str(error))}.") from error
+    return value
+
+
+def read_lines(path: Path, *, limit: int = 1 << 30) -> Iterator[tuple[int, Any]]:
+    """Parse a file of JSON lines: line numbers from 1, and values; blank lines are passed over.
+
+    Only a line feed ends a line. A last line without one was cut off by a crash and is dropped.
+    """
+    name = quote_path(path)
+    with open_regular(path) as file:
+        if os.fstat(file.fileno()).st_size > limit:
+            raise InputError(f"{name} has more than {limit:,} bytes, the most that is read.")
+        number = 0
+        while line := file.readline(MAX_JSON_BYTES + 1):
+            number += 1
+            if len(line) > MAX_JSON_BYTES:
+                raise InputError(f"{name}, line {number} is longer than {MAX_JSON_BYTES:,} bytes.")
+            if line.endswith(b"\n") and line.strip():
+                yield number, parse_json(line, source=f"{name}, line {number}")
+
+
+def quote(value: Any) -> str:
+    """Describe an untrusted value for a message, in at most some `MAX_QUOTED` characters.
+
+    Text is quoted and cut, numbers are shown, containers only named with their size.
+    """
+    if isinstance(value, str):
+        cut = value[:MAX_QUOTED]
+        return ascii(cut) + ("…" if len(value) > MAX_QUOTED else "")
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, bool) or value is None or isinstance(value, float):
+        return repr(value)
+    if isinstance(value, int):
+        return repr(value) if value.bit_length() < 256 else "a number of over 77 digits"
+    if isinstance(value, (list, tuple, dict, set)):
+        return f"a {type(value).__name__} of {len(value)}"
+    return f"a {type(value).__name__}"
+
+
+def quote_text(text: str) -> str:
+    """Cut and escape text for a message, without quotation marks."""
+    return quote(text)[1:].replace("'…", "…").removesuffix("'")
+
+
+def quote_path(path: Path | str) -> str:
+    """Show a path in a message: as it is, unless it has characters that cannot be printed."""
+    text = str(path)
+    return text if text.isprintable() else ascii(text)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        seen: set[str] = set()
+        for name, _ in pairs:
+            if name in seen:
+                _refuse(f"the name {quote(name)} is repeated")
+            seen.add(name)
+    return found
+
+
+def _check_surrogates(value: Any) -> None:
+    rest = [value]
+    while rest:
+        item = rest.pop()
+        if isinstance(item, str):
+            if any("\ud800" <= character <= "\udfff" for character in item):
+                _refuse(f"{quote(item)} holds half a surrogate pair")
+        elif isinstance(item, dict):
+            rest += item.keys()
+            rest += item.values()
+        elif isinstance(item, list):
+            rest += item
+
+
+def _refuse(why: str) -> NoReturn:
+    raise ValueError(why)
