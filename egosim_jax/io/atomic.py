@@ -33,8 +33,8 @@ _NEW = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
 def atomic_write(path: Path) -> Iterator[Path]:
     """Create a temporary file to write to; rename it to `path` when the block ends.
 
-    The temporary file is empty, new, beside `path` and has its suffix; folders are made as needed.
-    It reaches the disk before it is renamed. After an error it is removed and an older `path` stays.
+    The temporary file is new, empty, beside `path` and has its suffix; folders are made as needed.
+    It reaches the disk before it is renamed. After an error it is removed; an older `path` stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
@@ -55,7 +55,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Create a temporary folder to write to; put it in the place of `path` when the block ends.
 
-    An older folder `path` is exchanged for it in one step and then removed; after an error it stays.
+    An older `path` is exchanged for it in one step and then removed; after an error it stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)

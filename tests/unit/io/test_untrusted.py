@@ -30,7 +30,7 @@ def test_a_file_above_the_limit_is_refused(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"12345")
     assert read_bytes(path, limit=5) == b"12345"
-    with pytest.raises(InputError, match="over 4 bytes"):
+    with pytest.raises(InputError, match="more than 4 bytes"):
         read_bytes(path, limit=4)
 
 

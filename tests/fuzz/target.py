@@ -1,0 +1,40 @@
+"""What a fuzzer needs to know of a format: a valid sample, our reader and, if any, another one."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Mutate = Callable[[bytes, random.Random], bytes]
+"""Change a file's bytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """One format, and how it is read.
+
+    A case passes if `read` raises `InputError` with a short message, or gives what it gave of the
+    sample, or, where the format has no checksum of ours, gives what `reference` gives of the changed
+    file. Everything else is a failure: another exception, another result, more than 1 GiB or 20 s.
+    """
+
+    name: str
+    """As on the command line."""
+    make: Callable[[Path], None]
+    """Write a valid sample, the same at every call, into an empty folder."""
+    read: Callable[[Path], Any]
+    """Read the sample in that folder; gives plain data and arrays, compared by their values."""
+    files: tuple[str, ...]
+    """Globs, below the folder, of the files that are changed one at a time."""
+    sealed: bool = False
+    """The format carries our checksum: every change that alters the result must be refused."""
+    reference: Callable[[Path], Any] | None = None
+    """An independent reader, whose result of a changed file ours must equal; None: then a changed
+    file that is read must give the sample's result, unless `lossy`."""
+    lossy: str = ""
+    """Why a changed file may be read with another result though nobody can notice; else empty."""
+    mutations: tuple[Mutate, ...] = ()
+    """Changes that know the format, besides those of bytes."""
