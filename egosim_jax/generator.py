@@ -34,6 +34,8 @@ from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.schedule import FlowSchedule, VelocityFn
 from egosim_jax.diffusion.solver import Euler, UniPC, integrate
 from egosim_jax.io import weights
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.run import plain
 from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
 from egosim_jax.models.layers import initialise
 from egosim_jax.models.umt5 import UMT5, UMT5Config
@@ -41,7 +43,17 @@ from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 from egosim_jax.program import Program, gathered, place
 from egosim_jax.rendering.reference import draw_hands
-from egosim_jax.types import Action, Clip, Condition, InputError, Triplet, VideoSpec, View
+from egosim_jax.types import (
+    Action,
+    Clip,
+    Condition,
+    InputError,
+    Triplet,
+    VideoSpec,
+    View,
+    check_seed,
+    check_video,
+)
 
 T = TypeVar("T")
 
@@ -106,13 +118,13 @@ class Networks(nnx.Module):
         self.image = None if config.image is None else CLIPVision(config.image, rngs=rngs)
 
     @classmethod
-    def load(cls, config: ModelConfig, folder: Path, *, mesh: Mesh | None = None) -> Networks:
+    def load(cls, config: ModelConfig, folder: Path | str, *, mesh: Mesh | None = None) -> Networks:
         """The networks of a weights folder, which holds `<network>.safetensors` for each.
 
         With a mesh each device reads its own part of the weights. Raises `InputError` with every
         path that is missing, unknown or of another shape.
         """
-        networks = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0)))
+        networks, folder = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))), Path(folder)
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of weights. (--weights)")
         for name, network in networks.parts().items():
@@ -308,7 +320,21 @@ class Generator:
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """The frames of one clip of a simulation (`simulator.Generator`)."""
+        """Generate one clip of a simulation (`simulator.Generator`).
+
+        Raises `InputError` unless view, action and first frame have the length and size of the
+        model's clips.
+        """
+        video = self.config.video
+        shape = (video.frames, video.height, video.width)
+        check_video("The view", view.frames, shape)
+        check_video("The first frame, as a clip of one,", first_frame[None], (1, *shape[1:]))
+        if len(action.joints_m) != video.frames:
+            raise InputError(
+                f"The action has {len(action.joints_m)} frames, the clips of {self.config.name} "
+                f"have {video.frames}: give as many cameras and hands."
+            )
+        check_seed(seed, name="seed")
         triplet = Triplet(
             video_id="clip",
             prompt=action.prompt,
@@ -318,6 +344,16 @@ class Generator:
             first_frame=first_frame,
         )
         return self.generate([triplet], [seed])[0].frames
+
+    def fingerprint(self) -> str:
+        """Return the content hash of the config and all weights, as they are in memory."""
+        state = nnx.to_flat_state(nnx.state(self.networks, nnx.Param))
+        return fingerprint(
+            {
+                "config": plain(self.config),
+                **{".".join(map(str, path)): np.asarray(leaf.get_value()) for path, leaf in state},
+            }
+        )
 
     def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
         """The truth through the autoencoder and back: the best any denoiser could give."""

@@ -16,14 +16,16 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.atomic import atomic_write, lock_folder
+from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.journal import Journal
+from egosim_jax.io.npz import read_arrays
 from egosim_jax.perception import Perception, archive
 from egosim_jax.rendering.reference import render
 from egosim_jax.state import snapshot
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.tsdf import Fusion
-from egosim_jax.types import Action, Clip, InputError, SceneState, View
+from egosim_jax.types import Action, Clip, InputError, SceneState, View, check_seed
 
 T = TypeVar("T")
 
@@ -126,26 +128,43 @@ class Simulator:
         state: SceneState,
         actions: Iterable[Action],
         *,
-        out: Path,
+        out: Path | str,
         seed: int,
         first_frame: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> Iterator[Step]:
-        """One step for each action, each from the state that the last one left.
+        """Run one step for each action, each from the state that the last one left.
 
-        Every phase is journaled in `out`; the same call goes on where it was interrupted. The first
-        frame is that of the first clip.
+        Every phase is journaled in `out`, with the content hashes of what the run is made of; the
+        same call resumes where it was interrupted. The first frame is that of the first clip.
+        Raises `InputError` showing both values if `out` holds a run of another state, action,
+        generator, perception or seed, and if another process is writing to it.
         """
-        journal = Journal(out)
-        for number, action in enumerate(actions, start=1):
+        check_seed(seed, name="seed")
+        out = Path(out)
+        with lock_folder(out):
+            journal = Journal(out, outputs=("clip_*/*",))
+            journal.require(
+                "run",
+                {
+                    "state": snapshot.fingerprint(state),
+                    "first_frame": fingerprint(first_frame),
+                    "generator": fingerprint(self.generator),
+                    "perception": fingerprint(self.perception),
+                    "fusion": fingerprint((self.fusion, self.point_px, self.fps)),
+                    "seed": str(seed),
+                },
+            )
+            for number, action in enumerate(actions, start=1):
+                journal.require(f"{number} action", {"action": fingerprint(action)})
 
-            def keep(phase: str, output: str, number: int = number, **how: object) -> object:
-                where = out / f"clip_{number}" / output
-                return journal.phase(f"{number} {phase}", where, **how)  # type: ignore[arg-type]
+                def keep(phase: str, output: str, number: int = number, **how: object) -> object:
+                    where = out / f"clip_{number}" / output
+                    return journal.phase(f"{number} {phase}", where, **how)  # type: ignore[arg-type]
 
-            image = first_frame if number == 1 else None
-            step = self.step(state, action, seed=seed + number, first_frame=image, keep=keep)  # type: ignore[arg-type]
-            yield step
-            state = step.state
+                image = first_frame if number == 1 else None
+                step = self.step(state, action, seed=seed + number, first_frame=image, keep=keep)  # type: ignore[arg-type]
+                yield step
+                state = step.state
 
     def _generate(
         self, view: View, action: Action, image: UInt8[np.ndarray, "h w 3"], seed: int
@@ -176,5 +195,4 @@ def _save_frames(path: Path, frames: UInt8[np.ndarray, "f h w 3"]) -> None:
 
 
 def _load_frames(path: Path) -> UInt8[np.ndarray, "f h w 3"]:
-    with np.load(path, allow_pickle=False) as file:
-        return file["frames"]
+    return read_arrays(path, {"frames": "uint8"})["frames"]

@@ -46,6 +46,24 @@ def check_frame_count(frames: int, *, what: str = "a video", fix: str = "--num-f
         )
 
 
+def check_video(what: str, frames: np.ndarray, shape: tuple[int, int, int] | None = None) -> None:
+    """Raise `InputError` unless `frames` is a uint8 RGB video `f h w 3`, of a size if given."""
+    have = np.shape(frames)
+    fits = len(have) == 4 and have[3] == 3 and 0 not in have and shape in (None, have[:3])
+    if not fits or getattr(frames, "dtype", None) != np.uint8:
+        size = "(frames, height, width" if shape is None else str(shape)[:-1]
+        raise InputError(
+            f"{what} is {getattr(frames, 'dtype', type(frames).__name__)} {have}: it must be uint8 "
+            f"{size}, 3)."
+        )
+
+
+def check_seed(seed: int, *, name: str = "--seed") -> None:
+    """Raise `InputError` unless a seed is a whole number from 0 to 2**63 - 1."""
+    if not (hasattr(seed, "__index__") and 0 <= seed < 2**63):
+        raise InputError(f"{name} must be a whole number from 0 to 2**63 - 1, not {seed!r:.40}.")
+
+
 def check_counts(counts: Mapping[str, int | None]) -> None:
     """Raise `InputError` at the first count below 1; by name, None if none was given."""
     for name, count in counts.items():
@@ -116,7 +134,14 @@ class Cameras:
     """Columns of a picture."""
 
     def __post_init__(self) -> None:
-        """Check that every pose is a rigid motion and that the camera has a picture."""
+        """Check shapes, that every pose is rigid and that the camera has a picture."""
+        for name, shape in (("world_from_camera", (4, 4)), ("intrinsics_px", (3, 3))):
+            have = np.shape(getattr(self, name))
+            if have[-2:] != shape or len(have) != (3 if name == "world_from_camera" else 2):
+                raise InputError(
+                    f"{name} has shape {have}: it must be "
+                    f"{'(frames, 4, 4)' if shape == (4, 4) else '(3, 3)'}."
+                )
         rotations = self.world_from_camera[:, :3, :3]
         drift = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
         rigid = np.isfinite(self.world_from_camera).all(axis=(1, 2)) & (drift < 1e-3)
@@ -181,6 +206,10 @@ class Clip:
     frames: UInt8[np.ndarray, "f h w 3"]
     fps: int
 
+    def __post_init__(self) -> None:
+        """Check that the frames are a uint8 RGB video."""
+        check_video("A clip", self.frames)
+
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
@@ -225,18 +254,92 @@ class SceneState:
             )
 
 
+JOINTS: Mapping[str, int] = {"human": 21, "robot": 3}
+"""Keypoints of a hand, by kind."""
+HAND_SIZE_M = (0.01, 1.0)
+"""Smallest and largest extent of a hand that is taken for one in meters."""
+NEAR_PICTURE = 0.25
+"""How far outside the picture, in widths and heights, a joint counts as near the view."""
+
+
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Action:
-    """What the wearer does in a clip."""
+    """The wearer's camera path, hands and caption for one clip."""
 
     cameras: Cameras
     """The head's path."""
     joints_m: Float[np.ndarray, "f n j 3"]
-    """Of n hands, in the world; a hand with a joint that is not finite is missing."""
+    """Joints of n hands in the world, in meters: 21 of a human hand, 3 of a gripper. A hand is
+    missing from a frame if all its joints are NaN; without hands, all of one hand are."""
     kind: Kind
     """Whose hands."""
     prompt: str
+
+    def __post_init__(self) -> None:
+        """Check kind, joint count, frame count, units and frame of reference.
+
+        Raises `InputError`, also where hands are given and none comes near any camera's view: then
+        they are not in world coordinates.
+        """
+        if self.kind not in JOINTS:
+            raise InputError(
+                f"The kind of hands must be 'human' or 'robot', not {str(self.kind)[:40]!r}."
+            )
+        if not isinstance(self.prompt, str):
+            raise InputError(f"The prompt must be text, not {type(self.prompt).__name__}.")
+        joints = np.asarray(self.joints_m)
+        frames, wanted = len(self.cameras.world_from_camera), JOINTS[self.kind]
+        shape = (frames, max(1, joints.shape[1] if joints.ndim == 4 else 1), wanted, 3)
+        if joints.shape != shape or joints.dtype.kind != "f":
+            raise InputError(
+                f"joints_m is {joints.dtype} {joints.shape}: {self.kind} hands of a path of "
+                f"{frames} cameras must be floats ({frames}, hands, {wanted}, 3), at least one "
+                "hand. A hand that is not there has joints of NaN."
+            )
+        finite = np.isfinite(joints)
+        given = finite.all(axis=(2, 3))
+        broken = ~given & ~np.isnan(joints).all(axis=(2, 3))
+        if broken.any():
+            frame, hand = np.argwhere(broken)[0].tolist()
+            raise InputError(
+                f"Hand {hand} of frame {frame} has joints that are not finite and others that are: "
+                "give all joints of a hand, or NaN for all where it is missing."
+            )
+        if given.any():
+            self._check_size(joints, given)
+            self._check_place(joints, given)
+
+    def _check_size(self, joints: np.ndarray, given: np.ndarray) -> None:
+        hands = joints[given]
+        extent = np.linalg.norm(hands.max(axis=1) - hands.min(axis=1), axis=-1)
+        low, high = HAND_SIZE_M
+        bad = (extent < low) | (extent > high)
+        if bad.any():
+            frame, hand = np.argwhere(given)[np.argmax(bad)].tolist()
+            raise InputError(
+                f"Hand {hand} of frame {frame} is {extent[np.argmax(bad)]:.4g} m large: a hand has "
+                f"{low} to {high} m. Joints must be in meters."
+            )
+
+    def _check_place(self, joints: np.ndarray, given: np.ndarray) -> None:
+        """Refuse hands of which no joint is in front of a camera and near its picture."""
+        cameras, poses = self.cameras, self.cameras.world_from_camera
+        where = np.where(given[:, :, None, None], joints, 0.0) - poses[:, None, None, :3, 3]
+        rotations = poses[:, :3, :3]
+        x, y, z = np.moveaxis(np.einsum("fnjc,fcd->fnjd", where, rotations), -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
+            v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
+        near_u, near_v = NEAR_PICTURE * cameras.width, NEAR_PICTURE * cameras.height
+        seen = (z > 0) & (u > -near_u) & (u < cameras.width + near_u)
+        seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
+        if not seen.any():
+            raise InputError(
+                "No joint of any hand comes near the view of the cameras in any frame: joints must "
+                "be in world coordinates, as the cameras are, and in meters. Hands that are out of "
+                "sight all the time are given as NaN."
+            )
 
 
 @no_type_check

@@ -78,7 +78,8 @@ class Tabletop:
         )
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
-        open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
+        made_of = {"experiment": self, "weights": hashes(weights)}
+        open_folder(self.out, made_of, may_differ=["experiment.weights"])
         generator = Generator(config.at(weights), Networks.load(config, weights))
         kinds: tuple[Kind, ...] = ("human", "robot")
         tables = {kind: self._compare(kind, generator) for kind in kinds}

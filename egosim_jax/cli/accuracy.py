@@ -69,7 +69,8 @@ class Update:
         check_counts({"--scenes": self.scenes})
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
-        open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
+        made_of = {"experiment": self, "weights": hashes(weights)}
+        open_folder(self.out, made_of, may_differ=["experiment.weights"])
         generator = Generator(config.at(weights), Networks.load(config, weights))
         table: dict[str, list[dict[str, float]]] = {}
         for seed in track(self._seeds(config.video), "scenes", total=self.scenes):

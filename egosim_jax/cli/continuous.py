@@ -57,7 +57,8 @@ class Continuous:
         check_counts({"--sequences": self.sequences, "--clips": self.clips})
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
-        open_folder(self.out, {"experiment": self, "weights": hashes(weights)})
+        made_of = {"experiment": self, "weights": hashes(weights)}
+        open_folder(self.out, made_of, may_differ=["experiment.weights"])
         generator = Generator(config.at(weights), Networks.load(config, weights))
         seeds = range(self.first_scene, self.first_scene + self.sequences)
         jobs = [(method, seed) for seed in seeds for method in METHODS]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -16,7 +15,9 @@ import tyro
 
 from egosim_jax.command import DONE, PARTIAL, USAGE
 from egosim_jax.data.sheet import Block, draw_sheet
-from egosim_jax.types import Clip, InputError, MeshConfig, Triplet, check_counts
+from egosim_jax.io.atomic import append_line
+from egosim_jax.io.untrusted import read_lines
+from egosim_jax.types import Clip, InputError, MeshConfig, Triplet, check_counts, check_seed
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -86,26 +87,58 @@ class Generate:
         check_counts(
             {"--steps": self.steps, "--batch-size": self.batch_size, "--limit": self.limit}
         )
+        check_seed(self.seed)
+        check_seed(self.seed + (self.limit or 0))
+        if min(self.start) < 0:
+            raise InputError(f"--start must be at least 0, not {min(self.start)}.")
+        if self.lora is not None and self._weights is None:
+            raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
         config = self._config()
         mesh, size = self._placing()
         items = None if self.metadata is None else self._items(self.metadata)
         self._open(config)
         if items is None:
             items = self._items(self._make_scenes(config))
-        todo = [item for item in items if not (self.skip_existing and self._video(item).exists())]
-        if len(todo) < len(items):
-            print(f"{len(items) - len(todo)} clips are already there", file=sys.stderr)
-        sound, bad = self._check(todo, config)
+        self._check_names(items)
+        existing = [item for item in items if self.skip_existing and self._video(item).exists()]
+        if existing:
+            print(f"{len(existing)} clips are already there", file=sys.stderr)
+            self._list(existing)
+        there = {item.output_id for item in existing}
+        todo = [item for item in items if item.output_id not in there]
+        valid, bad = self._check(todo, config)
         for item, problem in bad:
             self._report(item, status="failed", error=problem)
-        if bad and not sound:
-            return USAGE
-        if sound:
-            _warn_of_long_prompts(sound, config)
-            bad += self._generate(sound, config, mesh, size)
+        if valid:
+            _warn_of_long_prompts(valid, config)
+            bad += self._generate(valid, config, mesh, size)
             self._draw(items, config)
         print(f"{len(todo) - len(bad)} done, {len(bad)} failed: {self._folder}", file=sys.stderr)
+        if bad and not valid and not existing:
+            return USAGE
         return PARTIAL if bad else DONE
+
+    def _check_names(self, items: Sequence[_Item]) -> None:
+        """Raise `InputError` if two clips would write the same file."""
+        owners: dict[str, str] = {}
+        for item in items:
+            for suffix in ("", "_cmp", "_vae"):
+                name = f"{item.output_id}{suffix}.mp4"
+                other = owners.setdefault(name, item.output_id)
+                if other != item.output_id:
+                    raise InputError(
+                        f"The clips {other} and {item.output_id} would both write {name}. Rename "
+                        "one of them. (column video_id)"
+                    )
+
+    def _list(self, items: Sequence[_Item]) -> None:
+        """Report clips whose video is there and whose line a kill prevented."""
+        path = self._folder / RESULTS
+        lines = read_lines(path) if path.exists() else ()
+        done = {line.get("video_id") for _, line in lines if line.get("status") == "done"}
+        for item in items:
+            if item.output_id not in done:
+                self._report(item, status="done", seed=_seed(self.seed, item.output_id))
 
     def _make_scenes(self, config: ModelConfig) -> Path:
         """Scenes of the tabletop world at the model's size, as files; their metadata."""
@@ -155,6 +188,7 @@ class Generate:
         return mesh, size
 
     def _open(self, config: ModelConfig) -> None:
+        from egosim_jax.io.digest import sha256
         from egosim_jax.io.run import open_folder
         from egosim_jax.io.weights import hashes
 
@@ -162,7 +196,7 @@ class Generate:
         run = {
             "model": config,
             "weights": digests,
-            "lora": None if self.lora is None else [str(self.lora), self.lora_scale],
+            "lora": None if self.lora is None else [sha256(self.lora), self.lora_scale],
             "seed": self.seed,
             "policy": self._policy,
         }
@@ -293,18 +327,20 @@ class Generate:
         """Append a line to results.jsonl; an id's last line counts."""
         if status == "failed":
             print(f"failed: {item.output_id}: {values['error']}", file=sys.stderr)
-        line = {
+        own = {
             "video_id": item.output_id,
             "source_id": item.files.video_id,
             "start": item.start,
             "status": status,
-            "output": self._video(item).name,
+            "output": f"{item.output_id}.mp4",
             **values,
             "prompt": item.files.prompt,
-            **item.files.extra,
         }
-        with (self._folder / RESULTS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+        # A column of the metadata never takes the place of what happened.
+        reserved = {*own, "seed", "seconds", "error"}
+        extra = item.files.extra.items()
+        line = own | {f"metadata_{k}" if k in reserved else k: text for k, text in extra}
+        append_line(self._folder / RESULTS, line)
 
     def _video(self, item: _Item) -> Path:
         return self._folder / f"{item.output_id}.mp4"

@@ -10,6 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egosim_jax.io.atomic import atomic_write
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -29,10 +31,10 @@ class Recording:
         import rerun as rr
         import rerun.blueprint as rrb
 
-        self._path, self._temporary = path, path.with_suffix(".tmp")
+        self._writing = atomic_write(path)
         self._rr, self._frame = rr, 0
         self._stream = rr.RecordingStream("egosim", recording_id=name)
-        self._stream.save(self._temporary)
+        self._stream.save(self._writing.__enter__())
         pictures = (("view", "/view"), ("generated", "/world/camera"), ("truth", "/truth"))
         column = rrb.Vertical(*(rrb.Spatial2DView(name=n, origin=o) for n, o in pictures))
         scene = rrb.Spatial3DView(name="world", origin="/world")
@@ -74,7 +76,7 @@ class Recording:
         self._points(state)
         self._stream.flush()
         self._stream.disconnect()
-        self._temporary.replace(self._path)
+        self._writing.__exit__(None, None, None)
 
     def _points(self, state: SceneState) -> None:
         points = self._rr.Points3D(state.points_m, colors=state.colours, radii=POINT_M)

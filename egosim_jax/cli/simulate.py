@@ -14,7 +14,7 @@ from egosim_jax.cli.recording import Recording
 from egosim_jax.cli.view import RECORDING, write_portrait
 from egosim_jax.command import DONE
 from egosim_jax.data.sheet import Block, draw_sheet
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -62,16 +62,24 @@ class Simulate:
         """Simulate, measure, draw."""
         from egosim_jax import configs
         from egosim_jax.generator import Generator, Networks
+        from egosim_jax.io.digest import sha256
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
         from egosim_jax.simulator import Simulator
         from egosim_jax.worlds.tabletop import make_sequence, to_action
 
         check_counts({"--clips": self.clips})
+        check_seed(self.seed)
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
-        open_folder(folder, {"simulate": self, "model": config, "weights": hashes(weights)})
+        made_of = {
+            "simulate": self,
+            "model": config,
+            "weights": hashes(weights),
+            "image": None if self.first_frame is None else sha256(self.first_frame),
+        }
+        open_folder(folder, made_of, may_differ=["simulate.weights", "simulate.first_frame"])
         kind = "robot" if self.robot else "human"
         truth = list(make_sequence(self.seed, spec=config.video, clips=self.clips, kind=kind))
         simulator = Simulator(

@@ -1,41 +1,86 @@
 """The phases of a run that are done, one line each: what was written and its hash.
 
-A line is added when its file is whole and on disk. So a run that is killed goes on at the phase
-that was under way, and a file that was changed since is noticed.
+    {"phase": "run", "made_of": {"state": "3f...", "seed": "0", ...}, "chain": "..."}
+    {"phase": "1 action", "made_of": {"action": "9a..."}, "chain": "..."}
+    {"phase": "1 generate", "file": "clip_1/frames.npz", "sha256": "...", "seconds": 2.1, ...}
+
+A line is appended when its file is complete and on disk, so a run that is killed resumes at the
+phase that was under way. `made_of` records the values a run is made of: another run is refused.
+`chain` is the hash of the line before and of this line: a changed, lost or reordered line is found.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.atomic import append_line
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.untrusted import quote, read_lines
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
+NAME = "journal.jsonl"
+MAX_BYTES = 64 << 20
 
 
 class Journal:
-    """The journal of a run's folder."""
+    """The journal of a run's folder.
 
-    def __init__(self, folder: Path):
+    Raises `InputError` if it is damaged, of an earlier version, or missing although one of
+    `outputs`, globs of what only a journaled run writes, is there.
+    """
+
+    def __init__(self, folder: Path, *, outputs: tuple[str, ...] = ()):
         self._folder = folder
-        self._path = folder / "journal.jsonl"
-        self.done: dict[str, dict[str, str | float]] = {}
+        self._path = folder / NAME
+        self._chain = ""
+        self.done: dict[str, dict[str, Any]] = {}
         if self._path.exists():
-            lines, _, torn = self._path.read_bytes().rpartition(b"\n")
-            if torn:  # the run was killed in the middle of a line
-                with atomic_write(self._path) as temporary:
-                    temporary.write_bytes(lines + b"\n" if lines else b"")
-            for line in lines.splitlines():
-                entry = json.loads(line)
-                self.done[entry["phase"]] = entry
+            for number, entry in read_lines(self._path, limit=MAX_BYTES):
+                self._read(number, entry)
+        elif left := [path.name for glob in outputs for path in folder.glob(glob)]:
+            raise InputError(
+                f"{self._path} is missing, although {sorted(left)[0]} is there: without it the run "
+                f"cannot be resumed. Restore it, or remove {folder} to start over."
+            )
+
+    def _read(self, number: int, entry: Any) -> None:
+        way_out = f"Restore it, or remove {self._folder} to start over."
+        if isinstance(entry, dict) and "phase" in entry and "chain" not in entry:
+            raise InputError(
+                f"{self._path} is of an earlier version, which did not record what its run was "
+                f"made of: it cannot be resumed. Choose another folder, or remove {self._folder}."
+            )
+        chain = entry.pop("chain", None) if isinstance(entry, dict) else None
+        if chain is None or chain != _chained(self._chain, entry):
+            raise InputError(f"{self._path}, line {number} was changed or is lost. {way_out}")
+        self._chain, self.done[entry["phase"]] = chain, entry
+
+    def require(self, phase: str, made_of: Mapping[str, str]) -> None:
+        """Record the values that a run, or one of its phases, is made of.
+
+        Raises `InputError` showing both values where a value differs from the recorded one.
+        """
+        if phase not in self.done:
+            self._append({"phase": phase, "made_of": dict(made_of)})
+            return
+        recorded = self.done[phase]["made_of"]
+        differing = [
+            f"  {name}: recorded {quote(recorded.get(name))}, given {quote(made_of.get(name))}"
+            for name in sorted(recorded.keys() | made_of.keys())
+            if recorded.get(name) != made_of.get(name)
+        ]
+        if differing:
+            listing = "\n".join(differing)
+            raise InputError(
+                f"{self._folder} holds another run (phase {phase} in {NAME}). Choose another "
+                f"folder, or give it what it was made of:\n{listing}"
+            )
 
     def phase(
         self,
@@ -46,17 +91,17 @@ class Journal:
         save: Callable[[Path, T], None],
         load: Callable[[Path], T],
     ) -> T:
-        """What the phase gives: read if it is done, else made, written and entered.
+        """Return the phase's result: read if it is done, else made, written and recorded.
 
         What is made is read back from what was written, so that a run that was interrupted and one
-        that was not go on from the same. Raises `InputError` if a file of a finished phase is
+        that was not continue from the same. Raises `InputError` if a file of a finished phase is
         missing or changed.
         """
         if name in self.done:
-            if not output.exists() or digest(output) != self.done[name]["sha256"]:
+            if not output.exists() or digest(output) != self.done[name].get("sha256"):
                 raise InputError(
                     f"{output} is not what the run wrote in phase {name}: it is missing or was "
-                    f"changed. Bring it back, or remove {self._path} to start over."
+                    f"changed. Restore it, or remove {self._folder} to start over."
                 )
             return load(output)
         then = time.monotonic()
@@ -66,21 +111,27 @@ class Journal:
         return load(output)
 
     def _enter(self, name: str, output: Path, seconds: float) -> None:
-        entry = {
-            "phase": name,
-            "file": str(output.relative_to(self._folder)),
-            "sha256": digest(output),
-            "seconds": round(seconds, 3),
-        }
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        self.done[name] = entry
+        self._append(
+            {
+                "phase": name,
+                "file": str(output.relative_to(self._folder)),
+                "sha256": digest(output),
+                "seconds": round(seconds, 3),
+            }
+        )
+
+    def _append(self, entry: dict[str, Any]) -> None:
+        self._chain = _chained(self._chain, entry)
+        append_line(self._path, {**entry, "chain": self._chain})
+        self.done[entry["phase"]] = entry
+
+
+def _chained(chain: str, entry: Any) -> str:
+    return hashlib.sha256(f"{chain}{json.dumps(entry)}".encode()).hexdigest()[:32]
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file, or of the names and hashes of a folder's files."""
+    """Return the SHA-256 of a file, or of the names and hashes of a folder's files."""
     if path.is_dir():
         listing = [f"{file.name} {digest(file)}\n" for file in sorted(path.iterdir())]
         return hashlib.sha256("".join(listing).encode()).hexdigest()

@@ -13,9 +13,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.atomic import atomic_write, hold_folder
+from egosim_jax.io.untrusted import quote, quote_text, read_json
 from egosim_jax.types import InputError
 
+CONFIG, ENVIRONMENT = "config.json", "environment.json"
+PLACE = "out"
+"""Name of fields that say where to write."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "av")
 
 
@@ -74,27 +78,33 @@ def _commit() -> str | None:
 def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) -> None:
     """Make a run folder and record config and environment, or continue in one of equal config.
 
-    A folder that was moved stays the same run: `out` may differ, and so may the fields whose dotted
-    paths are given, with all below them. Of several processes the first one writes. Raises
-    `InputError` when the folder cannot be written or holds a run of another config, naming the
-    fields that differ.
+    The folder is locked until the process ends. Fields named `out` are places, not settings: a
+    folder that was moved stays the same run. Fields whose dotted paths are in `may_differ`, with
+    all below them, may differ, too. Of several processes the first one locks and writes. Raises
+    `InputError` when the folder cannot be written, is in use, lost its record, or holds a run of
+    another config, naming the fields that differ.
     """
     import jax
 
+    path, wanted = folder / CONFIG, plain(config)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".writable-{jax.process_index()}"
-        probe.touch()
-        probe.unlink()
+        if jax.process_index() == 0:
+            hold_folder(folder)
+        recorded = read_json(path) if path.exists() else None
     except OSError as error:
         raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
-    path, wanted = folder / "config.json", plain(config)
-    if path.is_file():
-        found = _differences(json.loads(path.read_text("utf-8")), wanted)
+    if recorded is None and (folder / ENVIRONMENT).exists():
+        raise InputError(
+            f"{path} is missing, although {folder} holds a run: without it nobody knows of which "
+            "config. Restore it, or choose another --out."
+        )
+    if recorded is not None:
+        if not isinstance(recorded, dict):
+            raise InputError(f"{path} is not the record of a config. Restore it. (--out)")
         differing = [
             f"  {field}: {what}"
-            for field, what in sorted(found.items())
-            if not any(f"{field}.".startswith(f"{free}.") for free in ("out", *may_differ))
+            for field, what in sorted(_differences(recorded, wanted).items())
+            if not any(f"{field}.".startswith(f"{free}.") for free in may_differ)
         ]
         if differing:
             raise InputError(
@@ -108,15 +118,18 @@ def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) 
             )
     if jax.process_index() == 0:
         write_json(path, config)
-        write_json(folder / "environment.json", environment())
+        write_json(folder / ENVIRONMENT, environment())
 
 
 def _differences(have: Any, want: Any, path: str = "") -> dict[str, str]:
-    """What differs, by the dotted path of its field."""
+    """Return what differs by the dotted path of its field; places to write to are not compared."""
     if isinstance(have, dict) and isinstance(want, dict):
         found = {}
         for key in have.keys() | want.keys():
-            below = f"{path}.{key}" if path else key
-            found |= _differences(have.get(key), want.get(key), below)
+            if key != PLACE:
+                below = f"{path}.{quote_text(key)}" if path else quote_text(key)
+                found |= _differences(have.get(key), want.get(key), below)
         return found
-    return {} if have == want else {path: f"the folder has {have}, this run has {want}"}
+    if have == want:
+        return {}
+    return {path: f"the folder has {quote(have)}, this run has {quote(want)}"}

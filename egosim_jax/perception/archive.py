@@ -9,10 +9,17 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.untrusted import parse_json, quote_path, quote_text
 from egosim_jax.state.filter import from_arrays, to_arrays
 from egosim_jax.types import Cameras, InputError, Perceived
 
 PIXELS = ("frames", "depth_m", "object_ids")
+_DTYPES = {
+    "about": "uint8", "world_from_camera": "float64", "intrinsics_px": "float64",
+    "paths": "float64", "frames": "uint8", "depth_m": "float32", "object_ids": "int32",
+    "touched_ids": "int32", "touched_frames": "bool",
+}  # fmt: skip
 
 
 def save(path: Path, perceived: Perceived) -> None:
@@ -26,8 +33,8 @@ def save(path: Path, perceived: Perceived) -> None:
     }
     arrays: dict[str, Any] = {
         "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
-        "world_from_camera": perceived.cameras.world_from_camera,
-        "intrinsics_px": perceived.cameras.intrinsics_px,
+        "world_from_camera": np.asarray(perceived.cameras.world_from_camera, float),
+        "intrinsics_px": np.asarray(perceived.cameras.intrinsics_px, float),
         "paths": np.array([perceived.world_from_object[number] for number in tracked], float),
         **{name: getattr(perceived, name) for name in PIXELS},
         **to_arrays(perceived.touched),
@@ -38,22 +45,23 @@ def save(path: Path, perceived: Perceived) -> None:
 
 def load(path: Path) -> Perceived:
     """Read what `save` wrote. Raises `InputError` if the file is something else."""
+    arrays = read_arrays(path, _DTYPES)
+    about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
     try:
-        with np.load(path, allow_pickle=False) as file:
-            about = json.loads(file["about"].tobytes())
-            cameras = Cameras(
-                world_from_camera=file["world_from_camera"],
-                intrinsics_px=file["intrinsics_px"],
-                height=about["size"][0],
-                width=about["size"][1],
-            )
-            return Perceived(
-                step=about["step"],
-                cameras=cameras,
-                names={int(number): name for number, name in about["names"].items()},
-                world_from_object=dict(zip(about["tracked"], file["paths"], strict=True)),
-                touched=from_arrays(file),
-                **{name: file[name] for name in PIXELS},
-            )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} does not say what was perceived: {error}.") from error
+        cameras = Cameras(
+            world_from_camera=arrays.pop("world_from_camera"),
+            intrinsics_px=arrays.pop("intrinsics_px"),
+            height=about["size"][0],
+            width=about["size"][1],
+        )
+        return Perceived(
+            step=about["step"],
+            cameras=cameras,
+            names={int(number): name for number, name in about["names"].items()},
+            world_from_object=dict(zip(about["tracked"], arrays.pop("paths"), strict=True)),
+            touched=from_arrays(arrays),
+            **{name: arrays[name] for name in PIXELS},
+        )
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        why = quote_text(str(error))
+        raise InputError(f"{quote_path(path)} is not a record of perception: {why}.") from error

@@ -8,25 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.atomic import atomic_folder, atomic_write
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.untrusted import quote, quote_text, read_json
 from egosim_jax.types import InputError, SceneState
 
 VERSION = 1
 POINTS, DESCRIPTION = "points.npz", "state.json"
 ARRAYS = ("points_m", "colours", "object_ids", "last_seen")
-_DTYPES = {
-    "points_m": np.float32,
-    "colours": np.uint8,
-    "object_ids": np.int32,
-    "last_seen": np.int32,
-}
+_DTYPES = {"points_m": "float32", "colours": "uint8", "object_ids": "int32", "last_seen": "int32"}
 
 
 def fingerprint(state: SceneState) -> str:
@@ -37,59 +35,106 @@ def fingerprint(state: SceneState) -> str:
     return digest.hexdigest()
 
 
-def save(folder: Path, state: SceneState) -> None:
-    """Write the state to a folder, which is there whole or not at all."""
-    temporary = folder.with_name(folder.name + ".tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    with (temporary / POINTS).open("wb") as file:
-        np.savez(file, **{name: getattr(state, name) for name in ARRAYS})
-    written = {
-        "version": VERSION,
-        "points": len(state.points_m),
-        "sha256": hashlib.sha256((temporary / POINTS).read_bytes()).hexdigest(),
-        **_description(state),
-    }
-    (temporary / DESCRIPTION).write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
-    temporary.rename(folder)
+def save(folder: Path | str, state: SceneState) -> None:
+    """Write the state to a folder, which is complete or absent."""
+    with atomic_folder(Path(folder)) as temporary:
+        np.savez(temporary / POINTS, **{name: getattr(state, name) for name in ARRAYS})
+        description = _description(state)
+        written = {
+            "version": VERSION,
+            "points": len(state.points_m),
+            "sha256": sha256(temporary / POINTS),
+            "description_sha256": _sealed(description),
+            **description,
+        }
+        text = json.dumps(written, indent=2) + "\n"
+        (temporary / DESCRIPTION).write_text(text, encoding="utf-8")
 
 
-def load(folder: Path) -> SceneState:
+def load(folder: Path | str) -> SceneState:
     """Read a state. Raises `InputError` if it is damaged, of another version or no state."""
+    folder = Path(folder)
     try:
-        written: dict[str, Any] = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
-        version = written["version"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{folder} holds no state that can be read: {error}.") from error
-    if version != VERSION:
+        return _load(folder)
+    except InputError as error:
+        raise InputError(f"{folder} holds no state that can be read: {error}") from error
+
+
+def _load(folder: Path) -> SceneState:
+    written = read_json(folder / DESCRIPTION)
+    if not isinstance(written, dict) or "version" not in written:
+        raise InputError(f"{DESCRIPTION} is not the description of a state.")
+    if written["version"] != VERSION:
         raise InputError(
-            f"{folder} holds a state of version {version}; this program reads version {VERSION}."
+            f"it is of version {quote(written['version'])}; this program reads version {VERSION}."
         )
+    if sha256(folder / POINTS) != written.get("sha256"):
+        raise InputError(
+            f"{folder / POINTS} is damaged: it is not what {DESCRIPTION} was written for "
+            "(SHA-256). Take another copy."
+        )
+    arrays = read_arrays(folder / POINTS, _DTYPES)
     try:
-        data = (folder / POINTS).read_bytes()
-        if hashlib.sha256(data).hexdigest() != written["sha256"]:
-            raise InputError(
-                f"{folder / POINTS} is damaged: it is not what {DESCRIPTION} was written for "
-                "(SHA-256). Take another copy."
-            )
-        with np.load(folder / POINTS, allow_pickle=False) as file:
-            arrays = {name: file[name].astype(_DTYPES[name], copy=False) for name in ARRAYS}
-        return SceneState(
-            **arrays,
-            intrinsics_px=np.array(written["intrinsics_px"], float),
-            step=int(written["step"]),
-            names={int(number): name for number, name in written["names"].items()},
-            world_from_object={
-                int(number): np.array(pose, float)
-                for number, pose in written["world_from_object"].items()
-            },
-            provenance=written["provenance"],
+        description = _checked(written)
+        state = SceneState(**arrays, **description)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{DESCRIPTION}: {quote_text(str(error))}.") from error
+    sealed = written.get("description_sha256", None)  # earlier versions have none
+    changed = sealed not in (None, _sealed(_description(state)))
+    if changed or written.get("points") != len(state.points_m):
+        raise InputError(
+            f"{folder / DESCRIPTION} was changed after it was written. Take another copy."
         )
-    except InputError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{folder} holds no state that can be read: {error}.") from error
+    return state
+
+
+def _sealed(description: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
+
+
+def _checked(written: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of the description, their types checked.
+
+    Raises `ValueError`, `KeyError` or `TypeError`.
+    """
+    step, names, poses = written["step"], written["names"], written["world_from_object"]
+    provenance = written["provenance"]
+    if type(step) is not int or step < 0:
+        raise ValueError(f"step is {quote(step)}, not a count")
+    for field, texts in (("names", names), ("provenance", provenance)):
+        if not isinstance(texts, dict) or not all(isinstance(text, str) for text in texts.values()):
+            raise ValueError(f"{field} is not a mapping to text")
+    if not isinstance(poses, dict):
+        raise ValueError("world_from_object is not a mapping to poses")
+    return {
+        "intrinsics_px": _matrix(written["intrinsics_px"], 3, "intrinsics_px"),
+        "step": step,
+        "names": {_number(number): name for number, name in names.items()},
+        "world_from_object": {
+            _number(number): _matrix(pose, 4, f"the pose of object {quote_text(number)}")
+            for number, pose in poses.items()
+        },
+        "provenance": provenance,
+    }
+
+
+def _number(text: str) -> int:
+    if not (text.isascii() and text.removeprefix("-").isdigit() and len(text) < 12):
+        raise ValueError(f"{quote(text)} is not an object id")
+    return int(text)
+
+
+def _matrix(rows: Any, size: int, name: str) -> np.ndarray:
+    square = isinstance(rows, list) and len(rows) == size
+    if not square or not all(
+        isinstance(row, list) and len(row) == size and all(type(x) in (int, float) for x in row)
+        for row in rows
+    ):
+        raise ValueError(f"{name} is not {size} x {size} numbers")
+    matrix = np.array(rows, float)
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name} is not finite")
+    return matrix
 
 
 def _description(state: SceneState) -> dict[str, Any]:

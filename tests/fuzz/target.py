@@ -17,8 +17,9 @@ class Target:
     """One format, and how it is read.
 
     A case passes if `read` raises `InputError` with a short message, or gives what it gave of the
-    sample, or, where the format has no checksum of ours, gives what `reference` gives of the changed
-    file. Everything else is a failure: another exception, another result, more than 1 GiB or 20 s.
+    sample, or, where the format has no checksum of ours, gives what `reference` gives of the
+    changed file. Everything else is a failure: another exception, another result, more than 1 GiB
+    or 20 s.
     """
 
     name: str

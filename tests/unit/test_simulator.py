@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from egosim_jax.io.journal import Journal
 from egosim_jax.perception.oracle import oracle
 from egosim_jax.rendering.reference import draw_hands
 from egosim_jax.simulator import Simulator
@@ -92,18 +93,18 @@ def test_a_replay_gives_the_same_states(tmp_path):
     assert states[0] == states[1]
 
 
-@pytest.mark.parametrize("phase", range(6))
+@pytest.mark.parametrize("phase", range(9))
 def test_a_run_killed_after_any_phase_ends_the_same(tmp_path, phase):
     """A child dies by SIGKILL when the journal has so many lines; the run goes on from there."""
     code = (
         "import os, signal, sys; sys.path.insert(0, sys.argv[1])\n"
         "import test_simulator as t; from pathlib import Path\n"
         "from egosim_jax.io.journal import Journal\n"
-        "enter = Journal._enter\n"
+        "append = Journal._append\n"
         "def die(self, *args):\n"
         "    if len(self.done) == int(sys.argv[3]): os.kill(os.getpid(), signal.SIGKILL)\n"
-        "    enter(self, *args)\n"
-        "Journal._enter = die\n"
+        "    append(self, *args)\n"
+        "Journal._append = die\n"
         "t.run(Path(sys.argv[2]))\n"
     )
     here = os.path.dirname(__file__)
@@ -117,13 +118,114 @@ def test_a_run_killed_after_any_phase_ends_the_same(tmp_path, phase):
         assert fingerprint(a.state) == fingerprint(b.state)
 
 
+@dataclass
+class Named:
+    """A part of the loop that says itself what it is made of, and may be broken."""
+
+    part: object
+    broken: bool = False
+
+    def fingerprint(self):
+        return "v1"
+
+    def __call__(self, *args):
+        assert not self.broken, "made again"
+        return self.part(*args)
+
+
 def test_finished_phases_are_not_made_again(tmp_path):
+    for broken in (False, True):
+        parts = {"generator": Named(paint_the_hands, broken), "perception": Named(Told(), broken)}
+        assert len(run(tmp_path, **parts)) == 2
+
+
+def noisier(view, action, first_frame, seed):
+    return 255 - paint_the_hands(view, action, first_frame, seed)
+
+
+def with_action(**changes):
+    first, *rest = [to_action(clip) for clip in clips()]
+    return [replace(first, **changes), *rest]
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"state": clips()[1].state}, "state"),
+        ({"seed": 1}, "seed"),
+        ({"first_frame": np.zeros((48, 80, 3), np.uint8)}, "first_frame"),
+        ({"actions": with_action(prompt="another caption")}, "action"),
+        ({"actions": with_action(joints_m=to_action(clips()[0]).joints_m + 1e-6)}, "action"),
+        ({"generator": noisier}, "generator"),
+        ({"perception": Told(list(reversed(Told().truths)))}, "perception"),
+        ({"perception": None}, "perception"),
+        ({"fusion": Fusion(voxel_m=0.007)}, "fusion"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_another_run_in_the_same_folder_is_refused_with_both_values(tmp_path, changes, field):
+    list(run_with(tmp_path))
+    with pytest.raises(InputError, match=rf"{field}: recorded '.*', given '.*'"):
+        list(run_with(tmp_path, **changes))
+
+
+def run_with(out, *, state=None, actions=None, seed=0, first_frame=None, **parts):
+    return simulator(**parts).run(
+        state or clips()[0].state,
+        actions or with_action(),
+        out=str(out),
+        seed=seed,
+        first_frame=first_frame,
+    )
+
+
+def test_a_missing_journal_is_named_with_the_way_out(tmp_path):
     run(tmp_path)
+    (tmp_path / "journal.jsonl").unlink()
+    with pytest.raises(InputError, match=r"journal\.jsonl is missing, although .* to start over"):
+        run(tmp_path)
 
-    def never(*args):
-        raise AssertionError("made again")
 
-    assert len(run(tmp_path, generator=never, perception=never)) == 2
+def test_a_journal_of_the_first_release_is_refused_with_the_way_out(tmp_path):
+    line = '{"phase": "1 generate", "file": "clip_1/frames.npz", "sha256": "0", "seconds": 1}\n'
+    (tmp_path / "journal.jsonl").write_text(line)
+    with pytest.raises(InputError, match=r"of an earlier version.* Choose another folder"):
+        run(tmp_path)
+
+
+def test_any_changed_byte_of_the_journal_is_noticed(tmp_path):
+    run(tmp_path)
+    path = tmp_path / "journal.jsonl"
+    data = path.read_bytes()
+    for place in range(0, len(data) - 1, 37):
+        changed = bytearray(data)
+        changed[place] ^= 4
+        path.write_bytes(bytes(changed))
+        with pytest.raises(InputError, match="journal"):
+            Journal(tmp_path)
+    lines = data.splitlines(keepends=True)
+    path.write_bytes(b"".join([lines[0], *lines[2:]]))
+    with pytest.raises(InputError, match="line 2 was changed or is lost"):
+        Journal(tmp_path)
+
+
+def test_a_folder_in_use_by_another_process_is_refused(tmp_path):
+    code = (
+        "import pathlib, sys, time; from egosim_jax.io.atomic import hold_folder\n"
+        "hold_folder(pathlib.Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(InputError, match=f"in use by another process .PID {other.pid}"):
+            run(tmp_path)
+        other.kill()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_that_is_none_is_refused(tmp_path, seed):
+    with pytest.raises(InputError, match="seed must be a whole number"):
+        list(run_with(tmp_path, seed=seed))
 
 
 def test_a_torn_line_of_the_journal_is_forgotten(tmp_path):

@@ -75,3 +75,23 @@ def test_what_may_differ_may_and_is_recorded(tmp_path):
     with pytest.raises(InputError, match=r"training\.meshes") as refused:
         open_folder(tmp_path, other, may_differ=["training.mesh"])
     assert "mesh.fsdp" not in str(refused.value)
+
+
+def test_places_to_write_to_are_no_settings(tmp_path):
+    open_folder(tmp_path, {"simulate": {"out": "runs/a", "seed": 0}})
+    open_folder(tmp_path, {"simulate": {"out": str(tmp_path), "seed": 0}})
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"a": 1, "a": 2}', "\x00", '"' + "x" * 100])
+def test_a_damaged_record_is_named(tmp_path, text):
+    open_folder(tmp_path, config())
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(InputError, match=r"config\.json"):
+        open_folder(tmp_path, config())
+
+
+def test_a_lost_record_is_named_with_the_way_out(tmp_path):
+    open_folder(tmp_path, config())
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(InputError, match=r"config\.json is missing.*another --out"):
+        open_folder(tmp_path, config(seed=1))

@@ -74,8 +74,55 @@ def test_another_version_is_named(tmp_path):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "version": 2}))
-    with pytest.raises(InputError, match="version 2; this program reads version 1"):
+    with pytest.raises(InputError, match="of version 2; this program reads version 1"):
         load(tmp_path / "state")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step": "4"},
+        {"step": True},
+        {"names": {"1": 5}},
+        {"names": []},
+        {"names": {"one": "cup"}},
+        {"provenance": {"world": None}},
+        {"world_from_object": {"2": [[1, 0], [0, 1]]}},
+        {"world_from_object": None},
+        {"intrinsics_px": "eye"},
+        {"intrinsics_px": [[1, 0, 0], [0, 1, 0], [0, 0, None]]},
+        {"points": 7},
+        {"step": 5},
+        {"names": {"1": "blue cup", "2": "lid"}},
+        {"sha256": 0},
+    ],
+    ids=str,
+)
+def test_a_changed_description_is_named(tmp_path, change):
+    save(tmp_path / "state", state())
+    path = tmp_path / "state" / "state.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(InputError, match="no state that can be read"):
+        load(tmp_path / "state")
+
+
+def test_a_state_of_the_first_release_is_still_read(tmp_path):
+    save(tmp_path / "state", state())
+    path = tmp_path / "state" / "state.json"
+    written = json.loads(path.read_text())
+    del written["description_sha256"]
+    path.write_text(json.dumps(written))
+    assert fingerprint(load(tmp_path / "state")) == fingerprint(state())
+
+
+def test_a_save_that_fails_leaves_the_older_state(tmp_path, monkeypatch):
+    save(tmp_path / "state", state(50))
+    monkeypatch.setattr("egosim_jax.state.snapshot.DESCRIPTION", "no/such/folder.json")
+    with pytest.raises(OSError, match="No such file"):
+        save(tmp_path / "state", state(20))
+    monkeypatch.undo()
+    assert len(load(tmp_path / "state").points_m) == 50
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1}'])

@@ -1,0 +1,63 @@
+"""Arrays from npz files: without pickle, and checked before they are built."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from egosim_jax.io.untrusted import open_regular, quote, quote_path, quote_text
+from egosim_jax.types import InputError
+
+MAX_ARRAY_BYTES = 1 << 34
+MAX_ENTRIES = 64
+_HEADER = 4096
+
+
+def read_arrays(
+    path: Path, dtypes: Mapping[str, str], *, others: Collection[str] = ()
+) -> dict[str, np.ndarray]:
+    """Read exactly the named arrays of an npz that `np.savez` wrote.
+
+    `dtypes` names the dtype of each array; those in `others` may have any that holds numbers.
+    Raises `InputError` if an array is missing, unknown, of another dtype, compressed or damaged:
+    shapes are checked against sizes before anything is built, contents against their CRC-32.
+    """
+    name = quote_path(path)
+    with open_regular(path) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                found = archive.infolist()
+                names = [entry.filename.removesuffix(".npy") for entry in found[:MAX_ENTRIES]]
+                if len(found) > MAX_ENTRIES or sorted(names) != sorted({*dtypes, *others}):
+                    listing = ", ".join(quote_text(n) for n in names[:8])
+                    raise InputError(f"{name} holds the arrays {listing}: not those expected.")
+                return {
+                    n: _read(archive, entry, dtypes.get(n))
+                    for n, entry in zip(names, found, strict=True)
+                }
+        except InputError:
+            raise
+        except (zipfile.BadZipFile, ValueError, EOFError, OSError, NotImplementedError,
+                RuntimeError) as error:  # fmt: skip
+            raise InputError(f"{name} is damaged: {quote_text(str(error))}.") from error
+
+
+def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, dtype: str | None) -> np.ndarray:
+    stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
+    if not stored or entry.file_size > MAX_ARRAY_BYTES:
+        raise ValueError(f"{quote(entry.filename)} is compressed or too large")
+    data = archive.read(entry)
+    header = io.BytesIO(data[:_HEADER])
+    if np.lib.format.read_magic(header) != (1, 0):
+        raise ValueError(f"{quote(entry.filename)} is of another version of npy")
+    shape, fortran, kind = np.lib.format.read_array_header_1_0(header, max_header_size=_HEADER)
+    if kind.hasobject or kind.kind not in "biuf" or (dtype is not None and kind != np.dtype(dtype)):
+        raise ValueError(f"{quote(entry.filename)} holds {quote_text(str(kind))}")
+    if fortran or len(data) - header.tell() != math.prod(shape) * kind.itemsize:
+        raise ValueError(f"{quote(entry.filename)} does not have the size that its header says")
+    return np.frombuffer(data, kind, offset=header.tell()).reshape(shape).copy()

@@ -1,0 +1,106 @@
+"""What enters the loop is checked where it is made."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from egosim_jax.types import Action, Cameras, Clip, InputError, VideoSpec, check_seed
+from egosim_jax.worlds.tabletop import make_sequence, to_action
+
+SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
+
+
+@cache
+def action(kind: str = "human", seed: int = 3) -> Action:
+    return to_action(next(make_sequence(seed, spec=SPEC, kind=kind)))
+
+
+def joints(change) -> np.ndarray:
+    changed = action().joints_m.copy()
+    change(changed)
+    return changed
+
+
+def one_nan(joints):
+    joints[2, 0, 5, 1] = np.nan
+
+
+def infinite(joints):
+    joints[2, 0] = np.inf
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joints_m": action().joints_m[:, :, :20]}, r"\(5, 2, 20, 3\).*\(5, hands, 21, 3\)"),
+        ({"joints_m": np.repeat(action().joints_m, 3, axis=0)}, r"\(15, 2, 21, 3\)"),
+        ({"joints_m": action().joints_m[:, :0]}, "at least one hand"),
+        ({"joints_m": action().joints_m[:, 0]}, r"\(5, 21, 3\)"),
+        ({"joints_m": np.zeros((5, 2, 21, 3), int)}, "must be floats"),
+        ({"kind": "gripper"}, "must be 'human' or 'robot', not 'gripper'"),
+        ({"kind": "robot"}, r"\(5, hands, 3, 3\)"),
+        ({"joints_m": 1000 * action().joints_m}, "Joints must be in meters"),
+        ({"joints_m": action().joints_m / 1000}, "Joints must be in meters"),
+        ({"joints_m": action().joints_m + [0, -9, 0]}, "must be in world coordinates"),
+        ({"joints_m": joints(one_nan)}, "Hand 0 of frame 2 has joints that are not finite"),
+        ({"joints_m": joints(infinite)}, "Hand 0 of frame 2 has joints that are not finite"),
+        ({"prompt": None}, "The prompt must be text, not NoneType"),
+    ],
+)
+def test_an_action_that_cannot_be_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        replace(action(), **changes)
+
+
+def test_joints_in_the_frame_of_the_camera_are_refused():
+    given = action(seed=5)
+    inverse = np.linalg.inv(given.cameras.world_from_camera)
+    points = np.einsum("fab,fnjb->fnja", inverse[:, :3, :3], given.joints_m)
+    points += inverse[:, None, None, :3, 3]
+    with pytest.raises(InputError, match="must be in world coordinates"):
+        replace(given, joints_m=points)
+
+
+def test_hands_may_be_missing_now_and_then_or_all_the_time():
+    for frames in (slice(2, 4), slice(None)):
+        missing = action().joints_m.copy()
+        missing[frames] = np.nan
+        replace(action(), joints_m=missing)
+
+
+def test_a_gripper_is_taken():
+    assert action("robot").joints_m.shape[2] == 3
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"world_from_camera": np.eye(4)},
+        {"world_from_camera": np.zeros((5, 3, 4))},
+        {"intrinsics_px": np.eye(4)},
+    ],
+)
+def test_cameras_of_another_shape_are_refused(changes):
+    with pytest.raises(InputError, match="has shape"):
+        replace(action().cameras, **changes)
+
+
+@pytest.mark.parametrize(
+    "frames", [np.zeros((2, 8, 8, 3)), np.zeros((2, 8, 8, 4), np.uint8), np.zeros(3, np.uint8)]
+)
+def test_a_clip_that_is_no_video_is_refused(frames):
+    with pytest.raises(InputError, match="must be uint8"):
+        Clip(frames=frames, fps=8)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 2**64])
+def test_a_seed_out_of_range_is_refused(seed):
+    with pytest.raises(InputError, match=r"--seed must be a whole number from 0 to 2\*\*63 - 1"):
+        check_seed(seed)
+
+
+def test_cameras_are_checked_as_before():
+    cameras = action().cameras
+    assert Cameras(**vars(cameras)).height == 48
