@@ -298,7 +298,7 @@ class Action:
                 "hand. A hand that is not there has joints of NaN."
             )
         finite = np.isfinite(joints)
-        given = finite.all(axis=(2, 3))
+        given = np.asarray(finite.all(axis=(2, 3)))
         broken = ~given & ~np.isnan(joints).all(axis=(2, 3))
         if broken.any():
             frame, hand = np.argwhere(broken)[0].tolist()

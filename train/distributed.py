@@ -4,17 +4,22 @@ Slurm, Open MPI and TPU pods are recognised by jax. Anywhere else, give every pr
 
     JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
 
-and with none of these a process is on its own, and its service listens to this machine alone.
+and with none of these a process is on its own. The service has no authentication. With an address
+of this machine's loopback it listens there alone; with any other it listens on all interfaces, or
+on `JAX_COORDINATOR_BIND_ADDRESS`, and a firewall has to keep others out (docs/security.md).
 """
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import jax
+from jax._src import xla_bridge
 
 from egosim_jax.types import InputError
 
@@ -33,16 +38,36 @@ def joined() -> Iterator[None]:
             )
         address, count, index = given.values()
         _check_numbers(count, index)
-        jax.distributed.initialize(address, int(count), int(index))
+        _initialize(address, int(count), int(index))
     else:
         try:
             jax.distributed.initialize()
         except ValueError:  # no cluster
-            jax.distributed.initialize(own_address(), 1, 0)
+            _initialize(own_address(), 1, 0)
     try:
         yield
     finally:
         jax.distributed.shutdown()
+
+
+def _initialize(address: str, count: int, index: int) -> None:
+    """Join the service at an address; on the loopback, neither it nor gloo listens elsewhere."""
+    bind = None
+    if _is_loopback(address.rpartition(":")[0]):
+        bind = address
+        # Else gloo listens where the machine's own name leads; jax has no public way to say it.
+        gloo = xla_bridge._jax.make_gloo_tcp_collectives
+        xla_bridge._jax.make_gloo_tcp_collectives = partial(gloo, hostname="127.0.0.1")
+    jax.distributed.initialize(address, count, index, coordinator_bind_address=bind)
+
+
+def _is_loopback(host: str) -> bool:
+    """Return whether a host name or address is of this machine's loopback."""
+    host = host.strip("[]")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _check_numbers(count: str, index: str) -> None:

@@ -45,11 +45,20 @@ class View:
     """Which axis of the world points up. If not given: z in the tabletop world; -y elsewhere, as in
     the coordinates of EgoSim's first camera."""
 
+    host: str = "127.0.0.1"
+    """Address that the Rerun viewer listens on; others can reach it only if one is named here."""
+
     def run(self) -> int:
         """Draw, or open the viewer."""
         recording = self.path / RECORDING if self.path.is_dir() else self.path
         if recording.suffix == ".rrd" and recording.exists():
-            return _open(recording)
+            return _open(recording, self.host)
+        if self.path.is_dir() and (self.path / "report.json").exists():
+            raise InputError(
+                f"{self.path} has no {RECORDING}: it was simulated without Rerun. Install it (pip "
+                "install 'egosim-jax[viewer]') and run the same egosim simulate again, which adds "
+                f"it; or look at one state: {self.path / 'clip_1' / 'state'}."
+            )
         state = self._state()
         up: Up = self.up or ("z" if state.provenance.get("world") == "tabletop" else "-y")
         out = self.out or Path(f"{self.path.stem}.png")
@@ -74,13 +83,14 @@ class View:
         )
 
 
-def _open(recording: Path) -> int:
+def _open(recording: Path, host: str) -> int:
     if find_spec("rerun") is None:
         raise InputError(
             f"{recording} is opened by Rerun, which is not installed: "
             "pip install 'egosim-jax[viewer]'."
         )
-    return subprocess.run([sys.executable, "-m", "rerun", str(recording)], check=False).returncode  # noqa: S603
+    command = [sys.executable, "-m", "rerun", "--bind", host, str(recording)]
+    return subprocess.run(command, check=False).returncode  # noqa: S603
 
 
 def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:
