@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import shlex
@@ -14,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from egosim_jax.types import InputError
@@ -56,7 +54,6 @@ def main(
     """
     import tyro
 
-    _keep_compiled_programs()
     command: Command = tyro.cli(
         commands,
         prog=program,
@@ -70,19 +67,6 @@ def main(
             return command.run()
 
     return guarded(run)
-
-
-def cache_folder() -> Path:
-    """Of everything that can be made again."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "egosim_jax"
-
-
-def _keep_compiled_programs() -> None:
-    """Let jax keep what it compiles in a folder that only its user can read and write."""
-    folder = cache_folder() / "compiled"
-    with contextlib.suppress(OSError):  # without it everything works, but compiles each time
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
 
 
 def guarded(run: Callable[[], int]) -> int:

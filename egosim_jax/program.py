@@ -11,7 +11,7 @@ import numpy as np
 from flax import nnx
 from jax.sharding import Mesh, PartitionSpec
 
-from egosim_jax.io.executables import kept
+from egosim_jax.io.executables import kept, share_with_jax
 from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
 
 Module = TypeVar("Module", bound=nnx.Module)
@@ -34,6 +34,7 @@ class Program:
         about: Any = None,
         **options: Any,
     ):
+        share_with_jax()
         graph, self._params = nnx.split(networks, nnx.Param)
         self._mesh, self._about = mesh, about
         if mesh is not None:

@@ -49,7 +49,7 @@ def main(kills: int = 20, processes: int = 1, seed: int = 0) -> int:
         processes: Processes that share the run.
         seed: Seed of the moments at which it is killed.
     """
-    steps, draw = (MOST + SAVE_EVERY) * kills + 10, random.Random(seed)  # noqa: S311
+    steps, draw = (MOST + SAVE_EVERY) * kills + 10, random.Random(seed)
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "latents"
         write_latents(data)

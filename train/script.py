@@ -28,6 +28,7 @@ from egosim_jax.command import FAILED, RESUBMIT, Stop
 from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
+from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
@@ -71,6 +72,7 @@ def train(
     digests = None if weights is None else hashes(weights)
     settings = {"task": task, "training": training, "weights": digests}
     open_folder(out, settings, may_differ=[*may_differ("training"), *HOW_COMPUTED])
+    share_with_jax()
     mesh = make_mesh(training.mesh)
     placed = batch_sharding(mesh)
     source = ShardReader(data)

@@ -1,9 +1,9 @@
 """Programs that were compiled at an earlier start, ready to run without tracing or compiling.
 
-They lie in a folder that belongs to the user and that nobody else can read or write, because
-reading one runs code that is in it: `~/.cache/egosim_jax/executables`. A program is found again by
-the digest of all that it depends on: its name and config, the shapes of what it is given, the
-devices, the versions of the libraries, XLA's flags, and our own code.
+They lie in a `PrivateCache`, because reading one runs code that is in it. A program is found again
+by the digest of all that it depends on: its name and config, the shapes of what it is given, the
+devices, the versions of the libraries, XLA's flags, and our own code. What jax compiles besides
+lies in another (`share_with_jax`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import hashlib
 import json
 import os
 import pickle
-import stat
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,13 +22,15 @@ from typing import Any
 
 import jax
 
-from egosim_jax.command import cache_folder
+from egosim_jax.io.private import PrivateCache
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
 VARIABLES = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
-MOST = 64
-"""Programs that are kept: those that were used last."""
+FOLDER, MOST = "executables", 64
+"""Name of the cache, and how many programs it keeps."""
+OF_JAX, MOST_OF_JAX = "jax", 1024
+"""Name of the cache of what jax compiles by itself, and how many programs it keeps."""
 
 
 def kept(about: Any, given: Any, compile: Callable[[], Any]) -> Any:
@@ -38,19 +39,53 @@ def kept(about: Any, given: Any, compile: Callable[[], Any]) -> Any:
     Where nothing can be kept, because the folder is not the user's alone or several processes share
     the program, it is compiled.
     """
-    folder = _folder()
-    if folder is None or jax.process_count() > 1:
+    from jax.experimental import serialize_executable
+
+    if jax.process_count() > 1 or (cache := PrivateCache.open(FOLDER, most=MOST)) is None:
         return compile()
-    path = folder / _digest(about, given)
-    if path.exists():
+    name = _digest(about, given)
+    if (data := cache.get(name)) is not None:
         try:
-            return _read(path)
+            return serialize_executable.deserialize_and_load(*pickle.loads(data))  # noqa: S301
         except Exception as error:  # whatever is wrong with it, it can be made again
-            warnings.warn(f"{path} cannot be used, so it is compiled again: {error}", stacklevel=2)
+            warnings.warn(f"{name} cannot be used and is compiled again: {error}", stacklevel=2)
     with _anew():
         compiled = compile()
-    _write(path, compiled)
+    try:
+        cache.put(name, pickle.dumps(serialize_executable.serialize(compiled)))
+    except (ValueError, NotImplementedError) as error:  # programs that cannot be serialised
+        warnings.warn(f"{name} was not kept: {error}", stacklevel=2)
     return compiled
+
+
+def share_with_jax() -> None:
+    """Let jax keep what it compiles in a `PrivateCache`, too, unless its user chose a folder.
+
+    Its own files have no checksum where it compresses with zstandard, and it takes them from
+    anybody.
+    """
+    from jax._src import compilation_cache
+
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    if (cache := PrivateCache.open(OF_JAX, most=MOST_OF_JAX)) is None:
+        return
+    original = compilation_cache.get_file_cache
+
+    class Checked(compilation_cache.CacheInterface):
+        _path = cache.folder
+
+        def get(self, key: str) -> bytes | None:
+            return cache.get(key)
+
+        def put(self, key: str, value: bytes) -> None:
+            cache.put(key, value)
+
+    def choose(path: str) -> Any:
+        return (Checked(), path) if path == str(cache.folder) else original(path)
+
+    compilation_cache.get_file_cache = choose
+    jax.config.update("jax_compilation_cache_dir", str(cache.folder))
 
 
 @contextmanager
@@ -69,41 +104,6 @@ def _anew() -> Iterator[None]:
     finally:
         jax.config.update("jax_enable_compilation_cache", enabled)
         compilation_cache.reset_cache()
-
-
-def _folder() -> Path | None:
-    """The folder, if it is the user's own."""
-    folder = cache_folder() / "executables"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
-    except OSError:
-        return None
-    private = found.st_uid == os.getuid() and not stat.S_IMODE(found.st_mode) & 0o077
-    return folder if private else None
-
-
-def _read(path: Path) -> Any:
-    from jax.experimental import serialize_executable
-
-    path.touch()
-    return serialize_executable.deserialize_and_load(*pickle.loads(path.read_bytes()))  # noqa: S301
-
-
-def _write(path: Path, compiled: Any) -> None:
-    from jax.experimental import serialize_executable
-
-    try:
-        data = pickle.dumps(serialize_executable.serialize(compiled))
-        mine = path.with_name(f"{path.name}.{os.getpid()}")  # others may write the same one
-        mine.write_bytes(data)
-        mine.replace(path)
-        files = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
-        for old in files[:-MOST]:
-            old.unlink(missing_ok=True)
-    # A full disk, or a platform whose programs cannot be serialised.
-    except (OSError, ValueError, NotImplementedError) as error:
-        warnings.warn(f"{path} was not kept: {error}", stacklevel=2)
 
 
 def _digest(about: Any, given: Any) -> str:

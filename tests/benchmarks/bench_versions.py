@@ -96,7 +96,7 @@ class Versions:
 
 def _print(command: str, seconds: list[tuple[float, float]]) -> None:
     ratios = [after / before for before, after in seconds]
-    draw = random.Random(0)  # noqa: S311
+    draw = random.Random(0)
     medians = sorted(statistics.median(draw.choices(ratios, k=len(ratios))) for _ in range(SAMPLES))
     low, high = medians[round(0.025 * SAMPLES)], medians[round(0.975 * SAMPLES)]
     before, after = (statistics.median(pair[i] for pair in seconds) for i in (0, 1))

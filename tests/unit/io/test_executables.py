@@ -1,13 +1,16 @@
 """Compiled programs are found again, and only by those who may."""
 
 import os
+import random
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from egosim_jax.io import executables
+from egosim_jax.io import executables, private
 from egosim_jax.io.executables import kept
 
 GIVEN = (jax.ShapeDtypeStruct((3,), jnp.float32),)
@@ -51,7 +54,8 @@ def test_a_folder_that_others_can_write_is_not_used(folder, double):
     folder.mkdir(parents=True)
     folder.chmod(0o770)
     for _ in range(2):
-        kept("double", GIVEN, double)
+        with pytest.warns(UserWarning, match="others may use it"):
+            kept("double", GIVEN, double)
     assert double.times == 2
     assert not list(folder.iterdir())
 
@@ -84,11 +88,112 @@ def test_a_damaged_file_is_made_again(folder, double):
     kept("double", GIVEN, double)
     (path,) = folder.iterdir()
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.warns(UserWarning, match="compiled again"):
+    with pytest.warns(UserWarning, match="damaged"):
         kept("double", GIVEN, double)
     assert double.times == 2
     kept("double", GIVEN, double)
     assert double.times == 2
+
+
+def test_every_flipped_bit_is_noticed_before_anything_is_loaded(folder, double, monkeypatch):
+    kept("double", GIVEN, double)
+    (path,) = folder.iterdir()
+    generator = random.Random(0)
+    monkeypatch.setattr(executables.pickle, "loads", lambda data: pytest.fail("it was loaded"))
+    for case in range(50):
+        damaged = bytearray(path.read_bytes())
+        damaged[generator.randrange(len(damaged))] ^= 1 << generator.randrange(8)
+        path.write_bytes(damaged)
+        with pytest.warns(UserWarning, match="damaged"):
+            kept("double", GIVEN, double)
+        assert double.times == case + 2
+        assert path.read_bytes() != damaged
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda path: path.chmod(0o640), "others may use it"),
+        (lambda path: os.link(path, path.parent.parent / "second"), "2 names"),
+        (lambda path: path.symlink_to(path.rename(path.parent.parent / "moved")), "symbolic"),
+        (lambda path: (path.unlink(), os.mkfifo(path)), "not a regular file"),
+        (lambda path: os.chown(path, 12345, -1), "belongs to user 12345"),
+    ],
+    ids=["mode", "hard link", "symbolic link", "pipe", "owner"],
+)
+def test_a_file_that_others_could_have_written_is_not_loaded(folder, double, change, why):
+    kept("double", GIVEN, double)
+    (path,) = folder.iterdir()
+    change(path)
+    with pytest.warns(UserWarning, match=why):
+        kept("double", GIVEN, double)
+    assert double.times == 2
+    kept("double", GIVEN, double)
+    assert double.times == 2
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda folder: os.chown(folder, 12345, -1), "belongs to user 12345"),
+        (lambda folder: folder.symlink_to(folder.rename(folder.with_name("else"))), "is a link"),
+        (lambda folder: folder.parent.parent.chmod(0o777), "others may rename it"),
+    ],
+    ids=["owner", "link", "above"],
+)
+def test_a_folder_that_others_could_change_is_not_used(folder, double, change, why):
+    kept("double", GIVEN, double)
+    change(folder)
+    with pytest.warns(UserWarning, match=why):
+        kept("double", GIVEN, double)
+    assert double.times == 2
+
+
+@pytest.mark.parametrize("value", ["", "cache"])
+def test_an_empty_or_relative_cache_home_is_not_the_working_folder(tmp_path, monkeypatch, value):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", value)
+    assert private.cache_folder() == tmp_path / ".cache" / "egosim_jax"
+
+
+JAX = """
+import sys
+import jax, jax.numpy as jnp
+from egosim_jax.io.executables import share_with_jax
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+share_with_jax()
+print(float(jax.jit(lambda x: jnp.sort(jnp.sin(x) @ jnp.cos(x)).sum())(jnp.eye(8))))
+"""
+
+
+def test_jaxs_own_cache_follows_the_same_policy(tmp_path):
+    def run() -> tuple[str, str]:
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION")}
+        environment["XDG_CACHE_HOME"] = str(tmp_path)
+        done = subprocess.run(
+            [sys.executable, "-c", JAX], env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout, done.stderr
+
+    folder = tmp_path / "egosim_jax" / "jax"
+    want, said = run()
+    assert not said
+    files = {path: path.read_bytes() for path in folder.iterdir()}
+    assert files
+    assert all(path.stat().st_mode & 0o777 == 0o600 for path in files)
+    assert run() == (want, "")
+    for path, data in files.items():
+        path.write_bytes(data[:-40] + bytes([data[-40] ^ 1]) + data[-39:])
+    got, said = run()
+    assert got == want
+    assert "damaged" in said
+    assert run() == (want, "")
+    folder.chmod(0o777)
+    got, said = run()
+    assert got == want
+    assert "others may use it" in said
 
 
 def test_the_oldest_are_forgotten(folder, double, monkeypatch):

@@ -1,0 +1,147 @@
+"""The one policy for caches of native code: what is loaded runs, so only its user may have made it.
+
+A cache is a folder `~/.cache/egosim_jax/NAME` (`XDG_CACHE_HOME/egosim_jax/NAME` if that is set to
+an absolute path) that belongs to the user, that nobody else can read or write and that is no link.
+A file is opened first; owner, mode, links and checksum are then those of what was opened. Whatever
+is wrong is said in a warning, and the file is made again.
+"""
+
+from __future__ import annotations
+
+import grp
+import hashlib
+import os
+import pwd
+import re
+import stat
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from egosim_jax.io.atomic import TEMPORARY, atomic_write
+
+MAGIC = b"egosim1\n"
+_HEAD = len(MAGIC) + hashlib.sha256().digest_size
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+
+
+def cache_folder() -> Path:
+    """Return the folder of everything that can be made again.
+
+    As the XDG specification asks, an empty or relative `XDG_CACHE_HOME` counts as not set.
+    """
+    home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (home if home.is_absolute() else Path.home() / ".cache") / "egosim_jax"
+
+
+@dataclass(frozen=True)
+class PrivateCache:
+    """Files of bytes, each with its checksum, in a folder that is the user's alone."""
+
+    folder: Path
+    """Where they lie."""
+    most: int
+    """Files that are kept: those that were used last."""
+
+    @classmethod
+    def open(cls, name: str, *, most: int) -> PrivateCache | None:
+        """Make or find the cache of a name; None, with a warning, if it is not the user's alone."""
+        folder = cache_folder() / name
+        try:
+            folder.parent.parent.mkdir(parents=True, exist_ok=True)
+            for own in (folder.parent, folder):
+                own.mkdir(mode=0o700, exist_ok=True)
+            problem = _problem(folder)
+        except (OSError, RuntimeError) as error:  # RuntimeError: no home
+            problem = str(error)
+        if problem is None:
+            return cls(folder, most)
+        warnings.warn(
+            f"{folder} is not used, so programs are compiled again: {problem}", stacklevel=3
+        )
+        return None
+
+    def get(self, name: str) -> bytes | None:
+        """Read a file; None if it is not there or, with a warning, not to be trusted."""
+        path = self.folder / name
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            return _refused(path, error.strerror)
+        with os.fdopen(descriptor, "rb") as file:
+            if (problem := _file_problem(os.fstat(descriptor))) is not None:
+                return _refused(path, problem)
+            data = file.read()
+            payload = memoryview(data)[_HEAD:]
+            if data[:_HEAD] != MAGIC + hashlib.sha256(payload).digest():
+                return _refused(path, "it is damaged: its checksum is of other bytes")
+            os.utime(descriptor)
+            return data[_HEAD:]
+
+    def put(self, name: str, data: bytes) -> None:
+        """Write a file, and remove those that were used longest ago; only warns if it cannot."""
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]*", name):
+            raise ValueError(f"not a file name: {name[:80]!r}")
+        path = self.folder / name
+        try:
+            with atomic_write(path) as temporary:
+                temporary.chmod(0o600)
+                with temporary.open("wb") as file:
+                    file.write(MAGIC + hashlib.sha256(data).digest())
+                    file.write(data)
+            self._forget()
+        except OSError as error:
+            warnings.warn(f"{path} was not kept: {error.strerror}", stacklevel=2)
+
+    def _forget(self) -> None:
+        with os.scandir(self.folder) as entries:
+            found = [(e.stat(follow_symlinks=False).st_mtime, e.name) for e in entries]
+        names = [name for _, name in sorted(found) if TEMPORARY not in name]
+        for name in names[: -self.most]:
+            (self.folder / name).unlink(missing_ok=True)
+
+
+def _refused(path: Path, problem: str) -> None:
+    warnings.warn(f"{path} is not used but made again: {problem}", stacklevel=3)
+
+
+def _file_problem(found: os.stat_result) -> str | None:
+    """Say what is wrong with a file of native code, if anything."""
+    if not stat.S_ISREG(found.st_mode):
+        return "it is not a regular file"
+    if found.st_uid != os.getuid():
+        return f"it belongs to user {found.st_uid}, not to {os.getuid()}"
+    if found.st_mode & _OTHERS:
+        return f"others may use it (mode {stat.S_IMODE(found.st_mode):o}, not 600)"
+    if found.st_nlink != 1:
+        return f"it has {found.st_nlink} names"
+    return None
+
+
+def _problem(folder: Path) -> str | None:
+    """Say who else could change what lies in a folder, if anybody."""
+    for own in (folder, folder.parent):
+        found = own.lstat()
+        if not stat.S_ISDIR(found.st_mode):
+            return f"{own} is a link or no folder. Remove it."
+        if found.st_uid != os.getuid():
+            return f"{own} belongs to user {found.st_uid}, not to {os.getuid()}. Remove it."
+    if mode := stat.S_IMODE(folder.lstat().st_mode) & _OTHERS:
+        return f"others may use it (mode 7{mode:02o}, not 700). Remove it."
+    for above in folder.resolve().parents:
+        found = above.stat()
+        others = stat.S_IWOTH if _own_group(found.st_gid) else stat.S_IWOTH | stat.S_IWGRP
+        writable = found.st_mode & others and not found.st_mode & stat.S_ISVTX
+        if found.st_uid not in (0, os.getuid()) or writable:
+            return f"others may rename it, because they may write to {above}. (XDG_CACHE_HOME)"
+    return None
+
+
+def _own_group(group: int) -> bool:
+    """Return whether a group is the user's private one, which has the user's name."""
+    with suppress(KeyError):
+        return grp.getgrgid(group).gr_name == pwd.getpwuid(os.getuid()).pw_name
+    return False
