@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import os
 import shlex
@@ -13,7 +14,8 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol, runtime_checkable
+from importlib import metadata
+from typing import Any, Protocol, get_args, get_type_hints, runtime_checkable
 
 from egosim_jax.types import InputError
 
@@ -54,10 +56,17 @@ def main(
     """
     import tyro
 
+    args = list(sys.argv[1:] if args is None else args)
+    if args == ["--version"]:
+        print(f"{program} {metadata.version('egosim-jax')}")
+        return DONE
+    if (mistake := _mistyped(commands, args, program)) is not None:
+        print(f"error: {mistake}", file=sys.stderr)
+        return USAGE
     command: Command = tyro.cli(
         commands,
         prog=program,
-        description=description,
+        description=f"{description} --version prints the version.",
         args=args,
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
@@ -67,6 +76,19 @@ def main(
             return command.run()
 
     return guarded(run)
+
+
+def _mistyped(commands: Any, args: Sequence[str], program: str) -> str | None:
+    """Say which subcommand a word that is none may have meant; None if there is no mistake."""
+    known = {part.__metadata__[0].name: part.__origin__ for part in get_args(commands)}
+    if not known or not args or args[0].startswith("-"):
+        return None
+    if args[0] in known:
+        below = get_type_hints(known[args[0]], include_extras=True).get("command")
+        return _mistyped(below, args[1:], f"{program} {args[0]}") if below else None
+    near = difflib.get_close_matches(args[0], known, n=1, cutoff=0.6)
+    meant = f" Did you mean {near[0]}?" if near else ""
+    return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(known)}."
 
 
 def guarded(run: Callable[[], int]) -> int:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.run import write_text
@@ -79,8 +78,10 @@ class TensorBoard:
     """Scalars for TensorBoard, by tensorboardX; a resumed run hides what it is going to repeat."""
 
     def __init__(self, folder: Path, *, resume_after: int = 0):
-        module = _optional("tensorboardX", extra="tensorboard")
-        self._writer = module.SummaryWriter(str(folder), purge_step=resume_after + 1)
+        check_installed("tensorboard")
+        import tensorboardX
+
+        self._writer = tensorboardX.SummaryWriter(str(folder), purge_step=resume_after + 1)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a scalar for each number."""
@@ -99,12 +100,14 @@ class WandB:
     """
 
     def __init__(self, folder: Path, *, project: str, name: str):
-        module = _optional("wandb", extra="wandb")
+        check_installed("wandb")
+        import wandb
+
         path = folder / "wandb_id.txt"
         if not path.exists():
-            write_text(path, module.util.generate_id())
+            write_text(path, wandb.util.generate_id())
         known = path.read_text("utf-8")
-        self._run = module.init(
+        self._run = wandb.init(
             project=project, name=name, id=known, resume="allow", dir=str(folder)
         )
 
@@ -134,10 +137,14 @@ class Writers:
             writer.close()
 
 
-def _optional(module: str, *, extra: str) -> ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
+EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+"""Places that need a package of an extra of the same name."""
+
+
+def check_installed(extra: str) -> None:
+    """Raise `InputError` if the package of an extra is not installed."""
+    if EXTRAS[extra] not in sys.modules and find_spec(EXTRAS[extra]) is None:
         raise InputError(
-            f"{module} is not installed: pip install 'egosim-jax[{extra}]'. (--training.{extra})"
-        ) from error
+            f"{EXTRAS[extra]} is not installed: pip install 'egosim-jax[{extra}]'. "
+            f"(--training.{extra})"
+        )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -30,6 +31,8 @@ from egosim_jax.types import MeshConfig
 KEEPING: tuple[Remat, ...] = ("offload", "full", "attention", "projections", "products", "none")
 """What a backward pass may keep, by the memory of a device that it takes, least first."""
 
+ANNOUNCEMENT = "looking for other settings that fit, which takes minutes; --no-search leaves it out"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
@@ -43,7 +46,7 @@ class Setting:
     """Devices that share a clip."""
 
 
-def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool) -> int:
+def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: bool) -> int:
     """Print what the stages of a recipe take on a target; 1 if one of them does not fit."""
     target, fit = find(name), True
     found: dict[str, dict[str, Any]] = {}
@@ -54,7 +57,9 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool) -> int:
         if not as_json:
             print(f"{_heading(title, stage, target)}\n\n{text(report)}", flush=True)
         # Settings are ordered by the target's speed.
-        if isinstance(stage.task, Denoising) and not math.isnan(target.device.flops):
+        ordered = isinstance(stage.task, Denoising) and not math.isnan(target.device.flops)
+        if search and ordered:
+            print(ANNOUNCEMENT, file=sys.stderr, flush=True)
             others = _others(stage, target, report)
             found[title]["settings"] = [
                 {**asdict(setting), **plain(report)} for setting, report in others.items()

@@ -18,14 +18,19 @@ class Recipe(ABC):
     h200:8, v5p:2x2x2 or cpu:1, and say whether it fits. Needs no other option."""
     json: bool = False
     """With --preflight: print JSON."""
+    search: bool = True
+    """With --preflight: also compile the other settings that take the same batch, which takes
+    minutes."""
 
     def run(self) -> int:
         """Train, unless a preflight was asked for."""
         if self.preflight is None:
+            for stage in self.stages().values():
+                stage.training.check_packages()
             return self.train()
         from egosim_jax.train.preflight import preflight
 
-        return preflight(self.stages(), self.preflight, as_json=self.json)
+        return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
 
     @abstractmethod
     def train(self) -> int:

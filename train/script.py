@@ -69,6 +69,7 @@ def train(
     environment.json, metrics.jsonl, checkpoints/ and samples/. Several processes call it alike, and
     the first one writes.
     """
+    training.check_packages()
     digests = None if weights is None else hashes(weights)
     settings = {"task": task, "training": training, "weights": digests}
     open_folder(out, settings, may_differ=[*may_differ("training"), *HOW_COMPUTED])

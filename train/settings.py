@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
+from egosim_jax.logging import EXTRAS, check_installed
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.types import check_counts
+from egosim_jax.types import check_counts, check_seed
 
 if TYPE_CHECKING:
     from egosim_jax.train.step import Task
@@ -54,10 +55,17 @@ class Training:
     """Project of Weights & Biases to log to, too."""
 
     def __post_init__(self) -> None:
-        """Check that every count is positive."""
+        """Check that every count is positive and the seed in range."""
         counts = ("steps", "batch_size", "accumulate", "log_every", "save_every", "validate_every")
         optional = ("sample_every", "keep", "keep_every")
         check_counts({name: getattr(self, name) for name in (*counts, *optional)})
+        check_seed(self.seed)
+
+    def check_packages(self) -> None:
+        """Raise `InputError` if a place that numbers should go to needs a package to install."""
+        for extra in EXTRAS:
+            if getattr(self, extra):
+                check_installed(extra)
 
 
 class Stage(NamedTuple):

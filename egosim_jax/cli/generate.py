@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -65,6 +65,9 @@ class Generate:
     """First frame of the window that is generated; several make several clips, {id}_{frame}."""
     steps: int | None = None
     """Denoising steps, if not the model's own."""
+    solver: Literal["euler", "unipc", "wan"] | None = None
+    """Steps from noise to data, if not the model's own; wan: UniPC with the noise levels and whole
+    timesteps of Wan's own sampler."""
     seed: int = 0
     """Each clip's noise comes from this seed and its id; without metadata, the scene does too."""
     batch_size: int | None = None
@@ -170,13 +173,21 @@ class Generate:
         import dataclasses
 
         from egosim_jax import configs
+        from egosim_jax.diffusion import Euler, FlowSchedule, UniPC
 
         config = configs.get(self.config)
         if self._weights is not None:
             config = config.at(self._weights)
         elif config.name != "debug":
             raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
-        return config if self.steps is None else dataclasses.replace(config, steps=self.steps)
+        config = dataclasses.replace(config, steps=self.steps or config.steps)
+        if self.solver is not None:
+            solver = Euler() if self.solver == "euler" else UniPC()
+            config = dataclasses.replace(config, solver=solver)
+        if self.solver == "wan":
+            schedule = FlowSchedule.of_wan(config.schedule.shift)
+            config = dataclasses.replace(config, schedule=schedule)
+        return config
 
     def _placing(self) -> tuple[Mesh, int]:
         """The devices, and how many clips they make together."""

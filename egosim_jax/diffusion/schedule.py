@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import jax
+import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 from jaxtyping import Array, Float
@@ -50,8 +51,9 @@ class FlowSchedule:
     """Lower end of the range that is warped and divided into steps."""
     sigma_max: float = 1.0
     """Upper end of that range: the first noise level, before the shift."""
-    timestep_rounding: Literal["none", "bfloat16"] = "none"
-    """`bfloat16` rounds t before it is embedded (spacing 4 above 512), as the EgoSim release."""
+    timestep_rounding: Literal["none", "bfloat16", "down"] = "none"
+    """`bfloat16` rounds t before it is embedded (spacing 4 above 512), as the EgoSim release;
+    `down` takes the whole number below, as Wan's own UniPC."""
 
     def __post_init__(self) -> None:
         """Check the shift and the range."""
@@ -62,6 +64,11 @@ class FlowSchedule:
                 "the noise levels must satisfy 0 <= sigma_min < sigma_max <= 1, not "
                 f"sigma_min {self.sigma_min}, sigma_max {self.sigma_max}."
             )
+
+    @classmethod
+    def of_wan(cls, shift: float) -> FlowSchedule:
+        """Noise levels of Wan's own UniPC: from the shifted 0.999 down, whole timesteps."""
+        return cls(shift=shift, sigma_max=0.999, timestep_rounding="down")
 
     def sigma(self, u: Numbers) -> Numbers:
         """Noise level at the uniform positions `u` in [0, 1]."""
@@ -79,6 +86,8 @@ class FlowSchedule:
         t = TIMESTEPS * sigmas
         if self.timestep_rounding == "none":
             return t
+        if self.timestep_rounding == "down":
+            return np.floor(t) if isinstance(t, np.ndarray) else jnp.floor(t)
         if isinstance(t, np.ndarray):
             return t.astype(ml_dtypes.bfloat16).astype(t.dtype)
         # Not a pair of casts, which the compiler may cancel out.

@@ -207,7 +207,8 @@ class WanVAE(nnx.Module):
     def encode(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
         """Normalised mean latents, float32; the frames are coded in groups of 1, 4, 4, ...
 
-        Raises `InputError` unless the video has 4k+1 frames of a size in multiples of 8.
+        Raises `InputError` unless the video is of floats (which should lie in [-1, 1]) and has 4k+1
+        frames of a size in multiples of 8.
         """
         self._check(video)
         first, cache = self.encoder(video[:, :1], None)
@@ -245,6 +246,11 @@ class WanVAE(nnx.Module):
         return latents * jnp.array(self.config.latent_std) + jnp.array(self.config.latent_mean)
 
     def _check(self, video: Array) -> None:
+        if not jnp.issubdtype(video.dtype, jnp.floating):
+            raise InputError(
+                f"A video of {video.dtype} cannot be encoded: values must be floats from -1 to 1. "
+                "For uint8 frames: frames / 127.5 - 1."
+            )
         _, frames, height, width, _ = video.shape
         check_frame_count(frames)
         if height % SPATIAL_STRIDE or width % SPATIAL_STRIDE:

@@ -96,3 +96,26 @@ def test_euler_follows_diffusers_step_by_step(noise):
         state = solver.step(state, v, jnp.asarray(row))
         errors.append(relative(state.x, expected[i]))
     assert max(errors) < TOLERANCE
+
+
+@pytest.mark.parametrize("steps", [10, 50])
+def test_unipc_takes_wans_noise_levels_and_whole_timesteps(noise, steps):
+    """Wan shifts 0.999 ... 0 and tells the network int64 timesteps."""
+    uniform = np.linspace(0.999, 0, steps + 1)[:-1]
+    sigmas = 5.0 * uniform / (1 + 4.0 * uniform)
+    scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True)
+    scheduler.set_timesteps(steps)
+    scheduler.sigmas = torch.from_numpy(np.append(sigmas, 0.0))
+    timesteps = torch.from_numpy(1000 * sigmas).to(torch.int64)
+    expected = torch.from_numpy(noise)
+    for told, t in zip(timesteps, scheduler.timesteps, strict=True):
+        v = torch.from_numpy(velocity(expected.numpy(), told.item()))
+        expected = scheduler.step(v, t, expected, return_dict=False)[0]
+    actual = integrate(
+        lambda x, t: velocity(x, t[:, None, None, None, None]),
+        jnp.asarray(noise, jnp.float32),
+        schedule=FlowSchedule.of_wan(5.0),
+        solver=UniPC(),
+        steps=steps,
+    )
+    assert relative(actual, expected.numpy()) < TOLERANCE

@@ -187,3 +187,8 @@ def test_an_untrained_vae_already_tells_dark_from_bright_everywhere_in_the_clip(
         values = np.asarray(decoded(nnx.Rngs(seed))).reshape(9, -1)
         correlation = np.corrcoef(np.concatenate([grey[None], values.T]))[0, 1:]
         assert np.median(correlation) > 0.8
+
+
+def test_frames_of_bytes_are_not_encoded_as_if_they_were_in_range(vae):
+    with pytest.raises(InputError, match=r"A video of uint8 cannot be encoded.*127.5 - 1"):
+        vae._check(jnp.zeros((1, 5, 16, 16, 3), jnp.uint8))  # which `encode` begins with

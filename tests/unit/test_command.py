@@ -1,0 +1,155 @@
+"""What every command line does alike: version, suggestions, one line for what it refuses."""
+
+import errno
+import runpy
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from packaging.requirements import Requirement
+
+from egosim_jax import command
+from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.convert.__main__ import main as convert
+from egosim_jax.train.__main__ import main as train
+from egosim_jax.train.settings import Training
+from egosim_jax.types import InputError
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    ("program", "name"), [(egosim, "egosim"), (train, "egosim-train"), (convert, "egosim-convert")]
+)
+def test_every_program_says_its_version(program, name, capsys):
+    assert program(["--version"]) == command.DONE
+    assert capsys.readouterr().out == f"{name} {command.metadata.version('egosim-jax')}\n"
+
+
+def test_python_dash_m_egosim_jax_is_egosim(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["egosim_jax", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("egosim_jax", run_name="__main__")
+    assert ended.value.code == command.DONE
+    assert capsys.readouterr().out.startswith("egosim ")
+
+
+@pytest.mark.parametrize(
+    ("program", "args", "meant"),
+    [
+        (egosim, ["simulte", "--out", "x"], "Did you mean simulate?"),
+        (egosim, ["data", "pak"], "Did you mean pack?"),
+        (egosim, ["experiment", "tabeltop"], "Did you mean tabletop?"),
+        (train, ["debugg", "--out", "x"], "Did you mean debug?"),
+        (convert, ["to_torch"], "Did you mean to-torch?"),
+        (egosim, ["zzz"], "All: generate, "),
+    ],
+)
+def test_a_mistyped_command_gets_a_suggestion_in_one_line(program, args, meant, capsys):
+    assert program(args) == command.USAGE
+    said = capsys.readouterr().err
+    assert meant in said
+    assert said.count("\n") == 1
+
+
+def test_a_mistyped_config_gets_a_suggestion(capsys, tmp_path):
+    assert egosim(["generate", "--config", "debugg", "--out", str(tmp_path)]) == command.USAGE
+    assert "Nearest: debug." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64])
+def test_seeds_out_of_range_are_refused(seed, tmp_path, capsys):
+    with pytest.raises(InputError, match="--seed must be a whole number"):
+        Training(steps=1, seed=seed)
+    args = ["simulate", "--seed", str(seed), "--out", str(tmp_path)]
+    assert egosim(args) == command.USAGE
+    assert "--seed must be a whole number" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("extra", ["tensorboard", "wandb"])
+def test_a_missing_extra_is_found_before_anything_starts(extra, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("egosim_jax.logging.find_spec", lambda name: None)
+    monkeypatch.delitem(sys.modules, "tensorboardX", raising=False)
+    option = [f"--denoiser.{extra}", *(["clips"] if extra == "wandb" else [])]
+    assert train(["debug", "--out", str(tmp_path / "run"), *option]) == command.USAGE
+    assert f"pip install 'egosim-jax[{extra}]'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_preflights_search_is_announced_and_can_be_left_out(monkeypatch, capsys):
+    from egosim_jax.train import preflight
+
+    searched = []
+    monkeypatch.setattr(preflight, "_others", lambda *args: searched.append(args) or {})
+    monkeypatch.setattr(preflight, "compile_step", lambda *stage: SimpleNamespace(fits=True))
+    for name in ("text", "plain", "_heading"):
+        monkeypatch.setattr(preflight, name, lambda *report: "")
+    monkeypatch.setattr(preflight.math, "isnan", lambda value: False)
+    options = ["debug", "--preflight", "cpu:1"]
+    assert train([*options, "--no-search"]) == command.DONE
+    assert not searched
+    assert "--no-search" not in capsys.readouterr().err
+    assert train(options) == command.DONE
+    assert len(searched) == 1
+    assert "takes minutes; --no-search leaves it out" in capsys.readouterr().err
+
+
+def test_viser_can_be_installed_beside_us():
+    """It needs rich below 15."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    (rich,) = (r for r in map(Requirement, project["dependencies"]) if r.name == "rich")
+    assert rich.specifier.contains("14.3.4")
+
+
+@pytest.mark.parametrize("code", command.REFUSALS)
+def test_what_the_system_refuses_is_one_line_with_a_way_out(code, capsys):
+    def run():
+        raise OSError(code, command.os.strerror(code), "/some/where")
+
+    assert command.guarded(run) == command.FAILED
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("error: /some/where: ")
+    assert command.REFUSALS[code] in said
+
+
+def test_a_library_that_hides_the_systems_reason_in_its_text_is_understood(capsys):
+    def run():
+        raise RuntimeError(f"write failed\n{command.os.strerror(errno.ENOSPC)} [/x/y]")
+
+    assert command.guarded(run) == command.FAILED
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "Free space" in said
+
+
+def test_too_little_memory_is_one_line(capsys):
+    def run():
+        raise MemoryError
+
+    assert command.guarded(run) == command.FAILED
+    assert capsys.readouterr().err == (
+        "error: not enough memory. Take less at a time, or a machine with more.\n"
+    )
+
+
+def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):
+    def run():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["egosim", "data", "make", "--out", "a folder"])
+    assert command.guarded(run) == command.FAILED
+    said = "interrupted; to continue: egosim data make --out 'a folder'\n"
+    assert capsys.readouterr().err == said
+
+
+def test_help_needs_no_jax():
+    code = (
+        "import sys; from egosim_jax.cli.__main__ import main\n"
+        "try: main(['--help'])\nexcept SystemExit: pass\n"
+        "assert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
