@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.run import write_text
@@ -78,10 +80,9 @@ class TensorBoard:
     """Scalars for TensorBoard, by tensorboardX; a resumed run hides what it is going to repeat."""
 
     def __init__(self, folder: Path, *, resume_after: int = 0):
-        check_installed("tensorboard")
-        import tensorboardX
-
-        self._writer = tensorboardX.SummaryWriter(str(folder), purge_step=resume_after + 1)
+        self._writer = _package("tensorboard").SummaryWriter(
+            str(folder), purge_step=resume_after + 1
+        )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a scalar for each number."""
@@ -100,9 +101,7 @@ class WandB:
     """
 
     def __init__(self, folder: Path, *, project: str, name: str):
-        check_installed("wandb")
-        import wandb
-
+        wandb = _package("wandb")
         path = folder / "wandb_id.txt"
         if not path.exists():
             write_text(path, wandb.util.generate_id())
@@ -148,3 +147,8 @@ def check_installed(extra: str) -> None:
             f"{EXTRAS[extra]} is not installed: pip install 'egosim-jax[{extra}]'. "
             f"(--training.{extra})"
         )
+
+
+def _package(extra: str) -> ModuleType:
+    check_installed(extra)
+    return import_module(EXTRAS[extra])

@@ -8,7 +8,6 @@ reads a changed byte as if nothing were wrong; they are compared before it is re
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import sys
@@ -24,6 +23,7 @@ from orbax.checkpoint import v1 as ocp
 
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import listing, quote_text, read_json
 from egosim_jax.types import InputError
 
 STATE, DATA = "state", "data"
@@ -118,11 +118,11 @@ class Checkpoints:
             damage = self._damage(step)
             if not damage:
                 return self._load(step, state, data)
-            listing = "\n".join(f"  {line}" for line in damage)
-            message = f"The checkpoint of step {step} in {self.folder} is damaged:\n{listing}"
+            message = f"The checkpoint of step {step} in {self.folder} is damaged"
+            message += f": {listing(damage)}."
             if not fallback:
                 raise InputError(
-                    f"{message}\nBring the files back, or take the checkpoint before it. "
+                    f"{message} Bring the files back, or take the checkpoint before it. "
                     "(--training.fallback)"
                 )
             print(message, file=sys.stderr)
@@ -155,11 +155,16 @@ class Checkpoints:
         if not (folder / HASHES).exists():
             return []
         try:
-            wanted = dict(json.loads((folder / HASHES).read_text("utf-8")))
-        except ValueError as error:
-            return [f"{folder / HASHES} cannot be read: {error}"]
+            wanted = read_json(folder / HASHES)
+        except InputError as error:
+            return [str(error).removesuffix(".")]
+        if not isinstance(wanted, dict):
+            return [f"{folder / HASHES} holds no hashes"]
         files = _files(folder)
-        missing = [f"{folder / name} is missing" for name in sorted(wanted.keys() - files.keys())]
+        missing = [
+            f"{folder / quote_text(name)} is missing"
+            for name in sorted(wanted.keys() - files.keys())
+        ]
         return missing + [
             f"{files[name]} is not what was written"
             for name in sorted(wanted.keys() & files.keys())
@@ -177,14 +182,22 @@ class Checkpoints:
         self._checkpointer.reload()
 
     def _load(self, step: int, state: Any, data: Any) -> Any:
-        self._check_shapes(step, state)
         try:
+            self._check_shapes(step, state)
             loaded = self._checkpointer.load_checkpointables(step, {STATE: state, DATA: data})
+        except InputError:
+            raise
         except Exception as error:
             # Orbax wraps what the data iterator says about a position of other data.
             if isinstance(error.__cause__, InputError):
                 raise error.__cause__ from error
-            raise
+            if (self.folder / str(step) / HASHES).exists():  # then its files are as written
+                raise
+            raise InputError(
+                f"The checkpoint of step {step} in {self.folder} cannot be read, and has no "
+                f"{HASHES} to tell why: {quote_text(str(error))}. Move it away to take the one "
+                "before it."
+            ) from error
         return loaded[STATE]
 
     def _check_shapes(self, step: int, state: Any) -> None:
@@ -197,10 +210,9 @@ class Checkpoints:
             if saved.get(path) != wanted.get(path)
         ]
         if problems:
-            listing = "\n".join(f"  {line}" for line in problems)
             raise InputError(
                 f"The checkpoint of step {step} in {self.folder} is of another model or "
-                f"optimiser. Use its config, or another --out:\n{listing}"
+                f"optimiser. Use its config, or another --out: {listing(problems)}."
             )
 
 

@@ -75,7 +75,7 @@ def share_with_jax() -> None:
     class Checked(compilation_cache.CacheInterface):
         _path = cache.folder
 
-        def get(self, key: str) -> bytes | None:
+        def get(self, key: str) -> Any:
             return cache.get(key)
 
         def put(self, key: str, value: bytes) -> None:

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted import quote, read_lines
+from egosim_jax.io.untrusted import listing, quote, read_lines
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -71,15 +71,14 @@ class Journal:
             return
         recorded = self.done[phase]["made_of"]
         differing = [
-            f"  {name}: recorded {quote(recorded.get(name))}, given {quote(made_of.get(name))}"
+            f"{name}: recorded {quote(recorded.get(name))}, given {quote(made_of.get(name))}"
             for name in sorted(recorded.keys() | made_of.keys())
             if recorded.get(name) != made_of.get(name)
         ]
         if differing:
-            listing = "\n".join(differing)
             raise InputError(
                 f"{self._folder} holds another run (phase {phase} in {NAME}). Choose another "
-                f"folder, or give it what it was made of:\n{listing}"
+                f"folder, or give it what it was made of: {listing(differing)}."
             )
 
     def phase(

@@ -70,7 +70,7 @@ class PrivateCache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            return _refused(path, error.strerror)
+            return _refused(path, str(error.strerror))
         with os.fdopen(descriptor, "rb") as file:
             if (problem := _file_problem(os.fstat(descriptor))) is not None:
                 return _refused(path, problem)

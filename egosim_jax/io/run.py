@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
-from egosim_jax.io.untrusted import quote, quote_text, read_json
+from egosim_jax.io.untrusted import listing, quote, quote_text, read_json
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
@@ -102,19 +102,14 @@ def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) 
         if not isinstance(recorded, dict):
             raise InputError(f"{path} is not the record of a config. Restore it. (--out)")
         differing = [
-            f"  {field}: {what}"
+            f"{field}: {what}"
             for field, what in sorted(_differences(recorded, wanted).items())
             if not any(f"{field}.".startswith(f"{free}.") for free in may_differ)
         ]
         if differing:
             raise InputError(
-                "\n".join(
-                    [
-                        f"{folder} holds a run of another config; choose another --out or the "
-                        "same config:",
-                        *differing,
-                    ]
-                )
+                f"{folder} holds a run of another config. Choose another --out, or the same "
+                f"config: {listing(differing)}."
             )
     if jax.process_index() == 0:
         write_json(path, config)

@@ -10,7 +10,7 @@ import io
 import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -113,6 +113,12 @@ def quote(value: Any) -> str:
 def quote_text(text: str) -> str:
     """Cut and escape text for a message, without quotation marks."""
     return quote(text)[1:].replace("'…", "…").removesuffix("'")
+
+
+def listing(items: Sequence[str], *, most: int = 5) -> str:
+    """Put findings on one line: the first ones, and how many more there are."""
+    more = f"; and {len(items) - most} more" if len(items) > most else ""
+    return "; ".join(items[:most]) + more
 
 
 def quote_path(path: Path | str) -> str:

@@ -21,7 +21,8 @@ from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.untrusted import quote, quote_text, read_json
 from egosim_jax.types import InputError, SceneState
 
-VERSION = 1
+VERSION, UNSEALED = 2, 1
+"""The version that is written, and the one before it, whose description has no hash."""
 POINTS, DESCRIPTION = "points.npz", "state.json"
 ARRAYS = ("points_m", "colours", "object_ids", "last_seen")
 _DTYPES = {"points_m": "float32", "colours": "uint8", "object_ids": "int32", "last_seen": "int32"}
@@ -64,9 +65,10 @@ def _load(folder: Path) -> SceneState:
     written = read_json(folder / DESCRIPTION)
     if not isinstance(written, dict) or "version" not in written:
         raise InputError(f"{DESCRIPTION} is not the description of a state.")
-    if written["version"] != VERSION:
+    version = written["version"]
+    if version not in (VERSION, UNSEALED) or isinstance(version, (bool, float)):
         raise InputError(
-            f"it is of version {quote(written['version'])}; this program reads version {VERSION}."
+            f"it is of version {quote(version)}; this program reads {UNSEALED} and {VERSION}."
         )
     if sha256(folder / POINTS) != written.get("sha256"):
         raise InputError(
@@ -79,8 +81,8 @@ def _load(folder: Path) -> SceneState:
         state = SceneState(**arrays, **description)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{DESCRIPTION}: {quote_text(str(error))}.") from error
-    sealed = written.get("description_sha256", None)  # earlier versions have none
-    changed = sealed not in (None, _sealed(_description(state)))
+    seal = written.get("description_sha256")
+    changed = version == VERSION and seal != _sealed(_description(state))
     if changed or written.get("points") != len(state.points_m):
         raise InputError(
             f"{folder / DESCRIPTION} was changed after it was written. Take another copy."

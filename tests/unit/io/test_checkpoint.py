@@ -134,7 +134,17 @@ def test_hashes_that_cannot_be_read_are_damage(tmp_path):
     saved_twice(tmp_path)
     truncate(tmp_path / "8" / HASHES)
     truncate(tmp_path / "8" / HASHES)
-    with pytest.raises(InputError, match=rf"{HASHES} cannot be read"):
+    with pytest.raises(InputError, match=rf"{HASHES} is not valid JSON"):
+        Checkpoints(tmp_path).restore(abstract(state(1000)), numbers())
+
+
+def test_without_hashes_what_orbax_cannot_read_is_named(tmp_path):
+    saved_twice(tmp_path)
+    (tmp_path / "8" / HASHES).unlink()
+    for file in (tmp_path / "8" / "state").rglob("*"):
+        if file.is_file():
+            file.write_bytes(b"")
+    with pytest.raises(InputError, match=r"step 8 in .* cannot be read, and has no sha256.json"):
         Checkpoints(tmp_path).restore(abstract(state(1000)), numbers())
 
 

@@ -73,8 +73,8 @@ def test_a_flipped_byte_is_named(tmp_path):
 def test_another_version_is_named(tmp_path):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 2}))
-    with pytest.raises(InputError, match="of version 2; this program reads version 1"):
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 3}))
+    with pytest.raises(InputError, match="of version 3; this program reads 1 and 2"):
         load(tmp_path / "state")
 
 
@@ -111,6 +111,10 @@ def test_a_state_of_the_first_release_is_still_read(tmp_path):
     path = tmp_path / "state" / "state.json"
     written = json.loads(path.read_text())
     del written["description_sha256"]
+    path.write_text(json.dumps(written))
+    with pytest.raises(InputError, match="was changed after it was written"):
+        load(tmp_path / "state")
+    written["version"] = 1
     path.write_text(json.dumps(written))
     assert fingerprint(load(tmp_path / "state")) == fingerprint(state())
 

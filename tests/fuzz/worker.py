@@ -1,0 +1,134 @@
+"""One process that fuzzes a target and says on stdout, line by line, what came of each case."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.types import InputError
+from tests.fuzz.mutations import BYTES
+from tests.fuzz.target import Target
+
+MODULES = ("targets_run", "targets_convert", "targets_media")
+MAX_SECONDS, MAX_BYTES, MAX_MESSAGE = 20, 1 << 30, 4000
+
+
+def targets() -> dict[str, Target]:
+    """Every target by its name."""
+    modules = [n for n in MODULES if (Path(__file__).parent / f"{n}.py").exists()]
+    found = [t for name in modules for t in import_module(f"tests.fuzz.{name}").TARGETS]
+    return {target.name: target for target in found}
+
+
+def fuzz(target: Target, *, seed: int, first: int, cases: int) -> None:
+    """Run the cases from `first` on; a line when one begins and a line with its outcome."""
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGALRM, _too_slow)
+    with tempfile.TemporaryDirectory() as home:
+        sample = Path(home) / "sample"
+        sample.mkdir()
+        target.make(sample)
+        files = sorted({f for glob in target.files for f in sample.glob(glob) if f.is_file()})
+        assert files, f"{target.name} has no files"
+        want = _result(target.read, sample)
+        for number in range(first, cases):
+            case = random.Random(f"{target.name} {seed} {number}")
+            folder = Path(home) / "case" / sample.name
+            shutil.copytree(sample, folder)
+            kind = _change(target, files, sample, folder, case)
+            _say({"case": number, "kind": kind})
+            _say({"case": number, **_outcome(target, folder, want)})
+            shutil.rmtree(folder.parent)
+
+
+def _change(target: Target, files: list[Path], sample: Path, folder: Path, case: Any) -> str:
+    """Change one file of a copy; the kind of change."""
+    file = folder / case.choice(files).relative_to(sample)
+    mutate = case.choice(BYTES + target.mutations * 2)
+    data = file.read_bytes()
+    changed = mutate(data, case)
+    if case.random() < 0.1:
+        changed = case.choice(BYTES)(changed, case)
+    file.write_bytes(changed)
+    return mutate.__name__
+
+
+def _outcome(target: Target, folder: Path, want: str) -> dict[str, Any]:
+    before, then = _peak_reset(), time.monotonic()
+    signal.alarm(MAX_SECONDS)
+    try:
+        got = _result(target.read, folder)
+    except InputError as error:
+        message = str(error)
+        bad = "\n" in message or len(message) > MAX_MESSAGE or not message.isprintable()
+        found = {"outcome": "unclear message" if bad else "refused", "detail": message[:300]}
+    except _TooSlowError:
+        found = {"outcome": "slow"}
+    except BaseException:
+        found = {"outcome": "traceback", "detail": traceback.format_exc()[-1500:]}
+    else:
+        found = _judge(target, folder, got, want)
+    finally:
+        signal.alarm(0)
+    if time.monotonic() - then > MAX_SECONDS:
+        return {**found, "outcome": "slow"}
+    grown = _status("VmHWM") - before
+    return {**found, "outcome": "memory", "detail": f"{grown:,}"} if grown > MAX_BYTES else found
+
+
+def _judge(target: Target, folder: Path, got: str, want: str) -> dict[str, Any]:
+    if got == want:
+        return {"outcome": "equal"}
+    if target.sealed:
+        return {"outcome": "changed"}
+    if target.reference is not None:
+        try:
+            same = got == _result(target.reference, folder)
+        except Exception as error:
+            return {"outcome": "changed", "detail": f"the reference refuses: {error!r:.300}"}
+        return {"outcome": "as reference" if same else "changed"}
+    return {"outcome": "unseen" if target.lossy else "changed"}
+
+
+def _result(read: Any, folder: Path) -> str:
+    return fingerprint(read(folder))
+
+
+class _TooSlowError(BaseException):
+    pass
+
+
+def _too_slow(*_: Any) -> None:
+    raise _TooSlowError
+
+
+def _peak_reset() -> int:
+    Path("/proc/self/clear_refs").write_text("5", "ascii")
+    return _status("VmRSS")
+
+
+def _status(name: str) -> int:
+    lines = Path("/proc/self/status").read_text("ascii").splitlines()
+    (line,) = (line for line in lines if line.startswith(f"{name}:"))
+    return int(line.split()[1]) * 1024
+
+
+def _say(record: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(record) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    name, seed, first, cases = sys.argv[1:]
+    fuzz(targets()[name], seed=int(seed), first=int(first), cases=int(cases))
