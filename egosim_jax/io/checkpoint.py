@@ -203,6 +203,8 @@ class Checkpoints:
     def _check_shapes(self, step: int, state: Any) -> None:
         saved = _shapes(self._checkpointer.metadata(step).metadata)
         wanted = _shapes(state)
+        if not saved:
+            raise ValueError("it lists no arrays")
         problems = [
             f"{path}: checkpoint has {saved.get(path, 'nothing')}, "
             f"config expects {wanted.get(path, 'nothing')}"
