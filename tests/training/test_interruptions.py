@@ -19,6 +19,7 @@ from tests import flags
 from tests.training.killing import logged
 from tests.training.line import write_points
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 LONG = {"steps": 100, "save_every": 30, "pause": 0.03}
 """Seconds of steps: jax hears of SIGTERM once a second."""

@@ -11,6 +11,7 @@ import pytest
 
 from tests.flags import devices
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 MESHES = [(1, 8, 1, 1), (4, 2, 1, 1), (1, 4, 2, 2), (2, 2, 2, 1)]
 """Data, fsdp, context, and parts in which a batch is taken."""

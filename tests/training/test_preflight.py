@@ -19,6 +19,7 @@ from egosim_jax.train.preflight import Setting
 from egosim_jax.train.recipes import Debug
 from tests.flags import devices
 
+pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parent / "run_memory.py"
 
 

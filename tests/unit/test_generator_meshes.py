@@ -10,6 +10,7 @@ import pytest
 
 from tests.flags import devices
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 

@@ -258,6 +258,7 @@ def test_clips_that_see_different_places_may_come_in_either_order(order):
     assert fingerprint(state) == fingerprint(expected)
 
 
+@pytest.mark.slow
 def test_a_hundred_steps_do_not_make_it_grow():
     """A wobbling look at a small piece of table, with noise in its depth."""
     rng = np.random.default_rng(0)
