@@ -25,6 +25,9 @@ from egosim_jax.types import InputError
 
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
+FOREVER_S = 10**8
+"""A process on its own may be suspended for as long as one likes: nobody waits for its heartbeat."""
+
 
 @contextmanager
 def joined() -> Iterator[None]:
@@ -58,7 +61,8 @@ def _initialize(address: str, count: int, index: int) -> None:
         # Else gloo listens where the machine's own name leads; jax has no public way to say it.
         gloo = xla_bridge._jax.make_gloo_tcp_collectives
         xla_bridge._jax.make_gloo_tcp_collectives = partial(gloo, hostname="127.0.0.1")
-    jax.distributed.initialize(address, count, index, coordinator_bind_address=bind)
+    patience = {"heartbeat_timeout_seconds": FOREVER_S} if count == 1 else {}
+    jax.distributed.initialize(address, count, index, coordinator_bind_address=bind, **patience)
 
 
 def _is_loopback(host: str) -> bool:

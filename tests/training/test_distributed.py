@@ -1,0 +1,45 @@
+"""How a process joins the others, and what it does where there are none."""
+
+import jax
+import pytest
+
+from egosim_jax.train import distributed
+
+
+@pytest.fixture
+def initialized(monkeypatch):
+    """What jax was asked for, instead of asking it."""
+    calls = []
+    for name in distributed.NAMES:
+        monkeypatch.delenv(name, raising=False)
+
+    def initialize(*address, **options):
+        if not address:
+            raise ValueError("no cluster")
+        calls.append((address, options))
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
+    return calls
+
+
+def test_a_process_on_its_own_listens_on_loopback_and_may_be_suspended(initialized):
+    with distributed.joined():
+        pass
+    ((address, options),) = initialized
+    assert options["coordinator_bind_address"] == address[0]
+    assert address[0].startswith("127.0.0.1:")
+    assert options["heartbeat_timeout_seconds"] > 3600
+
+
+@pytest.mark.parametrize(
+    ("host", "bound"), [("127.0.0.1", True), ("localhost", True), ("10.1.2.3", False)]
+)
+def test_several_processes_listen_where_their_address_says(initialized, monkeypatch, host, bound):
+    for name, value in zip(distributed.NAMES, (f"{host}:1234", "2", "0"), strict=True):
+        monkeypatch.setenv(name, value)
+    with distributed.joined():
+        pass
+    ((_, options),) = initialized
+    assert (options["coordinator_bind_address"] == f"{host}:1234") == bound
+    assert "heartbeat_timeout_seconds" not in options
