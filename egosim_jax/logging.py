@@ -11,7 +11,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
+from egosim_jax.io.atomic import append_line
 from egosim_jax.io.run import write_text
+from egosim_jax.io.untrusted import read_lines
 from egosim_jax.types import InputError
 
 
@@ -63,14 +65,17 @@ class JsonLines:
 
     def __init__(self, path: Path, *, resume_after: int = 0):
         self.path = path
-        lines = path.read_text("utf-8").splitlines() if path.is_file() else []
-        kept = [line for line in lines if json.loads(line)["step"] <= resume_after]
+        kept = []
+        for number, line in read_lines(path) if path.exists() else ():
+            if not isinstance(line, dict) or type(line.get("step")) is not int:
+                raise InputError(f"{path}, line {number} is of no step. Restore or remove it.")
+            if line["step"] <= resume_after:
+                kept.append(json.dumps(line))
         write_text(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Append the numbers."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"step": step, **values}) + "\n")
+        append_line(self.path, {"step": step, **values})
 
     def close(self) -> None:
         """Nothing is left: every line is written at once."""
@@ -142,7 +147,7 @@ EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 def check_installed(extra: str) -> None:
     """Raise `InputError` if the package of an extra is not installed."""
-    if EXTRAS[extra] not in sys.modules and find_spec(EXTRAS[extra]) is None:
+    if sys.modules.get(EXTRAS[extra]) is None and find_spec(EXTRAS[extra]) is None:
         raise InputError(
             f"{EXTRAS[extra]} is not installed: pip install 'egosim-jax[{extra}]'. "
             f"(--training.{extra})"

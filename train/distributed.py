@@ -17,6 +17,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import jax
 from jax._src import xla_bridge
@@ -26,7 +27,7 @@ from egosim_jax.types import InputError
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 FOREVER_S = 10**8
-"""A process on its own may be suspended for as long as one likes: nobody waits for its heartbeat."""
+"""A process on its own may be suspended for long: nobody waits for its heartbeat."""
 
 
 @contextmanager
@@ -61,8 +62,10 @@ def _initialize(address: str, count: int, index: int) -> None:
         # Else gloo listens where the machine's own name leads; jax has no public way to say it.
         gloo = xla_bridge._jax.make_gloo_tcp_collectives
         xla_bridge._jax.make_gloo_tcp_collectives = partial(gloo, hostname="127.0.0.1")
-    patience = {"heartbeat_timeout_seconds": FOREVER_S} if count == 1 else {}
-    jax.distributed.initialize(address, count, index, coordinator_bind_address=bind, **patience)
+    options: dict[str, Any] = {"coordinator_bind_address": bind}
+    if count == 1:
+        options["heartbeat_timeout_seconds"] = FOREVER_S
+    jax.distributed.initialize(address, count, index, **options)
 
 
 def _is_loopback(host: str) -> bool:

@@ -80,16 +80,15 @@ class Continuous:
 
     def _simulate(self, generator: Generator, method: str, seed: int) -> Scores:
         """The scores of one sequence, which are kept beside it."""
-        import json
-
         from egosim_jax.io.run import write_json
+        from egosim_jax.io.untrusted import read_json
         from egosim_jax.simulator import Simulator
         from egosim_jax.worlds.tabletop import make_sequence, to_action
 
         folder = self.out / method.replace(", ", "_").replace(" ", "_") / str(seed)
         path = folder / "scores.json"
         if path.exists():
-            return json.loads(path.read_text(encoding="utf-8"))
+            return read_json(path)
         truth = list(make_sequence(seed, spec=generator.config.video, clips=self.clips))
         name = METHODS[method]
         simulator = Simulator(

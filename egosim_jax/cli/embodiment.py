@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from egosim_jax.cli.spread import Line, print_table, summarise
 from egosim_jax.command import DONE
 from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.untrusted import read_lines
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
 
@@ -320,8 +320,8 @@ class Embodiment:
 
 def _validation(folder: Path) -> dict[int, float]:
     """The validation losses of a training, by step."""
-    lines = map(json.loads, (folder / "metrics.jsonl").read_text("utf-8").splitlines())
-    return {x["step"]: x["validation_loss"] for x in lines if "validation_loss" in x}
+    lines = read_lines(folder / "metrics.jsonl")
+    return {x["step"]: x["validation_loss"] for _, x in lines if "validation_loss" in x}
 
 
 def _compare(

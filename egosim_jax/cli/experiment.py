@@ -12,6 +12,7 @@ from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import RESULTS, Generate
 from egosim_jax.command import DONE
 from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.io.untrusted import read_json, read_lines
 
 if TYPE_CHECKING:
     from egosim_jax.data.metadata import ClipFiles
@@ -132,7 +133,7 @@ class Comparison:
         ).run()
         print(name)
         Evaluate(generated=folder, metadata=metadata).run()
-        return json.loads((folder / "report.json").read_text("utf-8"))
+        return read_json(folder / "report.json")
 
     def _swap(self) -> Path:
         """A metadata file in which each clip has the conditions of the next one of its split."""
@@ -167,7 +168,7 @@ def _blocks(folder: Path) -> list[Block]:
     """The comparison video of each generated clip, by split and id."""
     from egosim_jax.io.video import read_video
 
-    lines = [json.loads(line) for line in (folder / RESULTS).read_text("utf-8").splitlines()]
+    lines = [line for _, line in read_lines(folder / RESULTS)]
     shown = {line["source_id"]: line for line in reversed(lines) if line["status"] == "done"}
     ordered = sorted(shown.values(), key=lambda line: (line.get("split", ""), line["video_id"]))
     title = "{}  {}  prior | hands | generated | truth"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
+import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -13,19 +14,23 @@ import numpy as np
 from egosim_jax.io.untrusted import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
-MAX_ARRAY_BYTES = 1 << 34
+MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26
+DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError,
+          RuntimeError)  # fmt: skip
+"""What zipfile and NumPy raise for archives that are not whole."""
 MAX_ENTRIES = 64
 _HEADER = 4096
 
 
 def read_arrays(
-    path: Path, dtypes: Mapping[str, str], *, others: Collection[str] = ()
+    path: Path, dtypes: Mapping[str, str], *, others: Collection[str] = (), packed: bool = False
 ) -> dict[str, np.ndarray]:
     """Read exactly the named arrays of an npz that `np.savez` wrote.
 
     `dtypes` names the dtype of each array; those in `others` may have any that holds numbers.
-    Raises `InputError` if an array is missing, unknown, of another dtype, compressed or damaged:
-    shapes are checked against sizes before anything is built, contents against their CRC-32.
+    Compressed ones are read if `packed`. Raises `InputError` if an array is missing, unknown, of
+    another dtype, too large or damaged: shapes are checked against sizes before anything is built,
+    contents against their CRC-32.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -37,19 +42,21 @@ def read_arrays(
                     listing = ", ".join(quote_text(n) for n in names[:8])
                     raise InputError(f"{name} holds the arrays {listing}: not those expected.")
                 return {
-                    n: _read(archive, entry, dtypes.get(n))
+                    n: _read(archive, entry, dtypes.get(n), packed)
                     for n, entry in zip(names, found, strict=True)
                 }
         except InputError:
             raise
-        except (zipfile.BadZipFile, ValueError, EOFError, OSError, NotImplementedError,
-                RuntimeError) as error:  # fmt: skip
+        except DAMAGE as error:
             raise InputError(f"{name} is damaged: {quote_text(str(error))}.") from error
 
 
-def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, dtype: str | None) -> np.ndarray:
+def _read(
+    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, dtype: str | None, packed: bool
+) -> np.ndarray:
     stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
-    if not stored or entry.file_size > MAX_ARRAY_BYTES:
+    limit = MAX_ARRAY_BYTES if stored else MAX_PACKED_BYTES if packed else 0
+    if entry.file_size > limit:
         raise ValueError(f"{quote(entry.filename)} is compressed or too large")
     data = archive.read(entry)
     header = io.BytesIO(data[:_HEADER])

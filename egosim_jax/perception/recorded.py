@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from egosim_jax.io.npz import DAMAGE, read_arrays
+from egosim_jax.io.untrusted import open_regular, quote, quote_text, read_bytes
 from egosim_jax.perception import Backends
 from egosim_jax.state.align import CameraMethod, align_cameras
 from egosim_jax.state.filter import is_hand
@@ -27,8 +29,8 @@ from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
 
 IDS_A_STEP = 1000
 """Ids of one clip mean nothing in the next: each step has numbers of its own."""
-LARGEST_BYTES = 2**28
-"""Of one unpacked frame."""
+LARGEST_BYTES, LARGEST_PIXELS, LARGEST_TEXT = 2**28, 2**25, 2**20
+"""Of one unpacked frame, and of the list of phrases in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +54,12 @@ class Recorded:
 
     def poses(self, clip: Clip, action: Action, state: SceneState) -> Cameras:
         """The recorded cameras in the world."""
-        there = self._frames("pose", clip)
+        there = self._frames("pose", clip, 4, 4)
         motion = align_cameras(there, action.cameras.world_from_camera, method=self.alignment)
         scale = np.cbrt(np.linalg.det(motion[:3, :3]))
         poses = motion @ there
         poses[:, :3, :3] /= scale
-        fx, fy, cx, cy = self._frames("intrinsics", clip).mean(axis=0)
+        fx, fy, cx, cy = self._frames("intrinsics", clip, 4).mean(axis=0)
         return Cameras(
             world_from_camera=poses,
             intrinsics_px=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
@@ -67,7 +69,7 @@ class Recorded:
 
     def depth(self, clip: Clip, action: Action, state: SceneState) -> Float32[np.ndarray, "f h w"]:
         """The recorded depth in metres of the world; infinite where it is 0 or NaN."""
-        there = self._frames("pose", clip)
+        there = self._frames("pose", clip, 4, 4)
         motion = align_cameras(there, action.cameras.world_from_camera, method=self.alignment)
         depth = np.cbrt(np.linalg.det(motion[:3, :3])) * self._pictures("depth", clip)
         return np.where(depth > 0, depth, np.inf).astype(np.float32)
@@ -92,37 +94,38 @@ class Recorded:
 
     def _phrases(self) -> dict[int, str]:
         path = self._path("mask", "txt")
+        text = read_bytes(path, limit=LARGEST_TEXT).decode("utf-8", "replace")
         found = {}
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in text.splitlines():
             number, colon, phrase = line.partition(":")
-            if not colon or not number.strip().isdigit():
-                raise InputError(f"{path}: each line must be `id: phrase`, and one is {line!r}.")
-            found[int(number)] = phrase.strip()
+            if not colon or not (number.strip().isascii() and number.strip().isdigit()):
+                raise InputError(f"{path}: each line must be `id: phrase`, one is {quote(line)}.")
+            found[int(number[:18])] = phrase.strip()
         return found
 
-    def _frames(self, kind: str, clip: Clip) -> Float[np.ndarray, "f ..."]:
-        """The rows of an npz, one for each frame of the clip."""
+    def _frames(self, kind: str, clip: Clip, *size: int) -> Float[np.ndarray, "f ..."]:
+        """The rows of an npz, one of a size for each frame of the clip."""
         path = self._path(kind, "npz")
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                data, numbers = file["data"].astype(float), file["inds"]
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(f"{path} must hold `data` and `inds`: {error}.") from error
-        if not np.array_equal(numbers, np.arange(len(clip.frames))):
+        arrays = read_arrays(path, {}, others=("data", "inds"), packed=True)
+        data, numbers, count = arrays["data"].astype(float), arrays["inds"], len(clip.frames)
+        if not np.array_equal(numbers, np.arange(count)):
             raise InputError(
-                f"{path} is for {len(numbers)} frames, the clip has {len(clip.frames)}: there must "
-                "be one for each, in order."
+                f"{path} is for {numbers.size} frames, the clip has {count}: there must be one for "
+                "each, in order."
             )
+        if data.shape != (count, *size) or not np.isfinite(data).all():
+            raise InputError(f"{path}: data is {data.shape}, not finite numbers {(count, *size)}.")
         return data
 
     def _pictures(self, kind: str, clip: Clip) -> np.ndarray:
         path = self._path(kind, "zip")
-        pictures = list(_unpack(path))
-        if len(pictures) != len(clip.frames) or pictures[0].shape != clip.frames.shape[1:3]:
-            shape = pictures[0].shape if pictures else "no"
+        count, *size = clip.frames.shape[:3]
+        pictures = list(_unpack(path, count))
+        if any(picture.shape != tuple(size) for picture in pictures) or len(pictures) != count:
+            shapes = {picture.shape for picture in pictures} or "no"
             raise InputError(
-                f"{path} holds {len(pictures)} frames of {shape} pixels, the clip "
-                f"{len(clip.frames)} of {clip.frames.shape[1:3]}."
+                f"{path} holds {len(pictures)} frames of {shapes} pixels, the clip {count} of "
+                f"{tuple(size)}."
             )
         return np.stack(pictures)
 
@@ -133,29 +136,35 @@ class Recorded:
         return path
 
 
-def _unpack(path: Path) -> Iterator[np.ndarray]:
-    """The pictures of an archive, in the order of their names."""
+def _unpack(path: Path, most: int) -> Iterator[np.ndarray]:
+    """The pictures of an archive, in the order of their names, and at most one too many."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in sorted(archive.infolist(), key=lambda entry: entry.filename):
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            for entry in sorted(archive.infolist(), key=lambda entry: entry.filename)[: most + 1]:
+                name = quote_text(entry.filename)
                 if entry.file_size > LARGEST_BYTES:
-                    raise InputError(f"{path}: {entry.filename} unpacks to {entry.file_size} bytes")
-                data = archive.read(entry)
-                yield _exr(data) if entry.filename.endswith(".exr") else _png(data, path)
-    except zipfile.BadZipFile as error:
-        raise InputError(f"{path} is damaged: {error}.") from error
+                    raise InputError(f"{path}: {name} unpacks to {entry.file_size} bytes.")
+                read = _exr if entry.filename.endswith(".exr") else _png
+                yield read(archive.read(entry), f"{path}: {name}")
+    except DAMAGE as error:
+        raise InputError(f"{path} is damaged: {quote_text(str(error))}.") from error
 
 
-def _png(data: bytes, path: Path) -> np.ndarray:
+def _png(data: bytes, name: str) -> np.ndarray:
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    width, height = int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+    picture = None
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and width * height <= LARGEST_PIXELS:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.ndim != 2:
-        raise InputError(f"{path} must hold pictures of one channel.")
+        raise InputError(
+            f"{name} must be a PNG of one channel and at most {LARGEST_PIXELS} pixels."
+        )
     return picture
 
 
-def _exr(data: bytes) -> np.ndarray:
+def _exr(data: bytes, name: str) -> np.ndarray:
     try:
         import OpenEXR
     except ImportError as error:
@@ -167,5 +176,13 @@ def _exr(data: bytes) -> np.ndarray:
     with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # it reads nothing but files
         file.write(data)
         file.flush()
-        with OpenEXR.File(file.name) as picture:
-            return picture.channels()["Z"].pixels.astype(np.float32)
+        try:
+            with OpenEXR.File(file.name, header_only=True) as header:
+                first, last = header.header()["dataWindow"]
+            if np.prod(np.asarray(last, float) - first + 1) > LARGEST_PIXELS:
+                raise InputError(f"{name} has more than {LARGEST_PIXELS} pixels.")
+            with OpenEXR.File(file.name) as picture:
+                return picture.channels()["Z"].pixels.astype(np.float32)
+        except (RuntimeError, KeyError, ValueError) as error:
+            why = quote_text(str(error))
+            raise InputError(f"{name} is no OpenEXR picture of a channel Z: {why}.") from error

@@ -2,6 +2,7 @@
 
 import zipfile
 from pathlib import Path
+from random import Random
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from egosim_jax.geometry import look_at, transform
 from egosim_jax.perception.recorded import IDS_A_STEP, Recorded
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
+from tests.fuzz.mutations import BYTES
 
 FRAMES, HEIGHT, WIDTH = 5, 6, 8
 INTRINSICS = np.array([[9.0, 0, 3.5], [0, 9, 2.5], [0, 0, 1]])
@@ -116,3 +118,33 @@ def test_a_phrase_without_an_id_is_named(tmp_path):
     (tmp_path / "mask" / "clip.txt").write_text("red cup\n")
     with pytest.raises(InputError, match="`id: phrase`"):
         Recorded(folder=tmp_path, name="clip").backends()(*asked())
+
+
+def test_arrays_that_unpack_to_too_much_or_are_of_another_shape_are_refused(tmp_path):
+    write(tmp_path)
+    recorded = Recorded(folder=tmp_path, name="clip")
+    path = tmp_path / "pose" / "clip.npz"
+    np.savez_compressed(path, data=np.zeros((3000, 3000)), inds=np.arange(FRAMES))
+    with pytest.raises(InputError, match="too large"):
+        recorded.poses(*asked())
+    np.savez_compressed(path, data=np.zeros((FRAMES, 3, 3)), inds=np.arange(FRAMES))
+    with pytest.raises(InputError, match="not finite numbers"):
+        recorded.poses(*asked())
+
+
+@pytest.mark.parametrize("kind", ["depth", "mask"])
+def test_every_damaged_archive_of_pictures_is_refused_in_one_line(tmp_path, kind):
+    write(tmp_path)
+    recorded, random = Recorded(folder=tmp_path, name="clip"), Random(0)
+    read = recorded.depth if kind == "depth" else recorded.segmentation
+    path = tmp_path / kind / "clip.zip"
+    whole = path.read_bytes()
+    want = read(*asked())
+    for _ in range(150):
+        path.write_bytes(random.choice(BYTES)(whole, random))
+        messages = []
+        try:
+            np.testing.assert_array_equal(read(*asked()), want)
+        except InputError as error:
+            messages.append(str(error))
+        assert not any("\n" in message for message in messages)
