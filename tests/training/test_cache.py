@@ -95,6 +95,7 @@ def test_the_manifest_names_what_made_the_arrays_alone(encoded, source, weights)
         "config": "debug",
         "source": source.manifest.fingerprint,
         "encoders": {"vae": hashes(weights)["vae"]},
+        "decoding": "accurate",
     }
 
 
