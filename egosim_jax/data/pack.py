@@ -38,17 +38,15 @@ def pack(
     failed = 0
     check_presence(items)
     decoded = {} if spec is None else {"decoding": decoding}
-    with (
-        lock_folder(out),
-        ShardWriter(
-            out,
-            kind="frames" if spec else "videos",
-            spec=spec,
-            provenance={**provenance, **decoded},
-            shard_bytes=shard_bytes,
-            overwrite=overwrite,
-        ) as writer,
-    ):
+    shards = ShardWriter(
+        out,
+        kind="frames" if spec else "videos",
+        spec=spec,
+        provenance={**provenance, **decoded},
+        shard_bytes=shard_bytes,
+        overwrite=overwrite,
+    )
+    with lock_folder(out), shards as writer:
         for files in items:
             problem = None
             try:
