@@ -46,8 +46,8 @@ MAX_PIXELS = 2**31
 """Most pixels decoded from one video, frames x height x width: some ten seconds."""
 MAX_KEPT = 3 * 2**28
 """Most bytes of the frames that one reading gives."""
-MAX_IMAGE_PIXELS = 2**26
-"""Most pixels of one image or frame: 8192 x 8192."""
+MAX_IMAGE_PIXELS = 2**25
+"""Most pixels of one image or frame: 8192 x 4096."""
 MAX_IMAGE_BYTES = 2**28
 """Largest image file that is read."""
 IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
