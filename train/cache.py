@@ -281,9 +281,7 @@ def _read(
             yield before[0], [future.result() for future in before[1]]
 
 
-def _clip(
-    source: ShardReader, window: Window, config: ModelConfig, decoding: Decoding
-) -> Example:
+def _clip(source: ShardReader, window: Window, config: ModelConfig, decoding: Decoding) -> Example:
     number, start = window
     record = source[number]
     try:
