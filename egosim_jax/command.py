@@ -148,6 +148,7 @@ REFUSALS = {
     errno.ELOOP: "Links are not followed here: give the real path.",
     errno.ENOENT: "Check the path.",
     errno.EMFILE: "Raise the limit of open files (ulimit -n).",
+    errno.EBUSY: "A mount point cannot be replaced: choose a folder inside it.",
     errno.EIO: "Check the disk.",
 }
 """What the system may refuse, and the way out."""

@@ -31,6 +31,8 @@ from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, gather, r
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.generator import Inputs, ModelConfig, Program, batches, place, truths
 from egosim_jax.io.run import open_folder
+from egosim_jax.io.untrusted import quote
+from egosim_jax.io.video import Decoding
 from egosim_jax.io.weights import hashes, load
 from egosim_jax.models.clip_vision import CLIPVision
 from egosim_jax.models.umt5 import UMT5
@@ -157,6 +159,7 @@ def cache(
     batch_size: int,
     mesh: Mesh | None = None,
     shard_windows: int = 64,
+    decoding: Decoding = "accurate",
     process_index: int | None = None,
     process_count: int | None = None,
     verb: str = "encoding",
@@ -165,7 +168,8 @@ def cache(
 
     `folder` holds the weights, of which `encoder_names` are read. Each batch is dealt out over
     `mesh`, which holds devices of this process. All processes call this alike and have `out` in
-    common; it is whole when they return. Raises `InputError` if `out` was begun with another
+    common; it is whole when they return. `decoding` is recorded in the manifest; that of frames was
+    chosen when they were packed. Raises `InputError` if `out` was begun with another
     config, source, stride or number of windows in a shard, or with other encoders.
     """
     check_counts({"--stride": stride, "--batch-size": batch_size, "--shard-windows": shard_windows})
@@ -173,10 +177,13 @@ def cache(
         check_batch(batch_size, mesh)
     index = jax.process_index() if process_index is None else process_index
     count = jax.process_count() if process_count is None else process_count
+    if source.manifest.kind == "frames":
+        decoding = _packed_decoding(source, decoding)
     provenance = {
         "config": config.name,
         "source": source.manifest.fingerprint,
         "encoders": hashes(folder, only=encoder_names(config)),
+        "decoding": decoding,
     }
     _open(
         out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
@@ -199,7 +206,7 @@ def cache(
     }
     if missing:
         encode = Encoding(config, Encoders.load(config, folder, mesh=mesh), mesh)
-        progress = _write(encode, missing, source, batch_size, provenance)
+        progress = _write(encode, missing, source, batch_size, provenance, decoding)
         for _ in track(progress, verb, total=sum(map(len, missing.values()))):
             pass
     _wait_for_all("encoded")
@@ -207,6 +214,16 @@ def cache(
         gather(parts, out)
         shutil.rmtree(out / "parts")
     _wait_for_all("gathered")
+
+
+def _packed_decoding(source: ShardReader, decoding: Decoding) -> Decoding:
+    packed = source.manifest.provenance.get("decoding", "accurate")
+    if decoding not in ("accurate", packed):
+        raise InputError(
+            f"{source.folder} holds frames whose decoding is {quote(packed)}, not {decoding}. Pack "
+            "the clips again. (--decoding)"
+        )
+    return packed
 
 
 def _open(out: Path, settings: Mapping[str, Any]) -> None:
@@ -226,11 +243,12 @@ def _write(
     source: ShardReader,
     batch_size: int,
     provenance: Mapping[str, Any],
+    decoding: Decoding,
 ) -> Iterator[Window]:
     """Write part after part; yields each window once it is encoded."""
     jobs = [(part, batch) for part, todo in parts.items() for batch in batches(todo, batch_size)]
     spec = encode.config.video
-    for part, group in groupby(_read(source, jobs, encode.config), key=itemgetter(0)):
+    for part, group in groupby(_read(source, jobs, encode.config, decoding), key=itemgetter(0)):
         with ShardWriter(
             part, kind="latents", spec=spec, provenance=provenance, shard_bytes=2**62
         ) as writer:
@@ -246,13 +264,16 @@ Example = tuple[Window, Mapping[str, Any], Triplet]
 
 
 def _read(
-    source: ShardReader, jobs: Sequence[tuple[Path, Sequence[Window]]], config: ModelConfig
+    source: ShardReader,
+    jobs: Sequence[tuple[Path, Sequence[Window]]],
+    config: ModelConfig,
+    decoding: Decoding,
 ) -> Iterator[tuple[Path, list[Example]]]:
     """The clips of each job, read while the one before is encoded."""
     with ThreadPoolExecutor(THREADS) as pool:
         before: tuple[Path, list[Future[Example]]] | None = None
         for part, batch in jobs:
-            now = part, [pool.submit(_clip, source, window, config) for window in batch]
+            now = part, [pool.submit(_clip, source, window, config, decoding) for window in batch]
             if before is not None:
                 yield before[0], [future.result() for future in before[1]]
             before = now
@@ -260,15 +281,17 @@ def _read(
             yield before[0], [future.result() for future in before[1]]
 
 
-def _clip(source: ShardReader, window: Window, config: ModelConfig) -> Example:
+def _clip(source: ShardReader, window: Window, config: ModelConfig, decoding: Decoding) -> Example:
     number, start = window
     record = source[number]
     try:
-        arrays: dict[str, Any] = decode_record(record.arrays, config.video, start=start)
+        arrays: dict[str, Any] = decode_record(
+            record.arrays, config.video, start=start, decoding=decoding
+        )
     except InputError as error:
         raise InputError(f"{source.name(number)}: {error}") from error
     metadata = record.metadata
-    names = {"video_id": str(metadata["video_id"]), "prompt": str(metadata["prompt"])}
+    names = {name: str(metadata.get(name, "")) for name in ("video_id", "prompt")}
     return window, metadata, Triplet(**names, **arrays)
 
 

@@ -46,6 +46,8 @@ class Pack:
     """Largest size of a shard file."""
     overwrite: bool = False
     """Replace the shards that the folder holds."""
+    decoding: Literal["accurate", "official"] = "accurate"
+    """With a size: how colors are decoded; official: as in EgoSim's loader, a gray level darker."""
 
     def run(self) -> int:
         """Check and pack clip after clip."""
@@ -62,6 +64,7 @@ class Pack:
             provenance={"metadata": self.metadata.name, "sha256": sha256(self.metadata)},
             shard_bytes=self.shard_megabytes * 2**20,
             overwrite=self.overwrite,
+            decoding=self.decoding,
         )
         problems = [problem for problem in track(progress, "packing", total=len(items)) if problem]
         for problem in problems:
@@ -101,6 +104,9 @@ class Encode:
     shard_windows: int = 64
     """Windows in a shard file: what an interrupted run loses at most. Best a multiple of the batch
     size."""
+    decoding: Literal["accurate", "official"] = "accurate"
+    """How the colors of videos are decoded; official: as in EgoSim's loader, a gray level darker.
+    The manifest says which."""
 
     def run(self) -> int:
         """Encode shard after shard."""
@@ -132,6 +138,7 @@ class Encode:
             batch_size=mesh.size if self.batch_size is None else self.batch_size,
             mesh=mesh,
             shard_windows=self.shard_windows,
+            decoding=self.decoding,
         )
 
 
@@ -243,7 +250,7 @@ class Look:
         spec = reader.manifest.spec or VideoSpec()
         blocks: dict[object, Block] = {}
         for number, record in enumerate(track(reader, "reading", total=len(reader))):
-            extra = record.metadata["extra"]
+            extra = record.metadata.get("extra", {})
             unknown = [name for name in self.by if name not in extra]
             if unknown:
                 known = ", ".join(sorted(extra)) or "none"
@@ -252,7 +259,7 @@ class Look:
             if key not in blocks:
                 videos = decode_record(record.arrays, spec)
                 shown = [videos[name] for name in self.streams if name in videos]
-                blocks[key] = Block(str(record.metadata["prompt"]), shown)
+                blocks[key] = Block(str(record.metadata.get("prompt", "")), shown)
             if len(blocks) == self.limit:
                 break
         moments = np.linspace(0, spec.frames - 1, self.moments).round().astype(int).tolist()

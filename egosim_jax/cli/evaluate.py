@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from egosim_jax.cli.generate import RESULTS
 from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.data.metadata import is_safe_id
+from egosim_jax.io.untrusted import quote_path, read_lines
 from egosim_jax.progress import track
 from egosim_jax.types import InputError
 
@@ -23,7 +27,7 @@ if TYPE_CHECKING:
 METHODS = {
     "generated": "generated",
     "prior": "prior",
-    "prior_fit": "prior, colours fitted to the truth",
+    "prior_fit": "prior, colors fitted to the truth",
     "still": "first true frame, repeated",
     "vae": "truth through the autoencoder",
 }
@@ -34,11 +38,12 @@ METHODS = {
 class Evaluate:
     """Compare generated clips with the recorded ones by PSNR and SSIM.
 
-    Every {id}.mp4 is compared with the truth of its metadata row, stretched to the generated size,
-    over the same frames; so are the prior, the prior with a least-squares change of colours, the
-    first true frame repeated and, where there is an {id}_vae.mp4, the autoencoder's copy of the
-    truth. Frame 0 does not count, because there the repeated frame is the truth. Prints a table;
-    writes metrics.jsonl (a line a clip) and report.json.
+    Every {id}.mp4 is compared with the truth of its metadata row over the same frames, both at one
+    size; so are the prior, the prior with a least-squares change of colors, the first true frame
+    repeated and, where there is an {id}_vae.mp4, the autoencoder's copy of the truth. Frame 0 does
+    not count, because there the repeated frame is the truth. A clip of another length than most
+    is left out (exit code 3). Prints a table; writes metrics.jsonl (a line a clip) and report.json,
+    which names the protocol.
     """
 
     generated: Path
@@ -47,6 +52,9 @@ class Evaluate:
     """CSV or JSONL in EgoSim's columns, with video."""
     where: str | None = None
     """Take rows whose column has this value, for instance split=test."""
+    size: Literal["output", "truth"] = "output"
+    """Whose size the comparison has. That of the output flatters small ones: methods whose outputs
+    differ in size compare at the truth's alone."""
     out: Path | None = None
     """Folder of the report, if not that of the clips."""
 
@@ -56,10 +64,14 @@ class Evaluate:
         from egosim_jax.metrics.report import DEFINITIONS, summarise_splits
 
         windows, failed = self._windows()
+        windows, frames = self._whole(windows, failed)
         compared: list[tuple[_Window, dict[str, Score]]] = []
+        sizes: set[str] = set()
         for window in track(windows, "comparing", total=len(windows)):
             try:
-                compared.append((window, self._scores(window)))
+                scores, height, width = self._scores(window)
+                compared.append((window, scores))
+                sizes.add(f"{width}x{height}")
             except InputError as error:
                 failed.append(f"{window.output_id}: {error}")
         for line in failed:
@@ -80,6 +92,12 @@ class Evaluate:
         write_text(out / "metrics.jsonl", "".join(f"{json.dumps(line)}\n" for line in lines))
         report = {
             "definitions": {**DEFINITIONS, "frames": "1 to the last"},
+            "protocol": {
+                "size": self.size,
+                "pixels": sorted(sizes),
+                "frames": [1, frames - 1],
+                "resize": "Pillow LANCZOS, to the size of the comparison",
+            },
             "splits": {
                 split: {method: asdict(summary) for method, summary in methods.items()}
                 for split, methods in splits.items()
@@ -87,6 +105,9 @@ class Evaluate:
         }
         write_json(out / "report.json", report)
         _print(splits)
+        print(
+            f"frames 1 to {frames - 1} at the size of the {self.size}: {', '.join(sorted(sizes))}"
+        )
         return PARTIAL if failed else DONE
 
     def _windows(self) -> tuple[list[_Window], list[str]]:
@@ -110,36 +131,63 @@ class Evaluate:
             if line.get("status") == "failed":
                 failed.append(f"{output_id}: it was not generated")
             else:
-                windows.append(_Window(files, int(line.get("start", 0)), output_id))
+                windows.append(_Window(files, line.get("start", 0), output_id))
         return windows, failed
 
-    def _scores(self, window: _Window) -> dict[str, Score]:
+    def _whole(self, windows: Sequence[_Window], failed: list[str]) -> tuple[list[_Window], int]:
+        """Return the clips that are as long as most are, and that length."""
+        from egosim_jax.io.video import probe_video
+
+        lengths: dict[_Window, int] = {}
+        for window in windows:
+            try:
+                lengths[window] = probe_video(self._video(window)).frames
+            except InputError as error:
+                failed.append(f"{window.output_id}: {error}")
+        counts = Counter(lengths.values())
+        usual = max(counts, key=lambda length: (counts[length], length), default=0)
+        failed += [
+            f"{window.output_id}: it has {length} frames, most clips {usual}."
+            for window, length in lengths.items()
+            if length != usual
+        ]
+        if usual == 1:
+            raise InputError("Single frames cannot be compared: frame 0 does not count.")
+        return [window for window in lengths if lengths[window] == usual], usual
+
+    def _scores(self, window: _Window) -> tuple[dict[str, Score], int, int]:
+        """Return the scores of a clip, and the height and width at which it was compared."""
         import numpy as np
 
-        from egosim_jax.io.video import read_video
+        from egosim_jax.io.video import probe_video
         from egosim_jax.metrics.image import fit_colours
         from egosim_jax.metrics.report import score
 
-        generated = read_video(self.generated / f"{window.output_id}.mp4").frames
-        if len(generated) < 2:
-            raise InputError("a single frame cannot be compared: frame 0 does not count.")
+        path = self._video(window)
         if window.files.truth is None:
             raise InputError(f"{window.files.row} names no truth.")
-        truth = _read_like(window.files.truth, generated, window.start)
-        prior = _read_like(window.files.prior, generated, window.start)
+        output = probe_video(path)
+        like = output if self.size == "output" else probe_video(window.files.truth)
+        shape = output.frames, like.height, like.width
+        truth = _read_at(window.files.truth, shape, window.start)
+        prior = _read_at(window.files.prior, shape, window.start)
         videos = {
-            "generated": generated,
+            "generated": _read_at(path, shape, 0),
             "prior": prior,
             "prior_fit": fit_colours(prior, truth),
             "still": np.broadcast_to(truth[:1], truth.shape),
         }
-        vae = self.generated / f"{window.output_id}_vae.mp4"
+        vae = path.with_name(f"{path.stem}_vae.mp4")
         if vae.exists():
-            videos["vae"] = _read_like(vae, generated, 0)
-        return {method: score(video[1:], truth[1:]) for method, video in videos.items()}
+            videos["vae"] = _read_at(vae, shape, 0)
+        scores = {method: score(video[1:], truth[1:]) for method, video in videos.items()}
+        return scores, like.height, like.width
+
+    def _video(self, window: _Window) -> Path:
+        return self.generated / f"{window.output_id}.mp4"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Window:
     """A generated clip and where its truth lies."""
 
@@ -157,23 +205,27 @@ def _results(path: Path) -> dict[str, dict[str, Any]] | None:
     """The last line of each clip in results.jsonl; None without the file."""
     if not path.is_file():
         return None
-    try:
-        lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
-        return {str(line["video_id"]): line for line in lines}
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path} cannot be read: {error!r}.") from error
+    lines = {}
+    for number, line in read_lines(path):
+        output_id = line.get("video_id") if isinstance(line, dict) else None
+        start = line.get("start", 0) if isinstance(line, dict) else None
+        if not (isinstance(output_id, str) and is_safe_id(output_id)) or type(start) is not int:
+            raise InputError(f"{quote_path(path)}, line {number} is no result of a clip.")
+        lines[output_id] = line
+    return lines
 
 
-def _read_like(path: Path, like: np.ndarray, start: int) -> np.ndarray:
-    """As many frames of a video as `like` has, from `start` on, stretched to its size."""
-    from egosim_jax.data.transforms import resize_video
+def _read_at(path: Path, shape: tuple[int, int, int], start: int) -> np.ndarray:
+    """Frames of a video from `start` on, as many as `shape` has, stretched to its size."""
+    from egosim_jax.data.transforms import resize_image
     from egosim_jax.io.video import read_video
 
-    count, height, width, _ = like.shape
-    frames = read_video(path, start=start, stop=start + count).frames
+    count, height, width = shape
+    fit = partial(resize_image, height=height, width=width)
+    frames = read_video(path, start=start, stop=start + count, each=fit).frames
     if len(frames) < count:
         raise InputError(f"{path} ends before frame {start + count}, which was generated.")
-    return resize_video(frames, height, width)
+    return frames
 
 
 def _print(splits: Mapping[str, Mapping[str, Summary]]) -> None:

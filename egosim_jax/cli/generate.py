@@ -80,6 +80,9 @@ class Generate:
     lenient: bool = False
     """Repair input as the official loader does: repeat or cut frames, stretch sizes, take a
     missing mask for all observed."""
+    decoding: Literal["accurate", "official"] = "accurate"
+    """How the colors of videos are decoded; official: as in EgoSim's loader, a gray level
+    darker."""
     skip_existing: bool = False
     """Leave clips alone whose video is already there."""
     reconstruct: bool = False
@@ -211,6 +214,8 @@ class Generate:
             "seed": self.seed,
             "policy": self._policy,
         }
+        if self.decoding != "accurate":
+            run["decoding"] = self.decoding
         open_folder(self._folder, run)
         for name, digest in (digests or {}).items():
             print(f"{config.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
@@ -220,7 +225,10 @@ class Generate:
     ) -> tuple[list[_Item], list[tuple[_Item, str]]]:
         """The items that can be read, and the others with what is wrong; nothing is compiled."""
         from egosim_jax.data.clips import check_clip
+        from egosim_jax.data.metadata import check_presence
 
+        if items:
+            check_presence([item.files for item in items])
         sound, bad = [], []
         for item in items:
             problems = check_clip(item.files, config.video, start=item.start, policy=self._policy)
@@ -287,7 +295,11 @@ class Generate:
         for item in batch:
             try:
                 triplet = load_triplet(
-                    item.files, config.video, start=item.start, policy=self._policy
+                    item.files,
+                    config.video,
+                    start=item.start,
+                    policy=self._policy,
+                    decoding=self.decoding,
                 )
                 loaded.append((item, triplet))
             except InputError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader
 
-from egosim_jax.data.metadata import SAFE_ID
+from egosim_jax.data.metadata import is_safe_id
 from egosim_jax.data.shards import (
     ArrayInfo,
     Manifest,
@@ -20,6 +20,7 @@ from egosim_jax.data.shards import (
     read_manifest,
 )
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.untrusted import quote
 from egosim_jax.io.video import decode_image, decode_video
 from egosim_jax.types import InputError, check_frame_count
 
@@ -69,8 +70,8 @@ def _read_problems(reader: ArrayRecordReader, index: int, manifest: Manifest) ->
 def _record_problems(record: Record, manifest: Manifest) -> list[str]:
     video_id = record.metadata.get("video_id")
     problems = []
-    if not isinstance(video_id, str) or not SAFE_ID.fullmatch(video_id):
-        problems.append(f"video_id {video_id!r} cannot name a file")
+    if not isinstance(video_id, str) or not is_safe_id(video_id):
+        problems.append(f"video_id {quote(video_id)} cannot name a file")
     problems += _shape_problems(record.arrays, manifest.arrays)
     if manifest.kind == "videos":
         problems += _video_problems(record.arrays)

@@ -3,15 +3,18 @@
 Strict, the default, refuses what would otherwise be repaired in silence: a missing mask, videos
 whose frame counts disagree or are not 4k+1, sizes that disagree or are not multiples of 16, clips
 shorter than the model's. Lenient does what the EgoSim release does: the last frame is repeated or
-the video cut, every size is stretched, and without a mask everything counts as observed. In both,
-a clip longer than the model's gives the window that begins at `start`.
+the video cut, every size is stretched, and without a mask everything counts as observed; a warning
+says how many frames were missing. In both, a clip longer than the model's gives the window that
+begins at `start`.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -20,12 +23,24 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax.data.metadata import MASK_NAME, ClipFiles
-from egosim_jax.data.transforms import fit_length, resize_image, resize_mask, resize_video
+from egosim_jax.data.transforms import fit_length, resize_image, resize_mask
 from egosim_jax.io.run import write_text
-from egosim_jax.io.video import VideoInfo, probe_video, read_image, read_video, write_video
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.video import (
+    Damage,
+    Decoding,
+    VideoInfo,
+    probe_video,
+    read_image,
+    read_video,
+    write_video,
+)
 from egosim_jax.types import InputError, Triplet, VideoSpec, check_frame_count
 
+logger = logging.getLogger(__name__)
+
 Policy = Literal["strict", "lenient"]
+DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
@@ -78,7 +93,7 @@ def check_clip(
     sizes: dict[str, tuple[int, int]] = {}
     for name, path in _videos(files, policy).items():
         try:
-            probed[name] = probe_video(path)
+            probed[name] = probe_video(path, damage=DAMAGE[policy])
             sizes[name] = (probed[name].height, probed[name].width)
         except InputError as error:
             problems.append(str(error))
@@ -93,37 +108,59 @@ def check_clip(
 
 
 def load_triplet(
-    files: ClipFiles, spec: VideoSpec, *, start: int = 0, policy: Policy = "strict"
+    files: ClipFiles,
+    spec: VideoSpec,
+    *,
+    start: int = 0,
+    policy: Policy = "strict",
+    decoding: Decoding = "accurate",
 ) -> Triplet:
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
     The image for CLIP is the clip's own, wherever the window begins. Raises `InputError` listing
-    what `check_clip` finds.
+    what `check_clip` finds, or naming the video that is damaged further on.
     """
     problems = check_clip(files, spec, start=start, policy=policy)
     if problems:
         raise InputError("\n".join(problems))
-    videos = {
-        name: _read_window(path, spec, start) for name, path in _videos(files, policy).items()
+    arrays: dict[str, np.ndarray] = {
+        "mask": np.zeros((spec.frames, spec.height, spec.width), np.uint8)
     }
-    colours = {
-        name: resize_video(frames, spec.height, spec.width)
-        for name, frames in videos.items()
-        if name != "mask"
-    }
-    if "mask" in videos:
-        mask = resize_mask(videos["mask"][..., 0], spec.height, spec.width)
-    else:
-        mask = np.zeros((spec.frames, spec.height, spec.width), np.uint8)
-    image = _read_first_frame(files.first_frame)
+    for name, path in _videos(files, policy).items():
+        fit = _fit_mask if name == "mask" else resize_image
+        try:
+            frames = read_video(
+                path,
+                start=start,
+                stop=start + spec.frames,
+                decoding=decoding,
+                damage=DAMAGE[policy],
+                each=partial(fit, height=spec.height, width=spec.width),
+            ).frames
+        except InputError as error:
+            raise InputError(f"{files.row} ({files.video_id}): {error}") from error
+        if len(frames) < spec.frames:
+            missing = spec.frames - len(frames)
+            why = (
+                f"{files.row} ({files.video_id}): {missing} of {spec.frames} frames are missing in "
+                f"{quote_path(path)}"
+            )
+            if policy == "strict":
+                raise InputError(f"{why}. (--lenient repeats the last frame)")
+            logger.warning("%s; the last one is repeated", why)
+        arrays[name] = fit_length(frames, spec.frames)
+    image = _read_first_frame(files.first_frame, decoding)
     return Triplet(
         video_id=files.video_id,
         prompt=files.prompt,
-        mask=mask,
         first_frame=resize_image(image, spec.height, spec.width),
         extra=files.extra,
-        **colours,
+        **arrays,
     )
+
+
+def _fit_mask(frame: UInt8[np.ndarray, "h w 3"], *, height: int, width: int) -> np.ndarray:
+    return resize_mask(frame[None, ..., 0], height, width)[0]
 
 
 def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
@@ -171,12 +208,7 @@ def _table(values: dict[str, int] | dict[str, str]) -> str:
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
-def _read_window(path: Path, spec: VideoSpec, start: int) -> UInt8[np.ndarray, "f h w 3"]:
-    frames = read_video(path, start=start, stop=start + spec.frames).frames
-    return fit_length(frames, spec.frames)
-
-
-def _read_first_frame(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+def _read_first_frame(path: Path, decoding: Decoding = "accurate") -> UInt8[np.ndarray, "h w 3"]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return read_video(path, stop=1).frames[0]
+        return read_video(path, stop=1, decoding=decoding).frames[0]
     return read_image(path)

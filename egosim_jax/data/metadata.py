@@ -1,34 +1,50 @@
 """The table that lists clips: EgoSim's metadata, as CSV or as JSON lines.
 
-    column               holds
-    video                the recorded video (truth); the column may be absent, its cells not empty
-    ego_prior_video      the scene rendered along the camera path
-    hand_keypoint_video  the hand skeletons
-    first_frame          image (or video, of which the first frame is taken) for CLIP
-    prompt               the caption
-    video_id             names the outputs: letters, digits, `.`, `_` and `-`
+    column               holds                                          if there is no such column
+    video                the recorded video (truth)                     there is no truth
+    ego_prior_video      the scene rendered along the camera path       needed
+    hand_keypoint_video  the hand skeletons                             hand_kp_video.mp4
+    first_frame          image (or video: its first frame) for CLIP     hand_inpaint.png
+    prompt               the caption                                    needed
+    video_id             names the outputs                              video, with _ for /
 
-Paths are relative to the folder of the metadata file. The mask has no column: it lies beside the
-prior as `pc_mask_video.mp4`. Further columns are carried to the results.
+Paths are relative to the folder of the metadata file; the defaults, EgoSim's own, lie beside the
+prior, and so does the mask, `pc_mask_video.mp4`, which has no column. Ids are letters, digits,
+`.`, `_` and `-`; with `/` they make folders of the outputs. Further columns are carried to the
+results. No cell of these columns may be empty.
 """
 
 from __future__ import annotations
 
 import csv
 import difflib
-import json
+import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes, read_lines
 from egosim_jax.types import InputError, check_counts
 
-REQUIRED = ("ego_prior_video", "hand_keypoint_video", "first_frame", "prompt", "video_id")
+REQUIRED = ("ego_prior_video", "prompt")
+COLUMNS = ("video", "ego_prior_video", "hand_keypoint_video", "first_frame", "prompt", "video_id")
 TRUTH = "video"
-MASK_NAME = "pc_mask_video.mp4"
-SAFE_ID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,199}")
-"""What may name an output file."""
+MASK_NAME, HANDS_NAME, IMAGE_NAME = "pc_mask_video.mp4", "hand_kp_video.mp4", "hand_inpaint.png"
+MAX_BYTES = 1 << 28
+"""Largest metadata file."""
+MAX_CLIPS = 400_000
+MAX_COLUMNS = 256
+_SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
+
+
+def is_safe_id(video_id: str) -> bool:
+    """Whether an id may name output files, in folders of their own if it has slashes.
+
+    Folders have no dots, so that no id takes the place of another one's file.
+    """
+    return len(video_id) <= 200 and _SAFE_ID.fullmatch(video_id) is not None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,36 +74,35 @@ class ClipFiles:
 def read_metadata(path: Path) -> list[ClipFiles]:
     """Read every row of a metadata file (`.csv`, or `.jsonl` with an object a line).
 
-    Raises one `InputError` that lists every problem: missing columns, empty cells (which the
+    Raises one `InputError` that lists the problems: missing columns, empty cells (which the
     official loader turns into the text "nan"), cells beyond the header, unsafe and repeated ids.
     """
-    rows = list(_json_rows(path) if path.suffix == ".jsonl" else _csv_rows(path))
-    if not rows:
-        raise InputError(f"{path} lists no clips.")
-    problems: list[str] = []
+    clips: list[ClipFiles] = []
+    problems = _Problems()
     first_seen: dict[str, int] = {}
-    for line, row in rows:
-        absent = [name for name in REQUIRED if name not in row]
-        if absent:
-            problems.append(f"line {line}: no column {', '.join(absent)}")
-            continue
-        for name in (*REQUIRED, TRUTH):
-            if name in row and row[name].strip().lower() in ("", "nan"):
-                problems.append(f"line {line}, column {name}: the cell is empty")
-        video_id = row["video_id"]
-        if video_id.strip() and not SAFE_ID.fullmatch(video_id):
-            problems.append(
-                f"line {line}: video_id {video_id!r} cannot name a file; use letters, digits, "
-                "'.', '_' and '-'"
-            )
-        if video_id in first_seen:
-            problems.append(
-                f"line {line}: video_id {video_id!r} is already that of line {first_seen[video_id]}"
-            )
-        first_seen.setdefault(video_id, line)
-    if problems:
-        raise InputError(_listing(f"{path} cannot be used", problems))
-    return [_files(path, line, row) for line, row in rows]
+    for line, row in _json_rows(path) if path.suffix == ".jsonl" else _csv_rows(path):
+        found = list(_row_problems(row, first_seen))
+        problems.add(f"line {line}{problem}" for problem in found)
+        if not found:
+            clips.append(_files(path, line, row))
+            first_seen[clips[-1].video_id] = line
+        if len(clips) > MAX_CLIPS:
+            raise InputError(f"{quote_path(path)} lists more than {MAX_CLIPS:,} clips. Split it.")
+    problems.refuse(f"{quote_path(path)} cannot be used")
+    if not clips:
+        raise InputError(f"{quote_path(path)} lists no clips.")
+    return clips
+
+
+def check_presence(items: Sequence[ClipFiles]) -> None:
+    """Raise `InputError` if not one of the clips has its prior: the folder is another one."""
+    if not any(item.prior.exists() for item in items):
+        shown = ", ".join(quote_path(item.prior) for item in items[:3])
+        raise InputError(
+            f"No prior video of the {len(items):,} clips is there: {shown}"
+            f"{', …' if len(items) > 3 else ''}. Paths are relative to the folder of the metadata. "
+            "(--metadata)"
+        )
 
 
 def select(
@@ -108,12 +123,12 @@ def select(
         if not equals or column not in columns:
             raise InputError(
                 f"--where {where!r} must be COLUMN=VALUE with one of the columns "
-                f"{', '.join(columns) or '(the metadata has no further columns)'}."
+                f"{_some(columns) or '(the metadata has no further columns)'}."
             )
         chosen = [item for item in items if item.extra.get(column) == value]
         if not chosen:
             values = sorted({item.extra.get(column, "") for item in items})
-            raise InputError(f"No clip has {where}; {column} is one of: {', '.join(values)}.")
+            raise InputError(f"No clip has {where}; {column} is one of: {_some(values)}.")
     if video_ids:
         by_id = {item.video_id: item for item in chosen}
         for video_id in video_ids:
@@ -128,69 +143,123 @@ def select(
     return chosen
 
 
+def _some(values: Sequence[str]) -> str:
+    shown = ", ".join(quote_text(value) for value in values[:20])
+    return shown + (f" and {len(values) - 20:,} more" if len(values) > 20 else "")
+
+
+class _Problems:
+    """The first problems of a list that may be long, and their number."""
+
+    def __init__(self, most: int = 20):
+        self._most, self._shown, self._count = most, list[str](), 0
+
+    def add(self, problems: Iterable[str]) -> None:
+        for problem in problems:
+            self._count += 1
+            if self._count <= self._most:
+                self._shown.append(f"  {problem}")
+
+    def refuse(self, what: str) -> None:
+        """Raise `InputError` if there are any."""
+        if self._count > self._most:
+            self._shown.append(f"  and {self._count - self._most:,} more")
+        if self._count:
+            raise InputError("\n".join([f"{what}:", *self._shown]))
+
+
+def _row_problems(row: Mapping[str, str], first_seen: Mapping[str, int]) -> Iterator[str]:
+    absent = [name for name in REQUIRED if name not in row]
+    if "video_id" not in row and TRUTH not in row:
+        absent.append("video_id")
+    if absent:
+        yield f": no column {', '.join(absent)}"
+        return
+    for name in COLUMNS:
+        if name in row and row[name].strip().lower() in ("", "nan"):
+            yield f", column {name}: the cell is empty"
+    video_id = _video_id(row)
+    if video_id.strip() and not is_safe_id(video_id):
+        yield (
+            f": video_id {quote(video_id)} cannot name a file; use letters, digits, '.', '_' and "
+            "'-', and '/' between folders without dots"
+        )
+    if video_id in first_seen:
+        yield f": video_id {quote(video_id)} is already that of line {first_seen[video_id]}"
+
+
+def _video_id(row: Mapping[str, str]) -> str:
+    if "video_id" in row:
+        return row["video_id"]
+    return row[TRUTH].replace("/", "_").removesuffix(".mp4")
+
+
 def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Line number and cells of each row; `InputError` if the file is no table."""
+    name = quote_path(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
-            header = next(reader, [])
-            absent = [name for name in REQUIRED if name not in header]
-            if absent:
-                raise InputError(f"{path} has no column {', '.join(absent)}.")
-            repeated = sorted({name for name in header if header.count(name) > 1})
-            if repeated:
-                raise InputError(f"{path} has more than one column {', '.join(repeated)}.")
+        text = read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig")
+        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+        header = next(reader, [])
+        needed = (*REQUIRED, *(() if TRUTH in header else ("video_id",)))
+        absent = [column for column in needed if column not in header]
+        if absent:
+            raise InputError(f"{name} has no column {', '.join(absent)}.")
+        repeated = sorted({quote_text(cell) for cell in header if header.count(cell) > 1})
+        if repeated or len(header) > MAX_COLUMNS:
+            what = (
+                f"more than one column {', '.join(repeated)[:200]}"
+                if repeated
+                else (f"{len(header)} columns, more than {MAX_COLUMNS}")
+            )
+            raise InputError(f"{name} has {what}.")
+        line = reader.line_num + 1
+        for cells in reader:
+            if len(cells) > len(header):
+                raise InputError(
+                    f"{name}, line {line}: {len(cells)} cells, but the header has "
+                    f"{len(header)}. A cell with a comma needs quotes."
+                )
+            if cells:
+                cells += [""] * (len(header) - len(cells))
+                yield line, dict(zip(header, cells, strict=True))
             line = reader.line_num + 1
-            for cells in reader:
-                if len(cells) > len(header):
-                    raise InputError(
-                        f"{path}, line {line}: {len(cells)} cells, but the header has "
-                        f"{len(header)}. A cell with a comma needs quotes."
-                    )
-                if cells:
-                    cells += [""] * (len(header) - len(cells))
-                    yield line, dict(zip(header, cells, strict=True))
-                line = reader.line_num + 1
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read as CSV: {error}.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{name} cannot be read as CSV: {quote_text(str(error))}.") from error
 
 
 def _json_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Line number and values of each line; null counts as an empty cell."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
-    for line, text in enumerate(lines, start=1):
-        if not text.strip():
-            continue
-        try:
-            row = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}, line {line} is not JSON: {error}.") from error
+    for line, row in read_lines(path, limit=MAX_BYTES, last="read"):
+        where = f"{quote_path(path)}, line {line}"
         if not isinstance(row, dict):
-            raise InputError(f"{path}, line {line} is not a JSON object.")
-        yield line, {name: "" if value is None else str(value) for name, value in row.items()}
+            raise InputError(f"{where} is not a JSON object.")
+        if len(row) > MAX_COLUMNS:
+            raise InputError(f"{where} has {len(row)} columns, more than {MAX_COLUMNS}.")
+        yield line, {name: _cell(value, name, where) for name, value in row.items()}
+
+
+def _cell(value: Any, name: str, where: str) -> str:
+    if isinstance(value, (list, dict)):
+        raise InputError(f"{where}: {quote(name)} is {quote(value)}, not text or a number.")
+    return "" if value is None else str(value)
 
 
 def _files(path: Path, line: int, row: Mapping[str, str]) -> ClipFiles:
     folder = path.parent
     prior = folder / row["ego_prior_video"]
+
+    def beside(column: str, name: str) -> Path:
+        return folder / row[column] if column in row else prior.parent / name
+
     return ClipFiles(
-        video_id=row["video_id"],
+        video_id=_video_id(row),
         prompt=row["prompt"],
         prior=prior,
         mask=prior.parent / MASK_NAME,
-        hands=folder / row["hand_keypoint_video"],
-        first_frame=folder / row["first_frame"],
+        hands=beside("hand_keypoint_video", HANDS_NAME),
+        first_frame=beside("first_frame", IMAGE_NAME),
         truth=folder / row[TRUTH] if TRUTH in row else None,
-        extra={name: cell for name, cell in row.items() if name not in (*REQUIRED, TRUTH)},
+        extra={name: cell for name, cell in row.items() if name not in COLUMNS},
         row=f"{path.name} line {line}",
     )
-
-
-def _listing(what: str, problems: Sequence[str], *, most: int = 20) -> str:
-    shown = [f"  {problem}" for problem in problems[:most]]
-    if len(problems) > most:
-        shown.append(f"  and {len(problems) - most} more")
-    return "\n".join([f"{what}:", *shown])

@@ -9,9 +9,15 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.data.clips import check_clip, load_triplet
-from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.metadata import ClipFiles, check_presence
 from egosim_jax.data.shards import Record, ShardWriter
+from egosim_jax.io.atomic import lock_folder
+from egosim_jax.io.untrusted import read_bytes
+from egosim_jax.io.video import Decoding
 from egosim_jax.types import InputError, Triplet, VideoSpec
+
+MAX_FILE = 1 << 28
+"""Largest file of a clip that is packed as it is, in bytes."""
 
 
 def pack(
@@ -22,24 +28,29 @@ def pack(
     provenance: Mapping[str, Any],
     shard_bytes: int = 256 * 2**20,
     overwrite: bool = False,
+    decoding: Decoding = "accurate",
 ) -> Iterator[str | None]:
     """Write the shards of some clips: decoded at `spec`, or their own files without one.
 
-    Yields, after each clip, what kept it out, or None. Raises `InputError` if none could be packed.
+    Yields, after each clip, what kept it out, or None. Raises `InputError` if none could be packed,
+    or if another process writes to the same folder.
     """
     failed = 0
-    with ShardWriter(
+    check_presence(items)
+    decoded = {} if spec is None else {"decoding": decoding}
+    shards = ShardWriter(
         out,
         kind="frames" if spec else "videos",
         spec=spec,
-        provenance=provenance,
+        provenance={**provenance, **decoded},
         shard_bytes=shard_bytes,
         overwrite=overwrite,
-    ) as writer:
+    )
+    with lock_folder(out), shards as writer:
         for files in items:
             problem = None
             try:
-                record = decoded_record(files, spec) if spec else encoded_record(files)
+                record = decoded_record(files, spec, decoding) if spec else encoded_record(files)
                 writer.add(record.arrays, record.metadata)
             except InputError as error:
                 failed, problem = failed + 1, str(error)
@@ -69,13 +80,16 @@ def encoded_record(files: ClipFiles) -> Record:
     }
     if files.truth is not None:
         paths["truth"] = files.truth
-    arrays = {name: np.frombuffer(path.read_bytes(), np.uint8) for name, path in paths.items()}
+    arrays = {
+        name: np.frombuffer(read_bytes(path, limit=MAX_FILE), np.uint8)
+        for name, path in paths.items()
+    }
     return Record(arrays=arrays, metadata=clip_metadata(files))
 
 
-def decoded_record(files: ClipFiles, spec: VideoSpec) -> Record:
+def decoded_record(files: ClipFiles, spec: VideoSpec, decoding: Decoding = "accurate") -> Record:
     """A clip's first `spec.frames` frames at the size of `spec`, after the strict checks."""
-    return triplet_record(load_triplet(files, spec))
+    return triplet_record(load_triplet(files, spec, decoding=decoding))
 
 
 def triplet_record(triplet: Triplet) -> Record:

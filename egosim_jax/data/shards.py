@@ -8,10 +8,11 @@ safetensors file whose header carries the record's metadata as JSON. Three kinds
     frames    the same, decoded at the manifest's spec: uint8 "f h w 3", mask "f h w", image "h w 3"
     latents   what a training step reads: latents "f h w 16", packed mask "f h w 4", embeddings, ...
 
-All records of a folder hold the same arrays. The manifest is written last, so a folder is whole or
-is not a dataset. Reading trusts nothing: file names are matched against a pattern, sizes are held
-against the manifest at opening, ArrayRecord's hashes are verified on every read, and `check`
-verifies the files' SHA-256 and decodes every record.
+All records of a folder hold the same arrays. A folder is written beside its place and put there in
+one step, so it is whole or is not there. Reading trusts nothing: the manifest carries its own
+SHA-256, file names are matched against a pattern, sizes are held against the manifest at opening,
+ArrayRecord's hashes are verified on every read, and `check` verifies the files' SHA-256 and decodes
+every record.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Literal, get_args
 
 import ml_dtypes
@@ -33,14 +35,18 @@ import safetensors.numpy
 from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordWriter
 
+from egosim_jax.io.atomic import LOCK, atomic_folder
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.run import write_json
+from egosim_jax.io.run import plain, write_json
+from egosim_jax.io.untrusted import parse_json, quote, quote_path, quote_text, read_json
 from egosim_jax.types import InputError, VideoSpec
 
 Kind = Literal["videos", "frames", "latents"]
 
 VERSION = 1
 MANIFEST = "manifest.json"
+SEAL = "manifest_sha256"
+"""In the manifest: the hash of all the rest of it."""
 SHARD_NAME = re.compile(r"shard-\d{5}\.array_record")
 _OPTIONS = "group_size:1,uncompressed"
 _DTYPES = {
@@ -52,6 +58,9 @@ _DTYPES = {
     "BF16": np.dtype(ml_dtypes.bfloat16),
     "F32": np.dtype(np.float32),
 }
+
+
+_DTYPE_NAMES = {dtype.name for dtype in _DTYPES.values()}
 
 
 class RecordError(InputError):
@@ -126,17 +135,23 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
             for key, tensor in safetensors.deserialize(data)
         }
         length = int.from_bytes(data[:8], "little")
-        metadata = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["json"])
-    except (safetensors.SafetensorError, KeyError, ValueError) as error:
-        raise RecordError(f"{name} is not a record of arrays: {error}.") from error
+        header = parse_json(data[8 : 8 + length], source="its header")
+        metadata = parse_json(header["__metadata__"]["json"].encode(), source="its metadata")
+        texts = {key: metadata.get(key, "") for key in ("video_id", "prompt")}
+        extra = metadata.get("extra", {})
+        if not all(isinstance(text, str) for text in [*texts.values(), *extra.values()]):
+            raise TypeError("its id, prompt and further columns must be text")
+    except (safetensors.SafetensorError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise RecordError(f"{name} is not a record of arrays: {quote_text(str(error))}.") from error
     return Record(arrays=arrays, metadata=metadata)
 
 
 class ShardWriter(AbstractContextManager["ShardWriter"]):
-    """Writes a folder of shards, or nothing: leaving by an exception removes what was written.
+    """Write a folder of shards in a `with` block, or nothing if it ends by an exception.
 
-    An existing dataset is replaced only with `overwrite`, and only once the new one is complete.
-    Raises `InputError` if the folder holds a dataset, or if records disagree in their arrays.
+    An existing dataset is replaced only with `overwrite`, in one step, once the new one is
+    complete. Raises `InputError` if the folder holds a dataset or other files, or if records
+    disagree in their arrays.
     """
 
     def __init__(
@@ -149,21 +164,21 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         shard_bytes: int = 256 * 2**20,
         overwrite: bool = False,
     ):
-        if (folder / MANIFEST).exists() and not overwrite:
-            raise InputError(f"{folder} already holds shards. (--overwrite replaces them)")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
+        _check_place(folder, overwrite)
         self.folder = folder
         self.kind: Kind = kind
         self.spec = spec
         self.provenance = dict(provenance or {})
         self.shard_bytes = shard_bytes
+        self._place = ExitStack()
         self._arrays: dict[str, ArrayInfo] = {}
         self._shards: list[ShardInfo] = []
         self._writer: ArrayRecordWriter | None = None
         self._records = self._bytes = 0
+
+    def __enter__(self) -> ShardWriter:
+        self._temporary = self._place.enter_context(atomic_folder(self.folder.resolve()))
+        return self
 
     def add(self, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any]) -> None:
         """Append a record; a full shard is closed first."""
@@ -171,55 +186,50 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         data = to_bytes(Record(arrays=arrays, metadata=metadata))
         if self._bytes + len(data) > self.shard_bytes:
             self._finish_shard()
-        writer = self._writer or ArrayRecordWriter(str(self._temporary()), _OPTIONS)
-        writer.write(data)
+        writer = self._writer or ArrayRecordWriter(str(self._shard_path()), _OPTIONS)
         self._writer = writer
+        writer.write(data)
         self._records += 1
         self._bytes += len(data)
 
-    def close(self) -> Manifest:
-        """Put the shards in place, then the manifest."""
-        self._finish_shard()
-        if not self._shards:
-            raise InputError(f"No record was written to {self.folder}.")
-        (self.folder / MANIFEST).unlink(missing_ok=True)
-        ours = {f"{shard.file}.tmp" for shard in self._shards}
-        for old in self.folder.iterdir():
-            if SHARD_NAME.fullmatch(old.name.removesuffix(".tmp")) and old.name not in ours:
-                old.unlink()
-        for shard in self._shards:
-            (self.folder / f"{shard.file}.tmp").replace(self.folder / shard.file)
-        manifest = Manifest(
-            kind=self.kind,
-            spec=self.spec,
-            arrays=self._arrays,
-            shards=tuple(self._shards),
-            provenance=self.provenance,
-        )
-        write_json(self.folder / MANIFEST, dataclasses.asdict(manifest))
-        return manifest
-
-    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        if error is None:
-            self.close()
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            if self._writer is not None:
+                with suppress(RuntimeError):  # what could not be written is thrown away anyway
+                    self._writer.close()
+            self._place.__exit__(kind, error, trace)
             return
-        if self._writer is not None:
-            self._writer.close()
-            self._temporary().unlink()
-        for shard in self._shards:
-            (self.folder / f"{shard.file}.tmp").unlink()
+        with self._place:
+            self._finish_shard()
+            if not self._shards:
+                raise InputError(f"No record was written to {self.folder}.")
+            _write_manifest(
+                self._temporary,
+                Manifest(
+                    kind=self.kind,
+                    spec=self.spec,
+                    arrays=self._arrays,
+                    shards=tuple(self._shards),
+                    provenance=self.provenance,
+                ),
+            )
 
-    def _temporary(self) -> Path:
-        return self.folder / f"shard-{len(self._shards):05d}.array_record.tmp"
+    def _shard_path(self) -> Path:
+        return self._temporary / f"shard-{len(self._shards):05d}.array_record"
 
     def _finish_shard(self) -> None:
         if self._writer is None:
             return
         self._writer.close()
-        path = self._temporary()
+        path = self._shard_path()
         self._shards.append(
             ShardInfo(
-                file=path.stem,
+                file=path.name,
                 records=self._records,
                 size=path.stat().st_size,
                 sha256=sha256(path),
@@ -237,6 +247,32 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
             for key, array in arrays.items()
         }
         self._arrays = _merge(self._arrays, infos, name)
+
+
+def _check_place(folder: Path, overwrite: bool) -> None:
+    """Raise `InputError` if there is anything in a folder that must not be replaced."""
+    try:
+        names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    except OSError as error:
+        raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
+    if MANIFEST in names and not overwrite:
+        raise InputError(f"{folder} already holds shards. (--overwrite replaces them)")
+    ours = {MANIFEST, LOCK}
+    others = [n for n in names if n not in ours and not SHARD_NAME.fullmatch(n.split(".tmp")[0])]
+    if others:
+        raise InputError(
+            f"{folder} holds other files, such as {quote_text(others[0])}, which would be lost. "
+            "Choose a new or an empty folder. (--out)"
+        )
+
+
+def _write_manifest(folder: Path, manifest: Manifest) -> None:
+    fields = plain(dataclasses.asdict(manifest))
+    write_json(folder / MANIFEST, {**fields, SEAL: _sealed(fields)})
+
+
+def _sealed(fields: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
 def _merge(
@@ -263,9 +299,9 @@ def _merge(
 def gather(parts: Sequence[Path], out: Path) -> Manifest:
     """Make one folder of shards of several, in this order, by renaming; the manifest comes last.
 
-    Every part holds one shard, and all were written with the same kind, spec and provenance. After
-    an interruption the same call goes on. Raises `InputError` naming the parts that are not there,
-    and the shards that are not as their part's manifest says.
+    All parts were written with the same kind, spec and provenance. After an interruption the same
+    call goes on. Raises `InputError` naming the parts that are not there, and the shards that are
+    not as their part's manifest says.
     """
     missing = [part.name for part in parts if not (part / MANIFEST).exists()]
     if missing:
@@ -274,20 +310,22 @@ def gather(parts: Sequence[Path], out: Path) -> Manifest:
             f"{', '.join(missing[:8])}. All processes must write to the same folder. (--out)"
         )
     arrays: dict[str, ArrayInfo] = {}
-    shards, problems = [], []
-    for number, part in enumerate(parts):
+    shards: list[ShardInfo] = []
+    problems = []
+    for part in parts:
         manifest = read_manifest(part)
-        (shard,) = manifest.shards
         arrays = _merge(arrays, manifest.arrays, str(part))
-        shards.append(dataclasses.replace(shard, file=f"shard-{number:05d}.array_record"))
-        if (part / shard.file).exists():
-            (part / shard.file).replace(out / shards[-1].file)
-        for problem in file_problems(out, shards[-1]):
-            problems.append(f"  {problem}: remove {part} to write it again")
+        for shard in manifest.shards:
+            file = f"shard-{len(shards):05d}.array_record"
+            shards.append(dataclasses.replace(shard, file=file))
+            if (part / shard.file).exists():
+                (part / shard.file).replace(out / file)
+            for problem in file_problems(out, shards[-1]):
+                problems.append(f"  {problem}: remove {part} to write it again")
     if problems:
         raise InputError("\n".join([f"{out} cannot be put together:", *problems]))
     manifest = dataclasses.replace(read_manifest(parts[0]), arrays=arrays, shards=tuple(shards))
-    write_json(out / MANIFEST, dataclasses.asdict(manifest))
+    _write_manifest(out, manifest)
     return manifest
 
 
@@ -320,8 +358,8 @@ class ShardReader:
         name = self.name(index)
         try:
             data = self._source[index]
-        except RuntimeError as error:
-            raise RecordError(f"{name} cannot be read: {error}") from error
+        except (RuntimeError, IndexError, ValueError) as error:
+            raise RecordError(f"{name} cannot be read: {quote_text(str(error))}.") from error
         return from_bytes(data, name=name)
 
     def __iter__(self) -> Iterator[Record]:
@@ -339,45 +377,62 @@ class ShardReader:
 def read_manifest(folder: Path) -> Manifest:
     """Read and validate a folder's manifest. Raises `InputError` if there is none, or a bad one."""
     path = folder / MANIFEST
+    if not path.is_file():
+        raise InputError(f"{quote_path(folder)} holds no dataset: there is no {MANIFEST}.")
+    fields = read_json(path)
+    name = quote_path(path)
     try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{folder} holds no dataset: there is no {MANIFEST}.") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
-    try:
-        if fields["version"] != VERSION or fields["kind"] not in get_args(Kind):
-            raise InputError(
-                f"{path} has version {fields['version']} and kind {fields['kind']}; this program "
-                f"reads version {VERSION} and kinds {', '.join(get_args(Kind))}."
-            )
-        shards = tuple(
-            ShardInfo(
-                file=str(shard["file"]),
-                records=int(shard["records"]),
-                size=int(shard["size"]),
-                sha256=str(shard["sha256"]),
-            )
-            for shard in fields["shards"]
+        manifest = _manifest(fields, name)
+    except InputError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        reason = quote_text(f"{type(error).__name__}: {error}")
+        raise InputError(f"{name} is not a manifest of shards: {reason}.") from error
+    sealed = fields.pop(SEAL, None)  # earlier versions have none
+    if sealed not in (None, _sealed(fields)):
+        raise InputError(f"{name} was changed after it was written. Take another copy.")
+    return manifest
+
+
+def _manifest(fields: Any, name: str) -> Manifest:
+    """Build a manifest from JSON. Raises `InputError`, or what a wrong type leads to."""
+    version, kind, spec = fields["version"], fields["kind"], fields["spec"]
+    if type(version) is not int or version != VERSION or kind not in get_args(Kind):
+        raise InputError(
+            f"{name} has version {quote(version)} and kind {quote(kind)}; this program reads "
+            f"version {VERSION} and kinds {', '.join(get_args(Kind))}."
         )
-        unsafe = [shard.file for shard in shards if not SHARD_NAME.fullmatch(shard.file)]
-        if unsafe or not shards or any(shard.records < 1 for shard in shards):
-            raise InputError(
-                f"{path} must name shards like shard-00000.array_record of at least one record, "
-                f"not {', '.join(unsafe) or 'none or empty ones'}."
-            )
-        return Manifest(
-            kind=fields["kind"],
-            spec=None if fields["spec"] is None else VideoSpec(**fields["spec"]),
-            arrays={
-                name: ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
-                for name, info in fields["arrays"].items()
-            },
-            shards=shards,
-            provenance=dict(fields["provenance"]),
+    shards = tuple(ShardInfo(**shard) for shard in fields["shards"])
+    for shard in shards:
+        if not (isinstance(shard.file, str) and isinstance(shard.sha256, str)):
+            raise TypeError("a shard without file or sha256")
+        if not (type(shard.size) is type(shard.records) is int and shard.size < 1 << 48):
+            raise TypeError("a shard whose size or number of records is no count")
+    unsafe = [quote(shard.file) for shard in shards if not SHARD_NAME.fullmatch(shard.file)]
+    files = {shard.file for shard in shards}
+    if unsafe or len(files) < max(1, len(shards)) or any(shard.records < 1 for shard in shards):
+        raise InputError(
+            f"{name} must name different shards like shard-00000.array_record of at least one "
+            f"record, not {', '.join(unsafe[:8]) or 'none, equal or empty ones'}."
         )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} is not a manifest of shards: {error!r}.") from error
+    arrays = {
+        key: ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
+        for key, info in fields["arrays"].items()
+    }
+    axes = [axis for info in arrays.values() for axis in info.shape]
+    if any(axis is not None and (type(axis) is not int or axis < 0) for axis in axes):
+        raise TypeError("a shape that is none")
+    if any(info.dtype not in _DTYPE_NAMES for info in arrays.values()):
+        raise TypeError("a dtype that no record can hold")
+    if spec is not None and not all(type(value) is int for value in spec.values()):
+        raise TypeError("a spec that is not whole numbers")
+    return Manifest(
+        kind=kind,
+        spec=None if spec is None else VideoSpec(**spec),
+        arrays=arrays,
+        shards=shards,
+        provenance=dict(fields["provenance"].items()),
+    )
 
 
 def file_problems(folder: Path, shard: ShardInfo) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from egosim_jax.io.video import decode_image, decode_video, probe_encoded
+from egosim_jax.io.video import Decoding, decode_image, decode_video, probe_encoded
 from egosim_jax.types import InputError, VideoSpec
 
 COLOURS = ("truth", "prior", "hands")
@@ -70,12 +70,18 @@ class DecodeWindow(grain.transforms.RandomMap):
 
 def record_length(arrays: Mapping[str, np.ndarray]) -> int:
     """Frames of a record's prior, encoded or decoded."""
-    prior = arrays["prior"]
+    prior = arrays.get("prior")
+    if prior is None:
+        raise InputError("The record is no clip: it has no prior.")
     return len(prior) if prior.ndim > 1 else probe_encoded(prior.tobytes(), name="prior").frames
 
 
 def decode_record(
-    arrays: Mapping[str, np.ndarray], spec: VideoSpec, *, start: int = 0
+    arrays: Mapping[str, np.ndarray],
+    spec: VideoSpec,
+    *,
+    start: int = 0,
+    decoding: Decoding = "accurate",
 ) -> dict[str, np.ndarray]:
     """Frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
 
@@ -83,10 +89,13 @@ def decode_record(
     """
     stop = start + spec.frames
     decoded: dict[str, np.ndarray] = {}
+    absent = [name for name in ("prior", "hands", "mask", "first_frame") if name not in arrays]
+    if absent:
+        raise InputError(f"The record is no clip: it has no {', '.join(absent)}.")
     for name in (*COLOURS, "mask"):
         if name not in arrays:
             continue
-        frames = _frames(arrays[name], name, start, stop)
+        frames = _frames(arrays[name], name, start, stop, decoding)
         if len(frames) < spec.frames:
             raise InputError(f"{name} ends before frame {stop}.")
         if name == "mask":
@@ -100,10 +109,12 @@ def decode_record(
     return decoded
 
 
-def _frames(array: np.ndarray, name: str, start: int, stop: int) -> np.ndarray:
+def _frames(array: np.ndarray, name: str, start: int, stop: int, decoding: Decoding) -> np.ndarray:
     if array.ndim > 1:
         return array[start:stop]
-    return decode_video(array.tobytes(), start=start, stop=stop, name=name).frames
+    return decode_video(
+        array.tobytes(), start=start, stop=stop, decoding=decoding, name=name
+    ).frames
 
 
 def _resize_all(frames: np.ndarray, height: int, width: int, how: Image.Resampling) -> np.ndarray:

@@ -12,7 +12,7 @@ import os
 import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 from egosim_jax.types import InputError
 
@@ -55,7 +55,7 @@ def read_json(path: Path, *, limit: int = MAX_JSON_BYTES) -> Any:
 
 
 def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
-    """Parse one JSON document in UTF-8.
+    """Parse one JSON document in UTF-8, with or without a byte order mark.
 
     Raises `InputError`, naming `source`, for what is too large or too deep, repeats a name, holds
     half a surrogate pair or is not JSON.
@@ -63,7 +63,7 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     if len(data) > limit:
         raise InputError(f"{source}: {len(data):,} bytes of JSON, more than {limit:,}.")
     try:
-        value = json.loads(data.decode("utf-8"), object_pairs_hook=_unique)
+        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
         if b"\\u" in data:
             _check_surrogates(value)
     except RecursionError:
@@ -73,10 +73,13 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     return value
 
 
-def read_lines(path: Path, *, limit: int = 1 << 30) -> Iterator[tuple[int, Any]]:
+def read_lines(
+    path: Path, *, limit: int = 1 << 30, last: Literal["drop", "read"] = "drop"
+) -> Iterator[tuple[int, Any]]:
     """Parse a file of JSON lines: line numbers from 1, and values; blank lines are passed over.
 
-    Only a line feed ends a line. A last line without one was cut off by a crash and is dropped.
+    Only a line feed ends a line. A `last` line without one was cut off by a crash and is dropped,
+    unless people may have written it.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -87,7 +90,7 @@ def read_lines(path: Path, *, limit: int = 1 << 30) -> Iterator[tuple[int, Any]]
             number += 1
             if len(line) > MAX_JSON_BYTES:
                 raise InputError(f"{name}, line {number} is longer than {MAX_JSON_BYTES:,} bytes.")
-            if line.endswith(b"\n") and line.strip():
+            if (last == "read" or line.endswith(b"\n")) and line.strip():
                 yield number, parse_json(line, source=f"{name}, line {number}")
 
 

@@ -1,40 +1,63 @@
 """Videos and images in and out: uint8 RGB arrays on our side, H.264 and PNG on disk.
 
-Colours cross between RGB and YUV 4:2:0 with accurate rounding and interpolated chroma. The
-scaler's fast default reads every frame about one grey level too dark, an error that would add up
-in a loop that writes clips and reads them back. What is written is tagged BT.601, limited range,
-which is also what readers assume of untagged files.
+Colors cross between RGB and YUV 4:2:0 with accurate rounding and interpolated chroma. The
+scaler's fast default, with which EgoSim's loader reads (`decoding="official"`), gives frames about
+one gray level darker, an error that would add up in a loop that writes clips and reads them back.
+What is written is tagged BT.601, limited range, which is also what readers assume of untagged
+files.
 
-Only file contents are ever opened, never names or addresses that a file may refer to, and what a
-header declares is held against caps before anything is decoded.
+Only the contents of regular files are opened, never names or addresses that a file may refer to,
+and what a header declares is held against caps before anything is decoded. Damage is refused as far
+as it shows: the decoder has to get through without an error, mark no frame as corrupt and give a
+frame for each packet that the container lists. H.264 has no checksum, so a changed bit that leaves
+a valid stream passes. Frames are turned and mirrored as the display matrix says, and those outside
+the edit list are not part of the video, as in every player.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import no_type_check
+from typing import Literal, no_type_check
 
 import av
 import numpy as np
 from av.container import InputContainer
+from av.packet import Packet
+from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, Colorspace, Interpolation
+from av.video.stream import VideoStream
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.boxes import check_boxes
+from egosim_jax.io.untrusted import open_regular, quote_path, quote_text, read_bytes
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000
 """Longest video that is read, in frames, unless the caller says otherwise."""
 MAX_PIXELS = 2**31
-"""Most pixels decoded from one video, frames x height x width: 6 GiB of RGB."""
-MAX_IMAGE_PIXELS = 2**26
-"""Most pixels of one image: 8192 x 8192."""
+"""Most pixels decoded from one video, frames x height x width: some ten seconds."""
+MAX_KEPT = 3 * 2**28
+"""Most bytes of the frames that one reading gives."""
+MAX_IMAGE_PIXELS = 2**25
+"""Most pixels of one image or frame: 8192 x 4096."""
+MAX_IMAGE_BYTES = 2**28
+"""Largest image file that is read."""
+IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
+"""Image formats that are read."""
+
+File = io.BufferedReader | io.BytesIO
+Decoding = Literal["accurate", "official"]
+"""How YUV becomes RGB: accurately, or bit for bit as in EgoSim's loader (imageio's FFmpeg)."""
+Damage = Literal["refuse", "stop"]
+"""What to do where a video is damaged: raise `InputError`, or give the frames before."""
 
 _ACCURATE = (
     Interpolation.BICUBIC
@@ -43,8 +66,21 @@ _ACCURATE = (
     | Interpolation.FULL_CHR_H_INP
     | Interpolation.BITEXACT
 )
+_SCALERS: dict[Decoding, Interpolation] = {
+    "accurate": _ACCURATE,
+    "official": Interpolation.BICUBIC,
+}
 _SMPTE170M, _LIMITED_RANGE = 6, 1
-_CONTAINERS = "mov,mp4,m4a,matroska,webm,avi,mpegts"
+_OPTIONS = {
+    "format_whitelist": "mov,mp4,m4a,matroska,webm,avi,mpegts",
+    "protocol_whitelist": "none",
+    "max_pixels": str(MAX_IMAGE_PIXELS),
+    "err_detect": "crccheck+bitstream+buffer+explode",
+}
+
+
+class DamagedError(InputError):
+    """A video is not whole, or not what was written."""
 
 
 @no_type_check
@@ -67,30 +103,46 @@ class VideoInfo:
     fps: Fraction
 
 
-def probe_video(path: Path) -> VideoInfo:
-    """Count a video's frames and read its size and rate, without decoding.
+def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
+    """Count a video's frames and read its size and rate; only the first frame is decoded.
 
     Raises `InputError` for a file that is missing, unreadable, empty, or above the caps.
     """
     with _open_file(path) as file:
-        return _probe(file, str(path))
+        return _probe(file, quote_path(path), damage)
 
 
 def probe_encoded(data: bytes, *, name: str = "the encoded video") -> VideoInfo:
     """`probe_video` from the bytes of a file; `name` stands for the path in errors."""
-    return _probe(io.BytesIO(data), name)
+    return _probe(io.BytesIO(data), name, "refuse")
 
 
 def read_video(
-    path: Path, *, start: int = 0, stop: int | None = None, max_frames: int = MAX_FRAMES
+    path: Path,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    max_frames: int = MAX_FRAMES,
+    decoding: Decoding = "accurate",
+    damage: Damage = "refuse",
+    each: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Video:
     """Decode frames `start` (inclusive) to `stop` (exclusive; the end if None) of a video file.
 
-    Raises `InputError` for a file that is missing, unreadable, above the caps, or that has no
-    frame in that range. A video that ends before `stop` gives the frames it has.
+    `each` is applied to every frame as it is decoded, for instance to make it smaller. A video
+    that ends before `stop` gives the frames it has. Raises `InputError` for a file that is
+    missing, unreadable, damaged, above the caps, or that has no frame in that range.
     """
     with _open_file(path) as file:
-        return _decode(file, str(path), start=start, stop=stop, max_frames=max_frames)
+        return _decode(
+            file,
+            quote_path(path),
+            frames=slice(start, stop),
+            max_frames=max_frames,
+            decoding=decoding,
+            damage=damage,
+            each=each,
+        )
 
 
 def decode_video(
@@ -99,10 +151,20 @@ def decode_video(
     start: int = 0,
     stop: int | None = None,
     max_frames: int = MAX_FRAMES,
+    decoding: Decoding = "accurate",
+    each: Callable[[np.ndarray], np.ndarray] | None = None,
     name: str = "the encoded video",
 ) -> Video:
     """`read_video` from the bytes of a file; `name` stands for the path in errors."""
-    return _decode(io.BytesIO(data), name, start=start, stop=stop, max_frames=max_frames)
+    return _decode(
+        io.BytesIO(data),
+        name,
+        frames=slice(start, stop),
+        max_frames=max_frames,
+        decoding=decoding,
+        damage="refuse",
+        each=each,
+    )
 
 
 def write_video(
@@ -125,7 +187,7 @@ def encode_video(
     count, height, width, _ = frames.shape
     if count == 0 or height % 2 or width % 2:
         raise InputError(
-            f"{count} frames of {width}x{height} cannot be written: H.264 with 4:2:0 colour needs "
+            f"{count} frames of {width}x{height} cannot be written: H.264 with 4:2:0 color needs "
             "at least one frame and an even width and height."
         )
     buffer = io.BytesIO()
@@ -150,89 +212,209 @@ def encode_video(
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read an image file as RGB. Raises `InputError` if it is missing, unreadable or too large."""
-    with _open_file(path) as file:
-        return _decode_image(file, str(path))
+    """Read an image file as RGB. Raises `InputError` if it is missing, damaged or too large."""
+    return decode_image(read_bytes(path, limit=MAX_IMAGE_BYTES), name=quote_path(path))
 
 
 def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.ndarray, "h w 3"]:
-    """`read_image` from the bytes of a file; `name` stands for the path in errors."""
-    return _decode_image(io.BytesIO(data), name)
+    """`read_image` from the bytes of a file; `name` stands for the path in errors.
+
+    Of 16 bits the upper 8 are taken.
+    """
+    with _refusing(f"{name} is not a readable image"):
+        with Image.open(io.BytesIO(data), formats=IMAGES) as image:
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                raise InputError(
+                    f"{name} has {image.width}x{image.height} pixels, more than "
+                    f"{MAX_IMAGE_PIXELS:,}, the most that is read."
+                )
+            if image.mode in ("I", "F"):
+                raise InputError(f"{name} has 32 bits a channel; save it with 8 or 16.")
+            if image.format == "PNG":
+                image.verify()  # the CRC of every chunk; then it has to be opened again
+        with Image.open(io.BytesIO(data), formats=IMAGES) as image:
+            if image.mode.startswith("I;16"):
+                gray = (np.asarray(image) >> 8).astype(np.uint8)
+                return np.stack([gray] * 3, axis=-1)
+            return np.asarray(image.convert("RGB"))
 
 
-def _probe(file: io.BufferedReader | io.BytesIO, name: str) -> VideoInfo:
-    with _open_video(file, name) as container:
+def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
+    frames, size = 0, None
+    with _open_video(file, name, MAX_FRAMES) as container:
         stream = container.streams.video[0]
-        count = sum(1 for packet in container.demux(stream) if packet.size)
-        if count == 0:
+        try:
+            for packet in _packets(container, name, MAX_FRAMES):
+                frames += packet is not None and not packet.is_discard
+                if size is None:
+                    size = next(
+                        (
+                            _upright(p, np.empty((p.height, p.width))).shape
+                            for p in _decoded(stream, packet, name)
+                        ),
+                        None,
+                    )
+        except DamagedError:
+            if damage == "refuse" or size is None:
+                raise
+        if size is None:
             raise InputError(f"{name} holds no frames.")
-        return VideoInfo(
-            frames=count, height=stream.height, width=stream.width, fps=_rate(container, name)
-        )
+        return VideoInfo(frames=frames, height=size[0], width=size[1], fps=_rate(stream, name))
 
 
 def _decode(
-    file: io.BufferedReader | io.BytesIO,
+    file: File,
     name: str,
     *,
-    start: int,
-    stop: int | None,
+    frames: slice,
     max_frames: int,
+    decoding: Decoding,
+    damage: Damage,
+    each: Callable[[np.ndarray], np.ndarray] | None,
 ) -> Video:
-    frames = []
-    with _open_video(file, name, max_frames=max_frames) as container:
-        stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        area = stream.height * stream.width
-        for index, picture in enumerate(container.decode(stream)):
-            if stop is not None and index >= stop:
-                break
-            _check_size(name, index + 1, area, max_frames)
-            if index >= start:
-                picture = picture.reformat(
-                    width=stream.width,
-                    height=stream.height,
-                    format="rgb24",
-                    interpolation=_ACCURATE,
-                )
-                frames.append(picture.to_ndarray())
-        fps = _rate(container, name)
-    if not frames:
+    kept = np.empty((0,), np.uint8)
+    start, stop, count = frames.start, frames.stop, 0
+    with _open_video(file, name, max_frames) as container:
+        try:
+            for index, picture in enumerate(_pictures(container, name, max_frames)):
+                if stop is not None and index >= stop:
+                    break
+                if index < start:
+                    continue
+                frame = _rgb(picture, decoding)
+                frame = frame if each is None else each(frame)
+                if count == len(kept):
+                    kept = _grown(kept, frame, name)
+                kept[count] = frame
+                count += 1
+        except DamagedError:
+            if damage == "refuse" or not count:
+                raise
+        fps = _rate(container.streams.video[0], name)
+    if not count:
         wanted = f" from frame {start} on" if start else ""
         raise InputError(f"{name} holds no frames{wanted}.")
-    return Video(frames=np.stack(frames), fps=fps)
+    kept.resize((count, *kept.shape[1:]), refcheck=False)
+    return Video(frames=kept, fps=fps)
+
+
+def _grown(kept: np.ndarray, frame: np.ndarray, name: str) -> np.ndarray:
+    """Room for twice as many frames, without a copy."""
+    room = min(max(16, 2 * len(kept)), MAX_KEPT // frame.nbytes)
+    if room <= len(kept):
+        raise InputError(
+            f"{name} has more than {MAX_KEPT:,} bytes of frames ({frame.nbytes:,} each), the most "
+            "that is read at once."
+        )
+    kept.resize((room, *frame.shape), refcheck=False)
+    return kept
+
+
+def _rgb(picture: VideoFrame, decoding: Decoding) -> np.ndarray:
+    picture_rgb = picture.reformat(format="rgb24", interpolation=_SCALERS[decoding])
+    return _upright(picture, picture_rgb.to_ndarray())
+
+
+def _upright(picture: VideoFrame, pixels: np.ndarray) -> np.ndarray:
+    """Turn and mirror pixels as the display matrix (a b u, c d v, x y w) says.
+
+    A point (x, y) is shown at (a x + c y, b x + d y), y downward.
+    """
+    if "DISPLAYMATRIX" not in picture.side_data:
+        return pixels
+    a, b, _, c, d, *_ = np.frombuffer(bytes(picture.side_data["DISPLAYMATRIX"]), np.int32)
+    if (a or d) and (b or c):
+        raise InputError("the video is turned by an angle that is no multiple of 90°.")
+    if b or c:
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+
+
+def _pictures(container: InputContainer, name: str, max_frames: int) -> Iterator[VideoFrame]:
+    """Decode frame after frame. Raises `DamagedError` where the video is not whole."""
+    stream, size = container.streams.video[0], None
+    shown = given = 0
+    for packet in _packets(container, name, max_frames):
+        shown += packet is not None and not packet.is_discard
+        for picture in _decoded(stream, packet, name):
+            size = size or (picture.height, picture.width)
+            if picture.is_corrupt or size != (picture.height, picture.width):
+                raise DamagedError(f"{name} is damaged at frame {given}.")
+            given += 1
+            _check_size(name, given, size[0] * size[1], max_frames)
+            yield picture
+    if given != shown:
+        raise DamagedError(f"{name} is damaged: {given} of its {shown} frames can be decoded.")
+
+
+def _decoded(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
+    with _refusing(f"{name} is damaged", DamagedError):
+        return stream.decode(packet)
+
+
+def _packets(container: InputContainer, name: str, max_frames: int) -> Iterator[Packet | None]:
+    """Read packet after packet, then None, for which the decoder gives what it still holds.
+
+    Raises `DamagedError` at the end if the file was cut off.
+    """
+    stream, read = container.streams.video[0], 0
+    try:
+        with _refusing(f"{name} is damaged", DamagedError):
+            for number, packet in enumerate(container.demux(stream)):
+                _check_size(name, number // 2, 0, max_frames)  # empty ones count, too
+                if packet.is_corrupt:
+                    raise DamagedError(f"{name} is cut off after {read} frames.")
+                if packet.size:
+                    read += 1
+                    yield packet
+    except DamagedError:
+        yield None
+        raise
+    yield None
+    listed = len(stream.index_entries)
+    if read < listed:
+        raise DamagedError(f"{name} is cut off: it holds {read} of the {listed} frames it lists.")
 
 
 @contextmanager
-def _open_file(path: Path) -> Iterator[io.BufferedReader | io.BytesIO]:
+def _open_file(path: Path) -> Iterator[File]:
     """A file opened here, so that no video library ever resolves a name."""
-    try:
-        file = path.open("rb")
-    except FileNotFoundError as error:
-        raise InputError(f"There is no file {path}.") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    with file:
-        if path.stat().st_size == 0:
-            raise InputError(f"{path} is empty (0 bytes).")
+    with open_regular(path) as file:
+        if not os.fstat(file.fileno()).st_size:
+            raise InputError(f"{quote_path(path)} is empty (0 bytes).")
         yield file
 
 
 @contextmanager
-def _open_video(
-    file: io.BufferedReader | io.BytesIO, name: str, *, max_frames: int = MAX_FRAMES
-) -> Iterator[InputContainer]:
-    """A container with a video stream of an allowed size; decoder errors become `InputError`."""
-    limits = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "none"}
+def _open_video(file: File, name: str, max_frames: int) -> Iterator[InputContainer]:
+    """A container with a video stream of an allowed size."""
+    check_boxes(file, name)
+    with _refusing(f"{name} is not a readable video"):
+        container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
+    with container:
+        if not container.streams.video:
+            raise InputError(f"{name} has no video stream.")
+        stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise InputError(f"{name} is of a codec that is not known.")
+        with _refusing(f"{name} is not a readable video"):
+            stream.codec_context.options = _OPTIONS
+            stream.thread_type = "AUTO"
+            area = stream.height * stream.width
+        _check_size(name, stream.frames, area, max_frames)
+        yield container
+
+
+@contextmanager
+def _refusing(what: str, kind: type[InputError] = InputError) -> Iterator[None]:
+    """Whatever a decoder raises about foreign bytes becomes `InputError`."""
     try:
-        with av.open(file, mode="r", options=limits) as container:
-            if not container.streams.video:
-                raise InputError(f"{name} has no video stream.")
-            stream = container.streams.video[0]
-            _check_size(name, stream.frames, stream.height * stream.width, max_frames)
-            yield container
-    except (av.FFmpegError, OSError) as error:
-        raise InputError(f"{name} is not a readable video: {error.strerror}.") from error
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise kind(f"{what}: {quote_text(reason or type(error).__name__)}.") from error
 
 
 def _check_size(name: str, frames: int, area: int, max_frames: int) -> None:
@@ -244,22 +426,8 @@ def _check_size(name: str, frames: int, area: int, max_frames: int) -> None:
         )
 
 
-def _rate(container: InputContainer, name: str) -> Fraction:
-    stream = container.streams.video[0]
+def _rate(stream: VideoStream, name: str) -> Fraction:
     rate = stream.average_rate or stream.guessed_rate
     if not rate:
         raise InputError(f"{name} does not say its frame rate.")
     return rate
-
-
-def _decode_image(file: io.BufferedReader | io.BytesIO, name: str) -> np.ndarray:
-    try:
-        with Image.open(file) as image:
-            if image.width * image.height > MAX_IMAGE_PIXELS:
-                raise InputError(
-                    f"{name} has {image.width}x{image.height} pixels, more than "
-                    f"{MAX_IMAGE_PIXELS:,}, the most that is read."
-                )
-            return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{name} is not a readable image.") from error

@@ -15,16 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.atomic import atomic_folder, atomic_write
+from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.npz import read_arrays
-from egosim_jax.io.untrusted import quote, quote_text, read_json
+from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
+from egosim_jax.state.ply import read_points, write_points
 from egosim_jax.types import InputError, SceneState
 
 VERSION, UNSEALED = 2, 1
 """The version that is written, and the one before it, whose description has no hash."""
 POINTS, DESCRIPTION = "points.npz", "state.json"
 ARRAYS = ("points_m", "colours", "object_ids", "last_seen")
+CHANNELS = ("red", "green", "blue")
 _DTYPES = {"points_m": "float32", "colours": "uint8", "object_ids": "int32", "last_seen": "int32"}
 
 
@@ -153,47 +155,55 @@ def _description(state: SceneState) -> dict[str, Any]:
 
 
 def write_ply(path: Path, state: SceneState) -> None:
-    """The points as binary PLY: x y z, red green blue, object_ids, last_seen."""
-    import open3d as o3d
-
-    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(state.points_m)))
-    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(state.colours))
-    for name in ("object_ids", "last_seen"):
-        column = np.ascontiguousarray(getattr(state, name).reshape(-1, 1))
-        cloud.point[name] = o3d.core.Tensor(column)
-    with atomic_write(path) as temporary:
-        if not o3d.t.io.write_point_cloud(str(temporary), cloud):
-            raise OSError(f"{path} could not be written")
+    """Write the points as binary PLY: x y z, red green blue, object_ids, last_seen."""
+    places = dict(zip("xyz", state.points_m.T, strict=True))
+    colours = dict(zip(CHANNELS, state.colours.T, strict=True))
+    ids = {name: getattr(state, name) for name in ("object_ids", "last_seen")}
+    write_points(path, {**places, **colours, **ids})
 
 
 def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
-    """A state from a PLY of points with colours; what PLY does not say comes from the template.
+    """Read a state from a PLY of colored points; what PLY does not say comes from the template.
 
-    Raises `InputError` if there are no points or no colours.
+    Raises `InputError` if it is damaged, or has no points or no colors.
     """
-    import open3d as o3d
+    points = read_points(path)
+    missing = [
+        name for name in ("x", "y", "z", *CHANNELS) if name not in (points.dtype.names or ())
+    ]
+    if missing:
+        raise InputError(
+            f"{quote_path(path)} holds no points with colors: property {', '.join(missing)} is "
+            "missing."
+        )
+    try:
+        arrays = {
+            "points_m": np.stack([points[name] for name in "xyz"], axis=1).astype(np.float32),
+            "colours": np.stack([_channel(points[name]) for name in CHANNELS], axis=1),
+            "object_ids": _ids(points, "object_ids"),
+            "last_seen": _ids(points, "last_seen"),
+        }
+        if template is not None:
+            return replace(template, **arrays)
+        return SceneState(**arrays, intrinsics_px=np.eye(3), provenance={"read from": path.name})
+    except InputError as error:
+        raise InputError(f"{quote_path(path)}: {error}") from error
 
-    if not path.is_file():
-        raise InputError(f"{path} is not there.")
-    cloud = o3d.t.io.read_point_cloud(str(path))
-    if cloud.is_empty() or "colors" not in cloud.point:
-        raise InputError(f"{path} holds no points with colours.")
-    points = cloud.point.positions.numpy().astype(np.float32)
-    colours = cloud.point.colors.numpy()
-    if colours.dtype != np.uint8:
-        colours = np.clip(np.rint(255 * colours), 0, 255)
 
-    def column(name: str) -> np.ndarray:
-        if name in cloud.point:
-            return cloud.point[name].numpy().reshape(-1).astype(np.int32)
+def _channel(values: np.ndarray) -> np.ndarray:
+    """Levels of 0 to 255, from bytes or from floats of 0 to 1."""
+    if values.dtype == np.uint8:
+        return values
+    if values.dtype.kind != "f" or not ((values >= 0) & (values <= 1)).all():
+        raise InputError("Colors must be uchar, or float from 0 to 1. Save the PLY with uchar.")
+    return np.rint(255 * values).astype(np.uint8)
+
+
+def _ids(points: np.ndarray, name: str) -> np.ndarray:
+    if name not in (points.dtype.names or ()):
         return np.zeros(len(points), np.int32)
-
-    arrays = {
-        "points_m": points,
-        "colours": colours.astype(np.uint8),
-        "object_ids": column("object_ids"),
-        "last_seen": column("last_seen"),
-    }
-    if template is not None:
-        return replace(template, **arrays)
-    return SceneState(**arrays, intrinsics_px=np.eye(3), provenance={"read from": path.name})
+    values = points[name]
+    limits = np.iinfo(np.int32)
+    if values.dtype.kind not in "iu" or values.max() > limits.max:
+        raise InputError(f"Property {name} must be int.")
+    return values.astype(np.int32)

@@ -1,6 +1,7 @@
 """Latents that are encoded once: whole, and the same however they were made."""
 
 import dataclasses
+import io
 import json
 import os
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from safetensors.numpy import load_file, save_file
 
 from egosim_jax import configs
@@ -19,6 +21,7 @@ from egosim_jax.data import shards
 from egosim_jax.data.check import check
 from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, read_manifest
 from egosim_jax.generator import Networks
+from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.train import cache as caching
 from egosim_jax.train.cache import cache, check_encoders
@@ -90,11 +93,18 @@ def test_every_window_is_a_record_in_order(encoded):
     assert not (encoded / "parts").exists()
 
 
+def test_frames_are_not_decoded_again(source, weights, tmp_path):
+    with pytest.raises(InputError, match=r"decoding is 'accurate', not official\. Pack"):
+        encode(source, weights, tmp_path / "out", decoding="official")
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_manifest_names_what_made_the_arrays_alone(encoded, source, weights):
     assert read_manifest(encoded).provenance == {
         "config": "debug",
         "source": source.manifest.fingerprint,
         "encoders": {"vae": hashes(weights)["vae"]},
+        "decoding": "accurate",
     }
 
 
@@ -276,3 +286,23 @@ def test_the_command_goes_on_after_a_kill(weights, tmp_path):
     first, second = read_manifest(out), read_manifest(tmp_path / "whole")
     assert first == second
     assert json.loads((out / "config.json").read_text("utf-8"))["config"] == "debug"
+
+
+def test_the_decoding_of_videos_is_recorded(weights, tmp_path):
+    clip = np.random.default_rng(0).integers(0, 256, (5, 16, 32, 3)).astype(np.uint8)
+    videos = {
+        name: np.frombuffer(encode_video(clip, 16), np.uint8)
+        for name in ("truth", "prior", "hands", "mask")
+    }
+    png = io.BytesIO()
+    Image.fromarray(clip[0]).save(png, "PNG")
+    videos["first_frame"] = np.frombuffer(png.getvalue(), np.uint8)
+    with ShardWriter(tmp_path / "videos", kind="videos") as writer:
+        writer.add(videos, {"video_id": "a", "prompt": "take it"})
+    truths = {}
+    for decoding in ("accurate", "official"):
+        out = tmp_path / decoding
+        encode(ShardReader(tmp_path / "videos"), weights, out, decoding=decoding, batch_size=1)
+        assert read_manifest(out).provenance["decoding"] == decoding
+        truths[decoding] = ShardReader(out)[0].arrays["truth"]
+    assert (truths["accurate"] != truths["official"]).any()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+import shutil
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from egosim_jax.data.pack import triplet_record
-from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
+from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, gather, to_bytes
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
 from egosim_jax.types import InputError, Kind, VideoSpec
@@ -53,6 +54,7 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
     parts = out / "parts"
     open_folder(out, plan)
     if (out / MANIFEST).exists():
+        shutil.rmtree(parts, ignore_errors=True)
         yield from plan.seeds
         return
     parts.mkdir(exist_ok=True)
@@ -85,12 +87,13 @@ def _part(parts: Path, seed: int, number: int) -> Path:
 
 def _gather(plan: Plan, parts: Path, out: Path) -> None:
     """Put the parts into shards, in the order of the plan, and remove them."""
-    paths: Sequence[Path] = [_part(parts, s, n) for s in plan.seeds for n in range(plan.clips)]
     provenance = {"world": "tabletop", "kind": plan.kind, "seeds": list(plan.seeds)}
-    with ShardWriter(out, kind="frames", spec=plan.spec, provenance=provenance) as writer:
-        for path in paths:
+    whole = parts / "shards"
+    with ShardWriter(
+        whole, kind="frames", spec=plan.spec, provenance=provenance, overwrite=True
+    ) as writer:
+        for path in (_part(parts, s, n) for s in plan.seeds for n in range(plan.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)
             writer.add(record.arrays, record.metadata)
-    for path in paths:
-        path.unlink()
-    parts.rmdir()
+    gather([whole], out)
+    shutil.rmtree(parts)

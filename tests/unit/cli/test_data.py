@@ -1,12 +1,19 @@
 """`egosim data`: pack, check and stats, with their exit codes."""
 
+import os
+import resource
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from egosim_jax.cli.data import Check, Look, Pack, Stats
-from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.command import DONE, FAILED, PARTIAL, USAGE, guarded
 from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.io.atomic import LOCK, hold_folder
+from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError, VideoSpec
 
 
@@ -46,7 +53,10 @@ def test_pack_takes_the_selected_rows(clips, out):
 def test_pack_leaves_a_bad_clip_out_and_says_so(clips, out, capsys):
     (clips.parent / "clip0" / "pc_mask_video.mp4").unlink()
     assert Pack(metadata=clips, out=out).run() == PARTIAL
-    assert "left out: metadata.csv line 2 (clip0): There is no file" in capsys.readouterr().err
+    assert (
+        f"left out: metadata.csv line 2 (clip0): {clips.parent}/clip0/pc_mask_video.mp4 cannot"
+        in capsys.readouterr().err
+    )
     assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
 
 
@@ -55,7 +65,7 @@ def test_pack_of_bad_clips_alone_is_refused_and_leaves_nothing(clips, out):
         (clips.parent / name / "video.mp4").unlink()
     with pytest.raises(InputError, match="None of the 2 clips could be packed"):
         Pack(metadata=clips, out=out).run()
-    assert list(out.iterdir()) == []
+    assert [path.name for path in out.iterdir()] == [LOCK]
 
 
 def test_pack_refuses_to_replace_shards_unasked(clips, out):
@@ -125,3 +135,112 @@ def test_look_refuses_unknown_columns_and_latents(clips, out, tmp_path):
         writer.add({"truth": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a", "prompt": "b"})
     with pytest.raises(InputError, match="holds latents"):
         Look(shards=latents, out=tmp_path / "sheet.png").run()
+
+
+BAD_CLIPS = {
+    "unknown codec": lambda path: path.write_bytes(
+        path.read_bytes().replace(b"avc1", b"zzz9").replace(b"avcC", b"zzzC")
+    ),
+    "pipe": lambda path: (path.unlink(), os.mkfifo(path)),
+    "folder": lambda path: (path.unlink(), path.mkdir()),
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-300]),
+}
+
+
+@pytest.mark.parametrize("how", BAD_CLIPS)
+def test_one_bad_clip_does_not_end_the_batch(clips, out, capsys, how):
+    BAD_CLIPS[how](clips.parent / "clip0" / "hand_keypoint_video.mp4")
+    assert Pack(metadata=clips, out=out).run() == PARTIAL
+    assert "left out: metadata.csv line 2 (clip0)" in capsys.readouterr().err
+    assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
+
+
+def test_a_nul_in_a_path_does_not_end_the_batch(clips, out, capsys):
+    text = clips.read_text().replace("clip0/ego_prior_video.mp4", "clip0/ego\0.mp4")
+    clips.write_text(text)
+    assert Pack(metadata=clips, out=out).run() == PARTIAL
+    assert "null byte" in capsys.readouterr().err
+    assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
+
+
+def test_official_decoding_is_packed_and_recorded(clips, out):
+    Pack(metadata=clips, out=out, size=(32, 48), num_frames=9, decoding="official").run()
+    reader = ShardReader(out)
+    assert reader.manifest.provenance["decoding"] == "official"
+    official = read_video(clips.parent / "clip0" / "ego_prior_video.mp4", decoding="official")
+    np.testing.assert_array_equal(reader[0].arrays["prior"], official.frames)
+
+
+def test_packing_over_other_files_is_refused(clips, out):
+    out.mkdir()
+    (out / "thesis.tex").write_text("years of work")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match=r"holds other files, such as thesis\.tex"):
+            Pack(metadata=clips, out=out, overwrite=overwrite).run()
+    assert (out / "thesis.tex").exists()
+
+
+def refused(command, capsys):
+    """Exit code, and the last of what is printed, which must not be a traceback."""
+    code = guarded(command.run)
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return code, error.splitlines()[-1]
+
+
+def test_a_file_where_a_folder_has_to_be_is_one_line(clips, out, tmp_path, capsys):
+    out.write_text("a file")
+    code, line = refused(Pack(metadata=clips, out=out), capsys)
+    assert code == USAGE
+    assert "Not a directory" in line
+    code, line = refused(Check(shards=out), capsys)
+    assert code == USAGE
+    assert "holds no dataset" in line
+    for command in (Stats(shards=clips), Look(shards=clips, out=tmp_path / "a.png")):
+        assert refused(command, capsys)[0] == USAGE
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is read-only for root")
+def test_a_read_only_folder_is_one_line(clips, tmp_path, capsys):
+    (tmp_path / "fixed").mkdir(mode=0o555)
+    code, line = refused(Pack(metadata=clips, out=tmp_path / "fixed" / "shards"), capsys)
+    assert code == FAILED
+    assert "Permission denied" in line
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_old_dataset(clips, out, capsys):
+    Pack(metadata=clips, out=out).run()
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        code, line = refused(Pack(metadata=clips, out=out, overwrite=True), capsys)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == FAILED
+    assert "File too large" in line
+    after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != LOCK}
+    assert after == before
+    assert {path.name for path in out.parent.iterdir() if "tmp" in path.name} == set()
+
+
+def test_a_second_process_on_the_same_folder_is_one_line(clips, out):
+    hold_folder(out)
+    program = (
+        "import sys; from pathlib import Path; from egosim_jax.cli.data import Pack; "
+        "from egosim_jax.command import guarded; "
+        "sys.exit(guarded(Pack(metadata=Path(sys.argv[1]), out=Path(sys.argv[2])).run))"
+    )
+    command = [sys.executable, "-c", program, str(clips), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == USAGE
+    assert f"in use by another process (PID {os.getpid()})" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_missing_files_are_refused_before_anything_is_written(clips, out):
+    for folder in ("clip0", "clip1"):
+        (clips.parent / folder / "ego_prior_video.mp4").unlink()
+    with pytest.raises(InputError, match="No prior video of the 2 clips is there"):
+        Pack(metadata=clips, out=out).run()
+    assert not out.exists()

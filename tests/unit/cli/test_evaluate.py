@@ -97,7 +97,9 @@ def test_a_clip_that_failed_is_left_out_and_named(clips, run, capsys):
 def test_a_missing_clip_is_left_out_and_named(clips, run, capsys):
     (run / "clip0.mp4").unlink()
     assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
-    assert "left out: clip0: There is no file" in capsys.readouterr().err
+    assert (
+        f"left out: clip0: {run / 'clip0.mp4'} cannot be read: No such" in capsys.readouterr().err
+    )
 
 
 def test_rows_are_selected_by_column(clips, run):
@@ -116,8 +118,10 @@ def test_the_report_has_definitions_and_a_summary_for_each_split(clips, run, tmp
 
 
 def test_a_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
-    write_video(run / "clip0.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
-    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    for name in ("clip0", "clip1"):
+        write_video(run / f"{name}.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
+    with pytest.raises(InputError, match="could be compared"):
+        Evaluate(generated=run, metadata=clips).run()
     assert "ends before frame 13" in capsys.readouterr().err
 
 
@@ -131,3 +135,47 @@ def test_metadata_without_truth_is_refused(clips, run):
 def test_a_missing_folder_is_refused(clips, tmp_path):
     with pytest.raises(InputError, match="There is no folder"):
         Evaluate(generated=tmp_path / "none", metadata=clips).run()
+
+
+def test_a_clip_of_fewer_frames_is_left_out_and_named(clips, run, capsys):
+    write_video(run / "clip0.mp4", truth(clips, "clip0")[:5], 16)
+    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert "left out: clip0: it has 5 frames, most clips 9." in capsys.readouterr().err
+    assert list(metrics(run)) == ["clip1"]
+
+
+def test_the_report_names_the_protocol(clips, run, capsys):
+    for name in ("clip0", "clip1"):
+        write_video(run / f"{name}.mp4", truth(clips, name)[:, ::2, :32], 16)
+    Evaluate(generated=run, metadata=clips).run()
+    protocol = json.loads((run / "report.json").read_text())["protocol"]
+    assert (protocol["size"], protocol["pixels"], protocol["frames"]) == (
+        "output",
+        ["32x16"],
+        [1, 8],
+    )
+    assert "LANCZOS" in protocol["resize"]
+    assert "frames 1 to 8 at the size of the output: 32x16" in capsys.readouterr().out
+
+
+def test_methods_of_different_size_compare_at_the_size_of_the_truth(clips, run, tmp_path):
+    small = tmp_path / "small"
+    for name in ("clip0", "clip1"):
+        write_video(small / f"{name}.mp4", read_video(run / f"{name}.mp4").frames[:, ::2, ::3], 16)
+    for folder in (run, small):
+        Evaluate(generated=folder, metadata=clips, size="truth").run()
+    assert json.loads((small / "report.json").read_text())["protocol"]["pixels"] == ["48x32"]
+    for method in ("prior", "still"):  # of which neither depends on what was generated
+        assert metrics(small)["clip0"][method] == metrics(run)["clip0"][method]
+    Evaluate(generated=small, metadata=clips).run()
+    assert metrics(small)["clip0"]["prior"] != metrics(run)["clip0"]["prior"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["[]", '{"video_id": "../../x"}', '{"video_id": 3}', '{"video_id": "a", "start": "x"}', "{"],
+)
+def test_results_that_are_none_are_refused(clips, run, line):
+    (run / "results.jsonl").write_text(line + "\n")
+    with pytest.raises(InputError, match=r"results\.jsonl, line 1"):
+        Evaluate(generated=run, metadata=clips).run()

@@ -1,7 +1,10 @@
 """Reading a clip at a model's length and size, strictly or as the EgoSim release does."""
 
 import dataclasses
+import io
+import os
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -85,7 +88,9 @@ def test_a_sound_clip_has_no_problems(files):
 def test_strict_refuses_a_missing_file_by_row_and_path(files, name):
     path = getattr(files, name)
     path.unlink()
-    assert check_clip(files, NATIVE) == [f"metadata.csv line 2 (clip0): There is no file {path}."]
+    assert check_clip(files, NATIVE) == [
+        f"metadata.csv line 2 (clip0): {path} cannot be read: No such file or directory."
+    ]
 
 
 def test_every_missing_file_is_listed(files):
@@ -164,7 +169,7 @@ def test_lenient_does_without_a_missing_truth(files):
 
 def test_lenient_still_refuses_a_missing_prior(files):
     files.prior.unlink()
-    with pytest.raises(InputError, match="There is no file"):
+    with pytest.raises(InputError, match="No such file"):
         load_triplet(files, NATIVE, policy="lenient")
 
 
@@ -204,3 +209,73 @@ def test_clips_that_were_written_are_read_back(tmp_path):
         for name in ("prior", "hands", "truth"):
             gap = getattr(back, name).astype(float) - getattr(triplet, name)
             assert np.abs(gap).mean() < 6
+
+
+def cut_off(path):
+    """Leave the first half of a video whose header comes first."""
+    with av.open(io.BytesIO(path.read_bytes())) as old:
+        path.unlink()
+        with av.open(str(path), "w", options={"movflags": "faststart"}) as new:
+            stream = new.add_stream_from_template(old.streams.video[0])
+            for packet in old.demux(video=0):
+                if packet.size:
+                    packet.stream = stream
+                    new.mux(packet)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 2 // 3])
+
+
+def test_strict_refuses_a_video_that_was_cut_off(files):
+    cut_off(files.hands)
+    (problem,) = check_clip(files, NATIVE)
+    assert "metadata.csv line 2 (clip0)" in problem
+    assert "is cut off" in problem
+
+
+def test_lenient_says_how_many_frames_of_a_cut_off_video_are_missing(files, caplog):
+    cut_off(files.hands)
+    triplet = load_triplet(files, NATIVE, policy="lenient")
+    have = len(read_video(files.hands, damage="stop").frames)
+    assert 0 < have < 9
+    np.testing.assert_array_equal(triplet.hands[have], triplet.hands[-1])
+    assert f"{9 - have} of 9 frames are missing in {files.hands}" in caplog.text
+
+
+def test_lenient_says_how_many_frames_a_short_video_lacks(files, caplog):
+    shorten(files.prior, 5)
+    load_triplet(files, NATIVE, policy="lenient")
+    assert f"4 of 9 frames are missing in {files.prior}" in caplog.text
+
+
+def test_damage_behind_the_first_frame_is_refused_by_row(files):
+    data = bytearray(files.hands.read_bytes())
+    end = data.index(b"moov") - 4
+    data[end - 60 : end] = bytes(60)
+    files.hands.write_bytes(bytes(data))
+    with pytest.raises(InputError, match=r"metadata\.csv line 2 \(clip0\).*damaged"):
+        load_triplet(files, NATIVE)
+
+
+def test_a_clip_may_be_larger_than_memory_should_hold(files, monkeypatch):
+    whole = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=16))
+    monkeypatch.setattr("egosim_jax.io.video.MAX_KEPT", 9 * 16 * 16 * 3)
+    again = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=16))
+    np.testing.assert_array_equal(again.prior, whole.prior)
+
+
+def test_official_decoding_is_darker(files):
+    accurate = load_triplet(files, NATIVE)
+    official = load_triplet(files, NATIVE, decoding="official")
+    np.testing.assert_array_equal(
+        official.prior, read_video(files.prior, decoding="official").frames
+    )
+    assert (accurate.prior.astype(float) - official.prior).mean() > 0.2
+
+
+@pytest.mark.parametrize("name", ["prior", "first_frame"])
+def test_a_pipe_or_a_name_with_nul_is_a_problem_of_its_clip(files, name):
+    pipe = files.prior.parent / "pipe.mp4"
+    os.mkfifo(pipe)
+    for path in (pipe, pipe.with_name("a\0.mp4")):
+        (problem,) = check_clip(dataclasses.replace(files, **{name: path}), NATIVE)
+        assert "not a regular file" in problem or "null" in problem

@@ -1,10 +1,13 @@
 """What a metadata file says, and every way in which it can be wrong."""
 
+import dataclasses
 import json
+import os
+import time
 
 import pytest
 
-from egosim_jax.data.metadata import read_metadata, select
+from egosim_jax.data.metadata import check_presence, read_metadata, select
 from egosim_jax.types import InputError
 
 HEADER = "video,ego_prior_video,hand_keypoint_video,first_frame,prompt,video_id,split"
@@ -53,7 +56,7 @@ def test_json_lines_say_the_same_as_csv(write):
     row = dict(zip(HEADER.split(","), ROW.split(","), strict=True))
     (from_json,) = read_metadata(write("", json.dumps(row), name="metadata.jsonl"))
     (from_csv,) = read_metadata(write(HEADER, ROW))
-    assert vars(from_json) == {**vars(from_csv), "row": "metadata.jsonl line 2"}
+    assert from_json == dataclasses.replace(from_csv, row="metadata.jsonl line 2")
 
 
 def test_a_prompt_may_hold_commas_and_line_breaks(write):
@@ -69,8 +72,8 @@ def test_a_byte_order_mark_is_no_part_of_the_first_column(write):
 
 
 def test_all_missing_columns_are_listed(write):
-    with pytest.raises(InputError, match="no column hand_keypoint_video, first_frame"):
-        read_metadata(write("video,ego_prior_video,prompt,video_id", "v.mp4,p.mp4,x,a"))
+    with pytest.raises(InputError, match="no column ego_prior_video, prompt, video_id"):
+        read_metadata(write("hand_keypoint_video,first_frame", "h.mp4,f.png"))
 
 
 @pytest.mark.parametrize("cell", ["", "  ", "nan", "NaN"])
@@ -88,7 +91,10 @@ def test_null_is_an_empty_cell(write):
         read_metadata(write(json.dumps({**row, "prompt": None}), name="metadata.jsonl"))
 
 
-@pytest.mark.parametrize("video_id", ["a/b", "../a", ".a", "a b", "a\\b", "é", "a" * 201])
+@pytest.mark.parametrize(
+    "video_id",
+    ["../a", "a/../b", "/a", "a/", "a//b", "a.mp4/b", ".a", "a b", "a\\b", "é", "a" * 201],
+)
 def test_an_id_that_cannot_name_a_file_is_refused(write, video_id):
     with pytest.raises(InputError, match=r"line 2: video_id .* cannot name a file"):
         read_metadata(write(HEADER, _other(video_id)))
@@ -101,7 +107,7 @@ def test_a_repeated_id_is_named_with_both_lines(write):
 
 def test_every_problem_is_listed_at_once(write):
     with pytest.raises(InputError) as caught:
-        read_metadata(write(HEADER, _other("a/b"), ROW.replace("pick it up", "")))
+        read_metadata(write(HEADER, _other("a b"), ROW.replace("pick it up", "")))
     assert "line 2" in str(caught.value)
     assert "line 3" in str(caught.value)
 
@@ -113,7 +119,7 @@ def test_every_problem_is_listed_at_once(write):
         ([HEADER, ROW + ",more"], "m.csv", "line 2: 8 cells, but the header has 7"),
         ([HEADER + ",split", ROW + ",x"], "m.csv", "more than one column split"),
         ([HEADER, '"open'], "m.csv", "cannot be read as CSV"),
-        (["{"], "m.jsonl", "line 1 is not JSON"),
+        (["{"], "m.jsonl", "line 1 is not valid JSON"),
         (["[]"], "m.jsonl", "line 1 is not a JSON object"),
         (["{}"], "m.jsonl", "line 1: no column ego_prior_video"),
     ],
@@ -169,3 +175,73 @@ def test_a_mistyped_id_gets_the_nearest_name(write):
 
 def _other(video_id, split="train"):
     return f"v.mp4,p.mp4,h.mp4,f.png,pick it up,{video_id},{split}"
+
+
+def test_the_minimal_columns_of_egosim_are_enough(write, tmp_path):
+    (item,) = read_metadata(
+        write("video,ego_prior_video,prompt", "part1/pour/7.mp4,renders/7/ego_prior.mp4,pour")
+    )
+    assert item.video_id == "part1_pour_7"
+    assert item.hands == tmp_path / "renders/7/hand_kp_video.mp4"
+    assert item.first_frame == tmp_path / "renders/7/hand_inpaint.png"
+    assert item.mask == tmp_path / "renders/7/pc_mask_video.mp4"
+    assert item.truth == tmp_path / "part1/pour/7.mp4"
+    assert item.extra == {}
+
+
+def test_an_id_with_slashes_is_taken(write):
+    (item,) = read_metadata(write(HEADER, _other("358/683347-001/clip.7")))
+    assert item.video_id == "358/683347-001/clip.7"
+
+
+def test_only_a_line_feed_ends_a_json_line(write):
+    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True)) | {"prompt": "a\u2028b\x85c"}
+    line = json.dumps(row, ensure_ascii=False)
+    (item,) = read_metadata(write(line, name="m.jsonl"))
+    assert item.prompt == "a\u2028b\x85c"
+
+
+def test_a_last_json_line_without_a_line_feed_counts(tmp_path):
+    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True))
+    lines = [json.dumps(row), json.dumps(row | {"video_id": "b"})]
+    (tmp_path / "m.jsonl").write_text("\n".join(lines), encoding="utf-8-sig")
+    assert [item.video_id for item in read_metadata(tmp_path / "m.jsonl")] == ["a", "b"]
+
+
+@pytest.mark.parametrize("value", [["a"], {"a": 1}])
+def test_a_cell_that_is_no_text_is_refused(write, value):
+    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True)) | {"prompt": value}
+    with pytest.raises(InputError, match="not text or a number"):
+        read_metadata(write(json.dumps(row), name="m.jsonl"))
+
+
+@pytest.mark.parametrize("name", ["m.csv", "m.jsonl"])
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff\xfe", b"\0" * 99, b"[" * 100_000, b'"' + b"a" * 200_000 + b'"\n']
+)
+def test_bytes_that_are_no_metadata_are_refused_in_short(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        read_metadata(tmp_path / name)
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_pipe_is_refused_without_waiting_for_it(tmp_path):
+    os.mkfifo(tmp_path / "m.csv")
+    with pytest.raises(InputError, match="not a regular file"):
+        read_metadata(tmp_path / "m.csv")
+
+
+def test_a_hundred_thousand_missing_files_are_refused_at_once(write):
+    items = read_metadata(write("video,ego_prior_video,prompt", "v.mp4,p.mp4,x"))
+    many = [dataclasses.replace(items[0], video_id=str(n)) for n in range(1000)] * 100
+    then = time.monotonic()
+    with pytest.raises(InputError, match=r"No prior video of the 100,000 clips is there: .*, …"):
+        check_presence(many)
+    assert time.monotonic() - then < 5
+
+
+def test_only_the_first_of_many_problems_are_listed(write):
+    with pytest.raises(InputError, match="and 980 more") as caught:
+        read_metadata(write(HEADER, *[_other(f"a b{n}") for n in range(1000)]))
+    assert len(str(caught.value).splitlines()) == 22

@@ -1,15 +1,18 @@
 """Shards: what goes in comes out bit for bit, and what is broken is named."""
 
 import json
+import os
 import pickle
 
 import ml_dtypes
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from egosim_jax.data.check import check
 from egosim_jax.data.shards import (
     MANIFEST,
+    SEAL,
     Record,
     RecordError,
     ShardReader,
@@ -50,6 +53,7 @@ def folder(tmp_path):
 
 def rewrite_manifest(folder, change):
     fields = json.loads((folder / MANIFEST).read_text())
+    del fields[SEAL]  # as in a manifest of an earlier version, or of a liar
     change(fields)
     (folder / MANIFEST).write_text(json.dumps(fields))
 
@@ -205,8 +209,11 @@ def test_the_old_shards_stay_until_the_new_ones_are_whole(folder):
 
 
 def test_writing_no_record_is_refused(tmp_path):
-    with pytest.raises(InputError, match="No record was written"):
-        ShardWriter(tmp_path, kind="latents").close()
+    with (
+        pytest.raises(InputError, match="No record was written"),
+        ShardWriter(tmp_path, kind="latents"),
+    ):
+        pass
 
 
 def test_sound_shards_have_no_problems(folder):
@@ -263,7 +270,7 @@ def test_check_names_a_file_that_is_no_array_record(folder):
 @pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "shard-1.array_record", ""])
 def test_a_manifest_that_names_other_paths_is_refused(folder, name):
     rewrite_manifest(folder, lambda fields: fields["shards"][0].update(file=name))
-    with pytest.raises(InputError, match="must name shards like"):
+    with pytest.raises(InputError, match="must name different shards like"):
         ShardReader(folder)
 
 
@@ -279,7 +286,7 @@ def test_a_shard_that_is_a_link_is_refused(folder):
     ("change", "message"),
     [
         (lambda fields: fields.update(version=2), "version 2"),
-        (lambda fields: fields.update(kind="pickles"), "kind pickles"),
+        (lambda fields: fields.update(kind="pickles"), "kind 'pickles'"),
         (lambda fields: fields.pop("shards"), "is not a manifest"),
         (lambda fields: fields.update(shards=[]), "at least one record"),
         (lambda fields: fields["shards"][0].update(records=0), "at least one record"),
@@ -296,7 +303,7 @@ def test_a_bad_manifest_is_refused(folder, change, message):
 
 def test_a_manifest_that_is_not_json_is_refused(folder):
     (folder / MANIFEST).write_text("{")
-    with pytest.raises(InputError, match=r"manifest\.json cannot be read"):
+    with pytest.raises(InputError, match=r"manifest\.json is not valid JSON"):
         read_manifest(folder)
 
 
@@ -357,3 +364,105 @@ def test_check_decodes_every_image(tmp_path):
     with ShardWriter(tmp_path, kind="videos") as writer:
         writer.add({"first_frame": np.zeros(99, np.uint8)}, {"video_id": "a"})
     assert "first_frame is not a readable image" in problems(tmp_path)[0]
+
+
+def test_the_old_dataset_is_there_until_the_new_one_takes_its_place(folder, monkeypatch):
+    """Stop at every step on the disk: what is there is the old dataset or the new one."""
+    steps, seen, stop = 0, set(), 0
+
+    def counted(name):
+        real = getattr(os, name)
+
+        def call(*arguments, **options):
+            nonlocal steps
+            seen.add(tuple(record.metadata["video_id"] for record in ShardReader(folder)))
+            steps += 1
+            if steps == stop:
+                raise KeyboardInterrupt
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(os, name, call)
+
+    for name in ("fsync", "mkdir", "rename", "replace", "unlink"):
+        counted(name)
+    old = tuple(f"clip{index}" for index in range(7))
+    while stop < 40:
+        stop, steps = stop + 1, 0
+        try:
+            with ShardWriter(folder, kind="latents", overwrite=True) as writer:
+                writer.add(latents(9), {"video_id": "new"})
+        except KeyboardInterrupt:
+            continue
+        break
+    assert seen <= {old, ("new",)}
+    assert old in seen
+    assert 3 < stop < 40
+
+
+def test_every_file_reaches_the_disk_once(tmp_path, monkeypatch):
+    synced = []
+    real = os.fsync
+    monkeypatch.setattr(
+        os, "fsync", lambda fd: (synced.append(os.readlink(f"/proc/self/fd/{fd}")), real(fd))
+    )
+    with ShardWriter(tmp_path / "shards", kind="latents", shard_bytes=4000) as writer:
+        for index in range(3):
+            writer.add(latents(index), {"video_id": str(index)})
+    shards = [name for name in synced if name.endswith(".array_record")]
+    assert len(shards) == len(set(shards)) == 3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda fields: fields["provenance"].update(vae="abd"),
+        lambda fields: fields["shards"][0].update(sha256="0" * 64),
+        lambda fields: fields["spec"].update(frames=13),
+        lambda fields: fields["arrays"]["truth"].update(shape=[None]),
+        lambda fields: fields["shards"].reverse(),
+    ],
+)
+def test_a_changed_manifest_is_named(folder, change):
+    fields = json.loads((folder / MANIFEST).read_text())
+    change(fields)
+    (folder / MANIFEST).write_text(json.dumps(fields))
+    with pytest.raises(InputError, match="was changed after it was written"):
+        read_manifest(folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda fields: fields["shards"][0].update(records="4"),
+        lambda fields: fields["shards"][0].update(size=1e300),
+        lambda fields: fields["shards"].append(fields["shards"][0]),
+        lambda fields: fields["arrays"]["truth"].update(shape=["x"]),
+        lambda fields: fields["arrays"]["truth"].update(dtype=["x"]),
+        lambda fields: fields["spec"].update(frames="9"),
+        lambda fields: fields.update(provenance=[]),
+        lambda fields: fields.update(kind=["latents"]),
+        lambda fields: fields.update(version=[1]),
+        lambda fields: fields.update(spec=[1]),
+    ],
+)
+def test_a_manifest_of_wrong_types_is_refused(folder, change):
+    rewrite_manifest(folder, change)
+    with pytest.raises(InputError):
+        read_manifest(folder)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", '{"version": 1}', "[" * 100_000, "\ud800"])
+def test_what_is_no_manifest_is_refused(folder, text):
+    (folder / MANIFEST).write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(InputError):
+        read_manifest(folder)
+
+
+@pytest.mark.parametrize(
+    "metadata", [[], {"video_id": 3}, {"extra": []}, {"extra": {"a": 1}}, {"prompt": None}]
+)
+def test_a_record_of_wrong_types_is_refused(metadata):
+    header = {"json": json.dumps(metadata)}
+    data = safetensors.numpy.save({"x": np.zeros(2, np.float32)}, metadata=header)
+    with pytest.raises(RecordError, match="is not a record"):
+        from_bytes(data)

@@ -1,5 +1,10 @@
 """Videos and images in and out, and what is refused."""
 
+import io
+import os
+import struct
+import tempfile
+import zlib
 from fractions import Fraction
 
 import av
@@ -9,8 +14,10 @@ from PIL import Image
 
 from egosim_jax.io import video as video_io
 from egosim_jax.io.video import (
+    decode_image,
     decode_video,
     encode_video,
+    probe_encoded,
     probe_video,
     read_image,
     read_video,
@@ -18,8 +25,8 @@ from egosim_jax.io.video import (
 )
 from egosim_jax.types import InputError
 
-# 4:2:0 halves the colour resolution, so only smooth colours come back; x264 at crf 10 and the
-# rounding to limited range (219 levels) then stay within this many grey levels.
+# 4:2:0 halves the color resolution, so only smooth colors come back; x264 at crf 10 and the
+# rounding to limited range (219 levels) then stay within this many gray levels.
 LEVELS = 6
 
 
@@ -36,12 +43,12 @@ def test_a_written_video_reads_back(tmp_path):
     assert np.abs(back.frames.astype(int) - frames).max() <= LEVELS
 
 
-def test_reading_and_writing_shift_no_colour_on_average():
+def test_reading_and_writing_shift_no_color_on_average():
     rng = np.random.default_rng(0)
     cells = rng.integers(30, 226, (5, 8, 8, 3)).astype(np.uint8)
     frames = cells.repeat(8, axis=1).repeat(8, axis=2)
     difference = decode_video(encode_video(frames, 16, crf=0)).frames.astype(float) - frames
-    # Rounding 320 colours averages out to less than 0.3 levels; the scaler's default is off by 1.
+    # Rounding 320 colors averages out to less than 0.3 levels; the scaler's default is off by 1.
     assert np.abs(difference.mean(axis=(0, 1, 2))).max() < 0.3
 
 
@@ -82,7 +89,7 @@ def test_probing_counts_frames_without_decoding(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "There is no file"),
+        (None, "No such file"),
         (b"", "is empty"),
         (b"not a video" * 99, "is not a readable video"),
         # A playlist must not make the reader open what it names.
@@ -154,3 +161,213 @@ def test_an_image_above_the_cap_is_refused(tmp_path, monkeypatch):
     Image.new("RGB", (6, 4)).save(tmp_path / "a.png")
     with pytest.raises(InputError, match="6x4 pixels"):
         read_image(tmp_path / "a.png")
+
+
+def detailed(frames=9):
+    """Noise on a gradient: enough bytes of H.264 for damage to show."""
+    noise = np.random.default_rng(0).integers(0, 30, (frames, 32, 48, 3)).astype(np.uint8)
+    return smooth(frames) + noise
+
+
+def remuxed(data, *, rotation=None, **flips):
+    """The same packets in a new file whose header comes first."""
+    with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
+        options = {"movflags": "faststart"}
+        with av.open(io.BytesIO(data)) as old, av.open(file.name, "w", options=options) as new:
+            stream = new.add_stream_from_template(old.streams.video[0])
+            if rotation is not None:
+                stream.set_display_rotation(rotation, **flips)
+            for packet in old.demux(video=0):
+                if packet.size:
+                    packet.stream = stream
+                    new.mux(packet)
+        return file.read()
+
+
+def flipped(data, at):
+    return data[:at] + bytes([data[at] ^ 16]) + data[at + 1 :]
+
+
+def test_a_bit_that_breaks_the_stream_is_refused_in_most_places():
+    """H.264 has no checksum; at b291cad only damage to the boxes was refused."""
+    data = encode_video(detailed(), 16)
+    whole = decode_video(data).frames
+    begin = data.index(b"mdat") + 800  # behind x264's description of itself
+    wrong = refused = 0
+    for at in range(begin, begin + 6000, 60):
+        try:
+            wrong += not np.array_equal(decode_video(flipped(data, at)).frames, whole)
+        except InputError:
+            refused += 1
+    assert refused > 20, f"{refused} refused, {wrong} not seen"
+
+
+def test_a_frame_marked_as_corrupt_is_refused(monkeypatch):
+    data = encode_video(detailed(), 16)
+    options = {**video_io._OPTIONS, "err_detect": "0"}
+    monkeypatch.setattr(video_io, "_OPTIONS", options)  # so that FFmpeg conceals what it can
+    begin = data.index(b"mdat") + 800
+    messages = []
+    for at in range(begin, begin + 3000, 30):
+        try:
+            decode_video(flipped(data, at))
+        except InputError as error:
+            messages.append(str(error))
+    assert any("is damaged at frame" in message for message in messages)
+
+
+def test_a_packet_without_a_frame_is_refused():
+    data = bytearray(encode_video(detailed(), 16))
+    (count,) = struct.unpack_from(">I", data, data.index(b"stsz") + 12)
+    sizes = struct.unpack_from(f">{count}I", data, data.index(b"stsz") + 16)
+    third = data.index(b"mdat") + 4 + sum(sizes[:5])
+    data[third + 4] = 0x0C  # a filler instead of a picture
+    with pytest.raises(InputError, match=r"8 of its 9 frames|damaged"):
+        decode_video(bytes(data))
+
+
+def test_frames_outside_the_edit_list_are_not_counted():
+    """Probing counted them, decoding dropped them, and the last frame was repeated for them."""
+    data = bytearray(encode_video(smooth(9), 16))
+    edit = data.index(b"elst") + 12
+    duration, start = struct.unpack_from(">II", data, edit)
+    struct.pack_into(">II", data, edit, duration // 9 * 5, start)
+    assert probe_encoded(bytes(data)).frames == len(decode_video(bytes(data)).frames) == 5
+
+
+TURNS = {
+    (0, False, False): lambda x: x,
+    (90, False, False): lambda x: np.rot90(x, axes=(1, 2)),
+    (180, False, False): lambda x: x[:, ::-1, ::-1],
+    (270, False, False): lambda x: np.rot90(x, -1, axes=(1, 2)),
+    (0, True, False): lambda x: x[:, :, ::-1],
+    (0, False, True): lambda x: x[:, ::-1],
+    (90, True, False): lambda x: np.rot90(x, axes=(1, 2))[:, :, ::-1],
+    (90, False, True): lambda x: np.rot90(x, axes=(1, 2))[:, ::-1],
+}
+
+
+@pytest.mark.parametrize("turn", TURNS, ids=str)
+def test_frames_are_turned_and_mirrored_as_the_display_matrix_says(turn):
+    data = encode_video(smooth(), 16)
+    rotation, hflip, vflip = turn
+    turned = remuxed(data, rotation=rotation, hflip=hflip, vflip=vflip)
+    expected = TURNS[turn](decode_video(data).frames)
+    np.testing.assert_array_equal(decode_video(turned).frames, expected)
+    info = probe_encoded(turned)
+    assert (info.height, info.width) == expected.shape[1:3]
+
+
+def test_an_oblique_display_matrix_is_refused():
+    with pytest.raises(InputError, match="no multiple of 90"):
+        decode_video(remuxed(encode_video(smooth(), 16), rotation=30))
+
+
+@pytest.fixture
+def half(tmp_path):
+    """The first half of a video whose header comes first."""
+    data = remuxed(encode_video(detailed(), 16))
+    (tmp_path / "half.mp4").write_bytes(data[: len(data) // 2])
+    return tmp_path / "half.mp4"
+
+
+@pytest.mark.parametrize("reader", [read_video, probe_video])
+def test_a_video_cut_off_behind_its_header_is_refused(half, reader):
+    with pytest.raises(InputError, match=r"is cut off"):
+        reader(half)
+
+
+def test_what_is_left_of_a_damaged_video_is_given_if_asked_for(half):
+    frames = read_video(half, damage="stop").frames
+    assert 0 < len(frames) < 9
+    assert probe_video(half, damage="stop").frames == len(frames)
+    whole = decode_video(encode_video(detailed(), 16)).frames
+    np.testing.assert_array_equal(frames, whole[: len(frames)])
+
+
+@pytest.mark.parametrize("reader", [read_video, probe_video, read_image])
+def test_a_pipe_is_refused_without_waiting_for_it(tmp_path, reader):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="not a regular file"):
+        reader(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("reader", [read_video, probe_video, read_image])
+def test_a_name_with_nul_is_refused(tmp_path, reader):
+    with pytest.raises(InputError, match="null"):
+        reader(tmp_path / "a\0.mp4")
+
+
+@pytest.mark.parametrize("reader", [decode_video, probe_encoded])
+def test_an_unknown_codec_is_refused(reader):
+    data = encode_video(smooth(), 16).replace(b"avc1", b"zzz9").replace(b"avcC", b"zzzC")
+    with pytest.raises(InputError, match=r"codec|readable|damaged"):
+        reader(data)
+
+
+def test_a_table_of_fifty_million_samples_is_refused_before_it_is_built():
+    data = bytearray(encode_video(smooth(), 16))
+    samples = 50_000_000
+    struct.pack_into(">II", data, data.index(b"stsz") + 8, 1, samples)
+    struct.pack_into(">I", data, data.index(b"stsc") + 16, samples)
+    struct.pack_into(">I", data, data.index(b"stts") + 12, samples)
+    with pytest.raises(InputError, match="samples"):
+        decode_video(bytes(data))
+
+
+def test_frames_beyond_what_memory_should_hold_are_refused(monkeypatch):
+    monkeypatch.setattr(video_io, "MAX_KEPT", 4 * 32 * 48 * 3)
+    with pytest.raises(InputError, match="bytes of frames"):
+        decode_video(encode_video(smooth(5), 16))
+    smaller = decode_video(encode_video(smooth(5), 16), each=lambda frame: frame[::2, ::2])
+    assert smaller.frames.shape == (5, 16, 24, 3)
+
+
+def test_official_decoding_is_the_scalers_default():
+    """Equal, bit for bit, to `ffmpeg -pix_fmt rgb24`, which imageio calls."""
+    data = encode_video(detailed(), 16)
+    with av.open(io.BytesIO(data)) as container:
+        expected = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
+    official = decode_video(data, decoding="official").frames
+    np.testing.assert_array_equal(official, expected)
+    accurate = decode_video(data).frames
+    assert 0.3 < (accurate.astype(float) - official).mean() < 2
+
+
+def test_gray_of_16_bits_keeps_its_upper_8(tmp_path):
+    levels = np.arange(0, 65536, 4096, dtype=np.uint16).reshape(4, 4)
+    Image.fromarray(levels).save(tmp_path / "a.png")
+    expected = np.repeat((levels >> 8).astype(np.uint8)[..., None], 3, axis=-1)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), expected)
+
+
+def png(*chunks):
+    """A PNG of these chunks."""
+    parts = [b"\x89PNG\r\n\x1a\n"]
+    for kind, content in chunks:
+        crc = zlib.crc32(kind + content)
+        parts.append(struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc))
+    return b"".join(parts)
+
+
+HEADER = (b"IHDR", struct.pack(">IIBBBBB", 4, 4, 8, 2, 0, 0, 0))
+PIXELS = (b"IDAT", zlib.compress(b"".join(b"\0" + bytes(12) for _ in range(4))))
+
+
+def test_a_png_with_a_text_bomb_is_refused():
+    bomb = (b"zTXt", b"a\0\0" + zlib.compress(bytes(1 << 27)))
+    with pytest.raises(InputError, match="is not a readable image"):
+        decode_image(png(HEADER, bomb, PIXELS, (b"IEND", b"")))
+
+
+def test_a_png_with_one_wrong_byte_of_pixels_is_refused():
+    data = png(HEADER, PIXELS, (b"IEND", b""))
+    at = data.index(b"IDAT") + 6
+    with pytest.raises(InputError, match="is not a readable image"):
+        decode_image(data[:at] + b"?" + data[at + 1 :])
+
+
+def test_an_image_of_32_bits_is_refused(tmp_path):
+    Image.fromarray(np.ones((4, 4), np.float32)).save(tmp_path / "a.tiff")
+    with pytest.raises(InputError, match="32 bits"):
+        read_image(tmp_path / "a.tiff")

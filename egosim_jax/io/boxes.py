@@ -1,0 +1,52 @@
+"""The tables of MP4 files, held against what their samples could be before FFmpeg builds them.
+
+A few bytes of a sample table may declare billions of samples, for each of which FFmpeg takes 24
+bytes and more. Boxes nest: 4 bytes of size, 4 of type, then what the type says.
+"""
+
+from __future__ import annotations
+
+import io
+
+from egosim_jax.types import InputError
+
+MAX_SAMPLES = 2**22
+"""Most samples of all tracks: a minute and a half of uncompressed sound at 48 kHz, beside video."""
+MAX_BOXES = 100_000
+_INNER = {
+    b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"dinf", b"udta", b"tref", b"mvex",
+    b"moof", b"traf", b"mfra", b"wave",
+}  # fmt: skip
+_COUNTS = {b"stsz": 8, b"stz2": 8, b"trun": 4, b"stts": 4, b"ctts": 4, b"stsc": 4, b"stco": 4,
+           b"co64": 4, b"stss": 4, b"sbgp": 4, b"elst": 4}  # fmt: skip
+"""Where each table says its number of entries."""
+
+
+def check_boxes(file: io.BufferedReader | io.BytesIO, name: str) -> None:
+    """Raise `InputError` if an MP4 declares more samples than are read; other files pass."""
+    size = file.seek(0, 2)
+    rest, seen, samples = [(0, size)], 0, 0
+    while rest:
+        start, end = rest.pop()
+        file.seek(start)
+        head = file.read(16)
+        kind, length, content = head[4:8], int.from_bytes(head[:4], "big"), start + 8
+        if length == 1:
+            length, content = int.from_bytes(head[8:], "big"), start + 16
+        if len(head) < 8 or 0 < length < content - start or not kind.isascii():
+            continue
+        stop = min(start + length, end) if length else end
+        if stop + 8 <= end:
+            rest.append((stop, end))
+        if kind in _INNER:
+            rest.append((content, stop))
+        elif kind in _COUNTS:
+            file.seek(content + _COUNTS[kind])
+            samples += int.from_bytes(file.read(4), "big")
+        seen += 1
+        if samples > MAX_SAMPLES or seen > MAX_BOXES or kind == b"cmov":
+            raise InputError(
+                f"{name} is not read: its header is compressed or declares more than "
+                f"{MAX_SAMPLES:,} samples."
+            )
+    file.seek(0)

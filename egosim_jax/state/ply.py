@@ -1,0 +1,158 @@
+"""PLY files of points: the header is held against the size of the file before anything is built.
+
+A header of text names elements, their number and their properties, then come the values, as text
+or in binary of either byte order. Points are the element `vertex`; what follows them, such as
+faces, is not read, but has to be there.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.untrusted import open_regular, quote, quote_path, quote_text
+from egosim_jax.types import InputError
+
+MAX_HEADER = 1 << 16
+"""Longest header, in bytes."""
+MAX_BYTES = 1 << 29
+"""Largest file in binary."""
+MAX_TEXT = 1 << 27
+"""Largest file of text."""
+MAX_POINTS = 1 << 24
+MAX_PROPERTIES = 256
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+          "float": "f4", "double": "f8"}  # fmt: skip
+_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
+           "uint32": "u4", "float32": "f4", "float64": "f8"}  # fmt: skip
+_NAMES = {np.dtype(dtype): name for name, dtype in reversed(_TYPES.items())}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    fields: list[tuple[str, str]] = field(default_factory=list)
+    """Names and dtypes; of a list, those of its length."""
+    lists: bool = False
+
+
+def read_points(path: Path) -> np.ndarray:
+    """Read the points of a PLY file: a structured array with a field for each property.
+
+    Raises `InputError` if it is no PLY, damaged, cut off or too large.
+    """
+    name = quote_path(path)
+    with open_regular(path) as file:
+        try:
+            order, elements = _header(file)
+            vertex = next((e for e in elements if e.name == "vertex"), None)
+            if vertex is None or not 0 < vertex.count <= MAX_POINTS:
+                count = vertex.count if vertex else 0
+                raise ValueError(f"it has {quote(count)} points; 1 to {MAX_POINTS:,} are read")
+            number = elements.index(vertex)
+            if vertex.lists or any(element.lists for element in elements[:number]):
+                raise ValueError("a list stands before the points or in them")
+            limit = MAX_TEXT if order == "=" else MAX_BYTES
+            data = file.read(limit + 1)
+            if len(data) > limit:
+                raise ValueError(f"it has more than {limit:,} bytes, the most that is read")
+            read = _text if order == "=" else _binary
+            return read(data, order, elements, number)
+        except ValueError as error:
+            raise InputError(f"{name} is no PLY that can be read: {quote_text(str(error))}.") from (
+                error
+            )
+
+
+def write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write points as binary PLY, whole or not at all; each column is a property."""
+    dtypes = {name: column.dtype.newbyteorder("<") for name, column in columns.items()}
+    points = np.empty(len(next(iter(columns.values()))), list(dtypes.items()))
+    for name, column in columns.items():
+        points[name] = column
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines += [f"property {_NAMES[dtype]} {name}" for name, dtype in dtypes.items()]
+    with atomic_write(path) as temporary:
+        temporary.write_bytes("\n".join([*lines, "end_header\n"]).encode() + points.tobytes())
+
+
+def _header(file: io.BufferedReader) -> tuple[str, list[_Element]]:
+    """The byte order and the elements. Raises `ValueError`."""
+    head = file.read(MAX_HEADER)
+    lines = head.decode("latin-1").split("\n")
+    if lines[0].rstrip("\r") != "ply":
+        raise ValueError("it does not begin with the line 'ply'")
+    order, elements, properties = "", [], 0
+    end = len(lines[0]) + 1
+    for line in lines[1:-1]:
+        end += len(line) + 1
+        match line.split():
+            case ["end_header"] if order:
+                file.seek(end)
+                return order, elements
+            case ["format", name, "1.0"] if name in _ORDERS and not order:
+                order = _ORDERS[name]
+            case ["comment" | "obj_info", *_]:
+                pass
+            case ["element", name, count] if count.isascii() and count.isdigit():
+                elements.append(_Element(name, int(count[:20])))
+            case ["property", kind, name] if kind in _TYPES and elements:
+                elements[-1].fields.append((name, _TYPES[kind]))
+                properties += 1
+            case ["property", "list", length, kind, name] if (
+                {length, kind} <= _TYPES.keys() and elements and _TYPES[length][0] != "f"
+            ):
+                elements[-1].fields.append((name, _TYPES[length]))
+                elements[-1].lists = True
+                properties += 1
+            case _:
+                raise ValueError(f"its header has the line {quote(line)}")
+        if properties > MAX_PROPERTIES:
+            raise ValueError(f"it has more than {MAX_PROPERTIES} properties")
+    raise ValueError(f"its header does not end within {MAX_HEADER:,} bytes")
+
+
+def _binary(data: bytes, order: str, elements: list[_Element], number: int) -> np.ndarray:
+    sizes = [
+        element.count * np.dtype([(n, order + t) for n, t in element.fields]).itemsize
+        for element in elements
+    ]
+    open_ended = any(element.lists for element in elements)
+    if len(data) < sum(sizes) or (len(data) > sum(sizes) and not open_ended):
+        raise ValueError(
+            f"{len(data):,} bytes follow the header, which tells of "
+            f"{'at least ' * open_ended}{quote(sum(sizes))}"
+        )
+    dtype = [(name, order + kind) for name, kind in elements[number].fields]
+    count = elements[number].count
+    return np.frombuffer(data, dtype, count=count, offset=sum(sizes[:number]))
+
+
+def _text(data: bytes, order: str, elements: list[_Element], number: int) -> np.ndarray:
+    wanted = sum(element.count for element in elements)
+    lines = data.count(b"\n") + (not data.endswith(b"\n"))
+    if wanted > lines:
+        raise ValueError(f"{lines:,} lines follow the header, which tells of {quote(wanted)}")
+    before = sum(element.count for element in elements[:number])
+    rows = (line for line in io.BytesIO(data) if not line.isspace())
+    points = np.loadtxt(
+        (row.decode("ascii") for row in rows),
+        [(name, order + kind) for name, kind in elements[number].fields],
+        comments=None,
+        skiprows=before,
+        max_rows=elements[number].count,
+        ndmin=1,
+    )
+    left = sum(1 for _ in rows)
+    if len(points) < elements[number].count or left != wanted - before - len(points):
+        raise ValueError(
+            f"{before + len(points) + left:,} lines follow the header, which tells of {wanted:,}"
+        )
+    return points

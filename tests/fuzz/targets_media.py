@@ -1,0 +1,494 @@
+"""What a fuzzer needs to know of videos, images, point clouds, metadata and shards."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import random
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+from PIL import Image
+
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.io.video import encode_video, read_image, read_video
+from egosim_jax.state.ply import read_points
+from egosim_jax.types import VideoSpec
+from tests.fuzz.target import Target
+
+NUMBERS = (0, 1, 2, 3, 255, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1)
+WORDS = (
+    b"",
+    b"0",
+    b"-1",
+    b"500000000",
+    b"1" * 40,
+    b"nan",
+    b"list",
+    b"double",
+    b"uchar",
+    b"x" * 999,
+)
+
+
+def _pixels(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+
+
+# PLY
+
+PROPERTIES = [("float", c) for c in "xyz"] + [("uchar", c) for c in ("red", "green", "blue")]
+DTYPES = {"float": "f4", "uchar": "u1"}
+
+
+def make_ply(folder: Path) -> None:
+    """Write the same three points as text and in both byte orders, with a face behind them."""
+    rows = [(0.5, 1, 2, 10, 20, 30), (3, 4, 5, 40, 50, 60), (6, 7, -8, 70, 80, 90)]
+    for name, order in (("ascii", "="), ("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        lines = ["ply", f"format {name} 1.0", "comment three points", "element vertex 3"]
+        lines += [f"property {kind} {c}" for kind, c in PROPERTIES]
+        lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+        if name == "ascii":
+            body = "".join(" ".join(map(str, row)) + "\n" for row in rows).encode() + b"3 0 1 2\n"
+        else:
+            body = np.array(rows, [(c, order + DTYPES[k]) for k, c in PROPERTIES]).tobytes()
+            body += struct.pack(f"{order}B3i", 3, 0, 1, 2)
+        (folder / f"{name}.ply").write_bytes("\n".join(lines).encode() + body)
+
+
+def read_ply(folder: Path) -> Any:
+    """Read the points of each file, as names and rows."""
+    return {path.name: _rows(read_points(path)) for path in sorted(folder.glob("*.ply"))}
+
+
+def _rows(points: np.ndarray) -> Any:
+    return points.dtype.names, [[float(value) for value in row] for row in points.tolist()]
+
+
+def reference_ply(folder: Path) -> Any:
+    """Read the points with `struct` and `float`, value by value."""
+    return {path.name: _unpacked(path.read_bytes()) for path in sorted(folder.glob("*.ply"))}
+
+
+def _unpacked(data: bytes) -> Any:
+    head, _, body = re.split(rb"(end_header\r?\n)", data, maxsplit=1)
+    words = [line.split() for line in head.decode("latin-1").split("\n")]
+    form = next(line[1] for line in words if line[:1] == ["format"])
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for line in words:
+        if line[:1] == ["element"]:
+            elements.append((line[1], int(line[2]), []))
+        elif line[:1] == ["property"]:
+            elements[-1][2].append(line[1:])
+    number = next(i for i, element in enumerate(elements) if element[0] == "vertex")
+    codes = {
+        **dict.fromkeys(("char", "int8"), "b"),
+        **dict.fromkeys(("uchar", "uint8"), "B"),
+        **dict.fromkeys(("short", "int16"), "h"),
+        **dict.fromkeys(("ushort", "uint16"), "H"),
+        **dict.fromkeys(("int", "int32"), "i"),
+        **dict.fromkeys(("uint", "uint32"), "I"),
+        **dict.fromkeys(("float", "float32"), "f"),
+        **dict.fromkeys(("double", "float64"), "d"),
+    }
+    layouts = ["".join(codes[p[0]] for p in element[2]) for element in elements[: number + 1]]
+    names = tuple(p[1] for p in elements[number][2])
+    count, skipped = elements[number][1], sum(element[1] for element in elements[:number])
+    if form == "ascii":
+        lines = [line.split() for line in body.decode().split("\n") if line.strip()]
+        kinds = layouts[number]
+        return names, [
+            [
+                float(np.float32(v)) if kind == "f" else float(v)
+                for v, kind in zip(line, kinds, strict=True)
+            ]
+            for line in lines[skipped : skipped + count]
+        ]
+    order = "<" if "little" in form else ">"
+    at = sum(
+        element[1] * struct.calcsize(order + layout)
+        for element, layout in zip(elements, layouts[:number], strict=False)
+    )
+    layout = order + layouts[number]
+    size = struct.calcsize(layout)
+    rows = [struct.unpack_from(layout, body, at + size * i) for i in range(count)]
+    return names, [[float(value) for value in row] for row in rows]
+
+
+def change_ply_word(data: bytes, rng: random.Random) -> bytes:
+    """Put another count, type or name into the header."""
+    end = data.find(b"end_header")
+    words = list(re.finditer(rb"[^\s]+", data[: max(end, 0)]))
+    if not words:
+        return data
+    word = rng.choice(words)
+    return data[: word.start()] + rng.choice(WORDS) + data[word.end() :]
+
+
+def change_ply_lines(data: bytes, rng: random.Random) -> bytes:
+    """Drop, repeat or exchange lines of the header, or add an element."""
+    head, end, body = data.partition(b"end_header")
+    lines = head.split(b"\n")
+    at = rng.randrange(len(lines))
+    match rng.randrange(4):
+        case 0:
+            del lines[at]
+        case 1:
+            lines.insert(at, lines[at])
+        case 2:
+            other = rng.randrange(len(lines))
+            lines[at], lines[other] = lines[other], lines[at]
+        case _:
+            count = rng.choice((0, 1, 3, 10**9))
+            lines[at:at] = [b"element edge %d" % count, b"property int vertex1"]
+    return b"\n".join(lines) + end + body
+
+
+# MP4 and PNG
+
+
+def make_mp4(folder: Path) -> None:
+    """Write three small frames of noise as H.264."""
+    (folder / "a.mp4").write_bytes(encode_video(_pixels(3, 16, 16, 3), 16, crf=40))
+
+
+def read_mp4(folder: Path) -> Any:
+    """Decode all frames."""
+    video = read_video(folder / "a.mp4")
+    return video.fps, video.frames
+
+
+BOXES = re.compile(
+    rb"ftyp|moov|mvhd|trak|tkhd|edts|elst|mdia|mdhd|hdlr|minf|vmhd|dinf|stbl|stsd|avc1|avcC|colr|"
+    rb"stts|stss|ctts|stsc|stsz|stco|udta|mdat"
+)
+
+
+def change_box(data: bytes, rng: random.Random) -> bytes:
+    """Put another number into a box: its size, or one of its first fields."""
+    boxes = list(BOXES.finditer(data))
+    if not boxes:
+        return data
+    at = rng.choice(boxes).start() + rng.choice((-4, -4, 4, 8, 12, 16, 20, 24))
+    if not 0 <= at <= len(data) - 4:
+        return data
+    (old,) = struct.unpack_from(">I", data, at)
+    new = rng.choice((*NUMBERS, old + 1, old - 1, old * 2, old // 2)) % 2**32
+    return data[:at] + struct.pack(">I", new) + data[at + 4 :]
+
+
+def move_box(data: bytes, rng: random.Random) -> bytes:
+    """Drop, repeat or rename a box."""
+    boxes = list(BOXES.finditer(data))
+    if not boxes:
+        return data
+    start = rng.choice(boxes).start() - 4
+    end = start + int.from_bytes(data[max(start, 0) : start + 4], "big")
+    box = data[start:end]
+    match rng.randrange(3):
+        case 0:
+            return data[:start] + data[end:]
+        case 1:
+            return data[:end] + box + data[end:]
+        case _:
+            other = rng.choice(boxes).group()
+            return data[: start + 4] + other + data[start + 8 :]
+
+
+def make_png(folder: Path) -> None:
+    """Write 8-bit RGB, a palette and 16-bit gray, with some text."""
+    Image.fromarray(_pixels(6, 5, 3)).save(folder / "rgb.png")
+    Image.fromarray(_pixels(6, 5, 3)).quantize(8).save(folder / "palette.png")
+    Image.fromarray(np.arange(30, dtype=np.uint16).reshape(6, 5) * 2000).save(folder / "gray.png")
+
+
+def read_png(folder: Path) -> Any:
+    """Decode all three."""
+    return {path.name: read_image(path) for path in sorted(folder.glob("*.png"))}
+
+
+def change_chunk(data: bytes, rng: random.Random) -> bytes:
+    """Change, drop, repeat or add a chunk, with its CRC as it should be."""
+    chunks, at = [], 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + length]))
+        at += 12 + length
+    if not chunks:
+        return data
+    number = rng.randrange(len(chunks))
+    kind, content = chunks[number]
+    match rng.randrange(5):
+        case 0:
+            del chunks[number]
+        case 1:
+            chunks.insert(number, chunks[number])
+        case 2:
+            bomb = zlib.compress(bytes(rng.choice((10, 10**6, 10**7))))
+            new = rng.choice(((b"zTXt", b"a\0\0" + bomb), (b"iCCP", b"a\0\0" + bomb),
+                              (b"tRNS", b"\0"), (b"PLTE", b"\0" * 3), (b"acTL", bytes(8)),
+                              (b"eXIf", b"II*\0" + bytes(9)), (b"IDAT", bomb)))  # fmt: skip
+            chunks.insert(rng.randrange(1, len(chunks) + 1), new)
+        case 3 if content:
+            place = rng.randrange(len(content))
+            changed = content[:place] + rng.randbytes(1) + content[place + 1 :]
+            chunks[number] = kind, changed
+        case _ if len(content) >= 8:
+            place = rng.choice((0, 4))
+            value = struct.pack(">I", rng.choice(NUMBERS))
+            chunks[number] = kind, content[:place] + value + content[place + 4 :]
+        case _:
+            chunks[number] = bytes(rng.choices(range(65, 123), k=4)), content
+    return data[:8] + b"".join(
+        struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks
+    )
+
+
+# Metadata
+
+ROWS = [
+    {
+        "video": f"{name}/video.mp4",
+        "ego_prior_video": f"{name}/prior.mp4",
+        "hand_keypoint_video": f"{name}/hands.mp4",
+        "first_frame": f"{name}/first.png",
+        "prompt": prompt,
+        "video_id": name,
+        "split": "train",
+    }
+    for name, prompt in (("a/1", "take it,\nslowly"), ("b", "é \u2028 put it down"), ("c", '"no"'))
+]
+KEYS = tuple(ROWS[0])
+CELLS: tuple[Any, ...] = ("", "nan", "../x", "a/../b", "a//b", "/etc/x", "\0", "é", "x" * 300, None,
+                          3, 1e400, True, [], {}, ["a"], "\u2028", '"', "a,b", "\n")  # fmt: skip
+
+
+def make_metadata(folder: Path) -> None:
+    """Write the same rows as CSV and as JSON lines."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, KEYS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(ROWS)
+    (folder / "m.csv").write_text(text.getvalue(), encoding="utf-8")
+    lines = (json.dumps(row, ensure_ascii=False) + "\n" for row in ROWS)
+    (folder / "m.jsonl").write_text("".join(lines), encoding="utf-8")
+
+
+def read_tables(folder: Path) -> Any:
+    """Read both tables."""
+    return {
+        name: [
+            [clip.video_id, clip.prompt, str(clip.prior), str(clip.hands), str(clip.first_frame),
+             str(clip.mask), str(clip.truth), dict(clip.extra)]
+            for clip in read_metadata(folder / name)
+        ]
+        for name in ("m.csv", "m.jsonl")
+    }  # fmt: skip
+
+
+def reference_tables(folder: Path) -> Any:
+    """Read both tables with `csv.DictReader` and `json.loads` alone."""
+    with (folder / "m.csv").open(newline="", encoding="utf-8-sig") as file:
+        table = [row for row in csv.DictReader(file, restval="")]
+    text = (folder / "m.jsonl").read_bytes().decode("utf-8-sig")
+    lines = [json.loads(line.lstrip("\ufeff")) for line in text.split("\n") if line.strip()]
+    return {"m.csv": _expected(folder, table), "m.jsonl": _expected(folder, lines)}
+
+
+def _expected(folder: Path, rows: list[dict[str, Any]]) -> Any:
+    found = []
+    for cells in rows:
+        row = {key: "" if cell is None else str(cell) for key, cell in cells.items()}
+        prior = folder / row["ego_prior_video"]
+        own = row["video"].replace("/", "_").removesuffix(".mp4") if "video" in row else None
+        paths = [
+            str(folder / row[column]) if column in row else str(prior.parent / default)
+            for column, default in (
+                ("hand_keypoint_video", "hand_kp_video.mp4"),
+                ("first_frame", "hand_inpaint.png"),
+            )
+        ]
+        truth = str(folder / row["video"]) if "video" in row else "None"
+        extra = {key: cell for key, cell in row.items() if key not in KEYS[:-1]}
+        mask = str(prior.parent / "pc_mask_video.mp4")
+        found.append(
+            [row.get("video_id", own), row["prompt"], str(prior), *paths, mask, truth, extra]
+        )
+    return found
+
+
+def change_cell(data: bytes, rng: random.Random) -> bytes:
+    """Put another value or name into a row of either table."""
+    if data.startswith(b"{"):
+        return change_json_line(data, rng)
+    try:
+        rows = list(csv.reader(io.StringIO(data.decode(), newline="")))
+    except (UnicodeDecodeError, csv.Error):
+        return data
+    row = rng.choice(rows)
+    if not row:
+        return data
+    match rng.randrange(4):
+        case 0:
+            del row[rng.randrange(len(row))]
+        case 1:
+            row.insert(rng.randrange(len(row) + 1), str(rng.choice(CELLS)))
+        case 2:
+            rows.remove(row)
+        case _:
+            row[rng.randrange(len(row))] = str(rng.choice((*CELLS, *KEYS)))
+    text = io.StringIO()
+    csv.writer(text, lineterminator=rng.choice(("\n", "\r\n", "\r"))).writerows(rows)
+    return text.getvalue().encode("utf-8", "replace")
+
+
+def change_json_line(data: bytes, rng: random.Random) -> bytes:
+    """Change a value or a name of one JSON line."""
+    lines = data.split(b"\n")
+    number = rng.randrange(len(lines))
+    lines[number] = change_json(lines[number], rng)
+    return b"\n".join(lines)
+
+
+def change_json(data: bytes, rng: random.Random) -> bytes:
+    """Change, drop, rename or repeat one value anywhere in a JSON document."""
+    try:
+        document = json.loads(data)
+    except ValueError:
+        return data
+    places: list[tuple[Any, Any]] = []
+    rest = [document]
+    while rest:
+        item = rest.pop()
+        keys = list(item) if isinstance(item, dict) else range(len(item)) if isinstance(
+            item, list
+        ) else ()  # fmt: skip
+        places += [(item, key) for key in keys]
+        rest += [item[key] for key in keys]
+    if not places:
+        return data
+    parent, key = rng.choice(places)
+    match rng.randrange(4):
+        case 0:
+            del parent[key]
+        case 1 if isinstance(parent, dict):
+            parent[rng.choice((f"{key}x", *KEYS, "version"))] = parent.pop(key)
+        case 2 if isinstance(parent, list):
+            parent.insert(key, parent[key])
+        case _:
+            parent[key] = rng.choice((*CELLS, *NUMBERS, -1, 10**30, 0.5))
+    return json.dumps(document, ensure_ascii=rng.random() < 0.5).encode("utf-8", "replace")
+
+
+# Shards
+
+SPEC = VideoSpec(frames=5, height=16, width=16)
+
+
+def make_shards(folder: Path) -> None:
+    """Write three records of tiny frames in two shards."""
+    with ShardWriter(
+        folder / "data", kind="frames", spec=SPEC, provenance={"from": "noise"}, shard_bytes=18_000
+    ) as writer:
+        for number in range(3):
+            videos = {name: _pixels(5, 16, 16, 3) for name in ("prior", "hands")}
+            still = {"mask": _pixels(5, 16, 16), "first_frame": _pixels(16, 16, 3)}
+            names = {"video_id": f"clip_{number}", "prompt": "é", "extra": {"split": "train"}}
+            writer.add({**videos, **still}, names)
+
+
+def make_latents(folder: Path) -> None:
+    """Write three records of tiny latents, as the encoders leave them."""
+    provenance = {"config": "debug", "source": "0" * 64, "encoders": {"vae": "1" * 64}}
+    with ShardWriter(
+        folder / "data", kind="latents", spec=SPEC, provenance=provenance, shard_bytes=3_000
+    ) as writer:
+        for number in range(3):
+            rng = np.random.default_rng(number)
+            arrays = {
+                name: rng.normal(size=(2, 2, 2, 16)).astype(ml_dtypes.bfloat16)
+                for name in ("truth", "prior", "hands")
+            }
+            arrays |= {"mask": _pixels(2, 2, 2, 4), "text": np.ones((3, 8), np.float32)}
+            names = {"video_id": f"clip_{number}", "prompt": "take it", "extra": {}, "start": 0}
+            writer.add(arrays, names)
+
+
+def read_shards(folder: Path) -> Any:
+    """Open a dataset and read every record, as the loader does."""
+    reader = ShardReader(folder / "data")
+    records = [(dict(record.metadata), dict(record.arrays)) for record in reader]
+    return asdict(reader.manifest), records
+
+
+def change_dataset(data: bytes, rng: random.Random) -> bytes:
+    """Change a value of the manifest; of a shard, a bit or eight bytes where it is not padding."""
+    if data.startswith(b"{"):
+        return change_json(data, rng)
+    places = [match.start() for match in re.finditer(rb"[^\0]", data)]
+    if not places:
+        return data
+    at = rng.choice(places)
+    if rng.random() < 0.5:
+        return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+    number = rng.choice((*NUMBERS, 2**63, 2**64 - 1))
+    return data[:at] + struct.pack("<Q", number) + data[at + 8 :]
+
+
+def _dataset(name: str, make: Callable[[Path], None]) -> Target:
+    return Target(
+        name=name,
+        make=make,
+        read=read_shards,
+        files=("data/manifest.json", "data/*.array_record"),
+        sealed=True,
+        mutations=(change_dataset,),
+    )
+
+
+TARGETS: list[Target] = [
+    Target(
+        name="ply",
+        make=make_ply,
+        read=read_ply,
+        files=("*.ply",),
+        reference=reference_ply,
+        mutations=(change_ply_word, change_ply_lines),
+    ),
+    Target(
+        name="mp4",
+        make=make_mp4,
+        read=read_mp4,
+        files=("*.mp4",),
+        lossy="H.264 and MP4 have no checksum: a bit that leaves a stream or a table valid gives "
+        "other pixels, another rate, matrix or edit list, and no decoder can tell.",
+        mutations=(change_box, move_box),
+    ),
+    Target(
+        name="png",
+        make=make_png,
+        read=read_png,
+        files=("*.png",),
+        lossy="A chunk whose CRC was computed anew is as good as any other.",
+        mutations=(change_chunk,),
+    ),
+    Target(
+        name="metadata",
+        make=make_metadata,
+        read=read_tables,
+        files=("m.csv", "m.jsonl"),
+        reference=reference_tables,
+        mutations=(change_cell,),
+    ),
+    _dataset("shards", make_shards),
+    _dataset("latents", make_latents),
+]
