@@ -149,14 +149,15 @@ class Cameras:
         if not rigid.all():
             frame = int(np.argmin(rigid))
             raise InputError(
-                f"The camera of frame {frame} is no rigid motion: its matrix must be finite, "
-                f"with a rotation of determinant 1, and is\n{self.world_from_camera[frame]}"
+                f"The camera of frame {frame} is no rigid motion: its matrix must be finite, with "
+                f"a rotation of determinant 1, not {self.world_from_camera[frame].tolist()}."
             )
         focal = self.intrinsics_px[0, 0], self.intrinsics_px[1, 1]
         if not (np.isfinite(self.intrinsics_px).all() and min(*focal, self.height, self.width) > 0):
             raise InputError(
-                f"A camera with intrinsics\n{self.intrinsics_px}\nand {self.width}x{self.height} "
-                "pixels has no picture: all must be finite, focal lengths and sizes positive."
+                f"A camera with intrinsics {self.intrinsics_px.tolist()} and {self.width}x"
+                f"{self.height} pixels has no picture: all must be finite, focal lengths and sizes "
+                "positive."
             )
 
 

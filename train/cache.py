@@ -31,7 +31,7 @@ from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, gather, r
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.generator import Inputs, ModelConfig, Program, batches, place, truths
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted import quote
+from egosim_jax.io.untrusted import listing, quote
 from egosim_jax.io.video import Decoding
 from egosim_jax.io.weights import hashes, load
 from egosim_jax.models.clip_vision import CLIPVision
@@ -310,7 +310,7 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
             "again. (egosim data encode)"
         )
     problems = [
-        f"  {what}: the shards have {have}, this training {want}"
+        f"{what}: the shards have {have}, this training {want}"
         for what, have, want in (
             ("config", manifest.provenance.get("config"), config.name),
             ("video", manifest.spec, config.video),
@@ -320,13 +320,13 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
     if weights is not None:
         ours = {"vae": "none", **hashes(weights, only=encoders)}
         problems += [
-            f"  {name}: the shards have {str(encoders[name])[:16]}, {weights} {ours[name][:16]}"
+            f"{name}: the shards have {str(encoders[name])[:16]}, {weights} {ours[name][:16]}"
             for name in sorted(encoders.keys() & ours.keys())
             if encoders[name] != ours[name]
         ]
     if problems:
-        listing = "\n".join(problems)
         raise InputError(
-            f"{shards} was not encoded for this training:\n{listing}\nEncode again with these "
-            "weights (egosim data encode), or take those that it was encoded with. (--weights)"
+            f"{shards} was not encoded for this training: {listing(problems)}. Encode again with "
+            "these weights (egosim data encode), or take those that it was encoded with. "
+            "(--weights)"
         )

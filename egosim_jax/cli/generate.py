@@ -16,7 +16,7 @@ import tyro
 from egosim_jax.command import DONE, PARTIAL, USAGE
 from egosim_jax.data.sheet import Block, draw_sheet
 from egosim_jax.io.atomic import append_line
-from egosim_jax.io.untrusted import read_lines
+from egosim_jax.io.untrusted import listing, read_lines
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ class Generate:
         for item in items:
             problems = check_clip(item.files, config.video, start=item.start, policy=self._policy)
             if problems:
-                bad.append((item, "\n".join(problems)))
+                bad.append((item, listing(problems)))
             else:
                 sound.append(item)
         return sound, bad

@@ -25,7 +25,7 @@ from PIL import Image
 from egosim_jax.data.metadata import MASK_NAME, ClipFiles
 from egosim_jax.data.transforms import fit_length, resize_image, resize_mask
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted import listing, quote_path
 from egosim_jax.io.video import (
     Damage,
     Decoding,
@@ -122,7 +122,7 @@ def load_triplet(
     """
     problems = check_clip(files, spec, start=start, policy=policy)
     if problems:
-        raise InputError("\n".join(problems))
+        raise InputError(listing(problems))
     arrays: dict[str, np.ndarray] = {
         "mask": np.zeros((spec.frames, spec.height, spec.width), np.uint8)
     }

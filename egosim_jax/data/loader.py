@@ -23,6 +23,7 @@ import numpy as np
 from absl import flags
 
 from egosim_jax.data.shards import Manifest, ShardReader
+from egosim_jax.io.untrusted import listing
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
@@ -124,12 +125,12 @@ class Loader(grain.DatasetIterator):
         """Continue where `get_state` was called."""
         saved = state["contract"]
         differing = [
-            f"  {name}: the state has {saved.get(name)}, this loader {value}"
+            f"{name}: the state has {saved.get(name)}, this loader {value}"
             for name, value in self.contract.items()
             if saved.get(name) != value
         ]
         if differing:
-            raise InputError("\n".join(["The data would come in another order:", *differing]))
+            raise InputError(f"The data would come in another order: {listing(differing)}.")
         self._batches.set_state(state["position"])
 
 
@@ -197,6 +198,5 @@ class _Healthy(grain.transforms.Filter):
             logger.warning("skipping %s", element.message)
         self.skipped[element.message] += 1
         if len(self.skipped) > Loader.MAX_BAD:
-            listing = "\n".join(f"  {message}" for message in self.skipped)
-            raise InputError(f"Too many records cannot be read:\n{listing}")
+            raise InputError(f"Too many records cannot be read: {listing(list(self.skipped))}")
         return False

@@ -151,21 +151,21 @@ def _some(values: Sequence[str]) -> str:
 class _Problems:
     """The first problems of a list that may be long, and their number."""
 
-    def __init__(self, most: int = 20):
+    def __init__(self, most: int = 10):
         self._most, self._shown, self._count = most, list[str](), 0
 
     def add(self, problems: Iterable[str]) -> None:
         for problem in problems:
             self._count += 1
             if self._count <= self._most:
-                self._shown.append(f"  {problem}")
+                self._shown.append(problem)
 
     def refuse(self, what: str) -> None:
         """Raise `InputError` if there are any."""
         if self._count > self._most:
-            self._shown.append(f"  and {self._count - self._most:,} more")
+            self._shown.append(f"and {self._count - self._most:,} more")
         if self._count:
-            raise InputError("\n".join([f"{what}:", *self._shown]))
+            raise InputError(f"{what}: {'; '.join(self._shown)}.")
 
 
 def _row_problems(row: Mapping[str, str], first_seen: Mapping[str, int]) -> Iterator[str]:

@@ -12,7 +12,7 @@ from egosim_jax.data.clips import check_clip, load_triplet
 from egosim_jax.data.metadata import ClipFiles, check_presence
 from egosim_jax.data.shards import Record, ShardWriter
 from egosim_jax.io.atomic import lock_folder
-from egosim_jax.io.untrusted import read_bytes
+from egosim_jax.io.untrusted import listing, read_bytes
 from egosim_jax.io.video import Decoding
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
@@ -71,7 +71,7 @@ def encoded_record(files: ClipFiles) -> Record:
     """
     problems = check_clip(files, None)
     if problems:
-        raise InputError("\n".join(problems))
+        raise InputError(listing(problems))
     paths = {
         "prior": files.prior,
         "hands": files.hands,

@@ -38,7 +38,7 @@ from array_record.python.array_record_module import ArrayRecordWriter
 from egosim_jax.io.atomic import LOCK, atomic_folder
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.io.untrusted import parse_json, quote, quote_path, quote_text, read_json
+from egosim_jax.io.untrusted import listing, parse_json, quote, quote_path, quote_text, read_json
 from egosim_jax.types import InputError, VideoSpec
 
 Kind = Literal["videos", "frames", "latents"]
@@ -321,9 +321,9 @@ def gather(parts: Sequence[Path], out: Path) -> Manifest:
             if (part / shard.file).exists():
                 (part / shard.file).replace(out / file)
             for problem in file_problems(out, shards[-1]):
-                problems.append(f"  {problem}: remove {part} to write it again")
+                problems.append(f"{problem}: remove {part} to write it again")
     if problems:
-        raise InputError("\n".join([f"{out} cannot be put together:", *problems]))
+        raise InputError(f"{out} cannot be put together: {listing(problems)}.")
     manifest = dataclasses.replace(read_manifest(parts[0]), arrays=arrays, shards=tuple(shards))
     _write_manifest(out, manifest)
     return manifest
@@ -343,8 +343,7 @@ class ShardReader:
         for shard in self.manifest.shards:
             problems += file_problems(folder, shard)
         if problems:
-            listing = "\n".join(f"  {line}" for line in problems)
-            raise InputError(f"{folder} is not as its manifest says:\n{listing}")
+            raise InputError(f"{folder} is not as its manifest says: {listing(problems)}.")
         self._source = ArrayRecordDataSource(
             [f"{folder / shard.file}[0:{shard.records}]" for shard in self.manifest.shards]
         )
