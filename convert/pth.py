@@ -40,7 +40,7 @@ STORAGES = {
     "ShortStorage": "int16", "CharStorage": "int8", "ByteStorage": "uint8", "BoolStorage": "bool",
 }  # fmt: skip
 UNTYPED = "torch.storage.UntypedStorage"
-MOST_PICKLE, MOST_STEPS, MOST_ENTRIES, DEEPEST = 16 << 20, 1 << 22, 1 << 17, 64
+MOST_PICKLE, MOST_STEPS, MOST_ENTRIES, DEEPEST = 16 << 20, 1 << 20, 1 << 17, 64
 """Bytes and operations of the pickle, entries of the zip, and containers in containers."""
 MOST_ITEMS, MOST_KEY = 1 << 22, 1 << 31
 """Items of all containers, counted wherever they are referred to, and the highest number as key."""

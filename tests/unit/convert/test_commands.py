@@ -10,7 +10,6 @@ import sys
 import time
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp

@@ -197,7 +197,7 @@ def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
     with pytest.raises(InputError) as error:
         read_lora(tmp_path / "bad.safetensors", CONFIG)
     for reason in (
-        "q, block 0: has no lora_B", "want (3, 48) and (48, 3)", "v.kernel, block 0: have (7, 48)",
+        "q, block 0: has no lora_B", "want (3, 48) and (48, 3)", "v, block 0: have (7, 48)",
         "blocks.99", "4 tensors",
     ):  # fmt: skip
         assert reason in str(error.value)
