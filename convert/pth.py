@@ -400,9 +400,10 @@ def _flat(tree: Any) -> dict[str, Tensor]:
     """The tensors of nested containers, by their keys joined with dots."""
     found: dict[str, Tensor] = {}
     left = [(tree, "", 0)]
-    items = 0
+    nodes = items = 0
     while left:
         node, name, depth = left.pop()
+        nodes += 1
         if isinstance(node, Tensor):
             if name in found:
                 raise RefusedError(f"there are two tensors {quote(name)}")
@@ -416,7 +417,7 @@ def _flat(tree: Any) -> dict[str, Tensor]:
                     inner = f"{name}.{key}" if name else str(key)
                     check_name(inner)
                     left.append((value, inner, depth + 1))
-            if len(left) + len(found) > MOST_TENSORS:
+            if nodes + len(left) > MOST_TENSORS:
                 raise RefusedError(f"it has more than {MOST_TENSORS:,} tensors and containers")
         elif isinstance(node, (Name, Storage)):
             raise RefusedError(
