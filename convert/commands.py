@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import shutil
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +16,11 @@ from egosim_jax.convert.layouts import Naming, Network, naming_in, recognise
 from egosim_jax.convert.plan import TABLES, Widening, fits, to_ours, to_theirs
 from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, in_rows, write
-from egosim_jax.io.mapped import Tensor
+from egosim_jax.convert.theirs import FOLDERS, pipeline
+from egosim_jax.io.atomic import atomic_folder, lock_folder
+from egosim_jax.io.mapped import OURS, Tensor
 from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import quote_path, read_bytes
 from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
 from egosim_jax.progress import track, track_bytes
 from egosim_jax.types import InputError
@@ -58,13 +61,13 @@ class Inspect:
                 f"{found.source.bytes / 1e9:.2f}",
                 ", ".join(n for n in configs.names() if fits(found, configs.get(n))) or "none",
             )
-        console = Console(width=160)
+        console = Console(width=160, markup=False, emoji=False, highlight=False)
         console.print(table)
         missing = [name for name in TABLES if name not in {f.network for f in folder.found}]
         for source in folder.unknown:
             console.print(f"{source.name}: no network of ours ({len(source.tensors)} tensors)")
         console.print(f"missing networks: {', '.join(missing) or 'none'}")
-        console.print(f"tokenizer: {folder.tokenizer or 'none'}")
+        console.print(f"tokenizer: {quote_path(folder.tokenizer or 'none')}")
         if self.tensors:
             for source in (*(f.source for f in folder.found), *folder.unknown):
                 for name, tensor in source.tensors.items():
@@ -103,22 +106,31 @@ class Weights:
         folder = recognise(self.source)
         names = self.only or tuple(dict.fromkeys(found.network for found in folder.found))
         if not names:
-            raise InputError(f"{self.source} holds no network of ours. (egosim-convert inspect)")
+            raise InputError(
+                f"{quote_path(self.source)} holds no network of ours. (egosim-convert inspect)"
+            )
+        apart(self.out, self.source)
         planned = []
         for found in map(folder.network, names):
             widen = self.widen if found.network == "dit" else None
             planned.append((found, to_ours(found, config, dtype=self.dtype, widen=widen)))
-        for found, weights in planned:
-            target = self.out / f"{found.network}.safetensors"
-            about = {"format": "egosim_jax", "config": self.config, "source": found.source.name}
-            _write(target, weights, origin=found.source.files, about=about)
+            for file in found.source.files:
+                apart(self.out / f"{found.network}.safetensors", file)
+        kept = {}
         if folder.tokenizer is not None and "text" in names and config.tokenizer.kind != "byt5":
-            shutil.copytree(folder.tokenizer, self.out / config.tokenizer.kind, dirs_exist_ok=True)
+            kept = tokenizer_files(folder.tokenizer, within=self.source)
+        with lock_folder(self.out):
+            for found, weights in planned:
+                target = self.out / f"{found.network}.safetensors"
+                about = {"format": OURS, "config": self.config, "source": found.source.name}
+                _write(target, weights, origin=found.source.files, about=about)
+            if kept:
+                with atomic_folder(self.out / config.tokenizer.kind) as temporary:
+                    for name, data in kept.items():
+                        (temporary / name).write_bytes(data)
         return command.DONE
 
 
-FOLDERS = {"dit": "transformer", "vae": "vae", "text": "text_encoder", "image": "image_encoder"}
-"""Of a network in diffusers' layout."""
 STEMS: dict[tuple[Network, Naming], str] = {
     ("dit", "wan"): "diffusion_pytorch_model",
     ("vae", "wan"): "Wan2.1_VAE",
@@ -138,7 +150,8 @@ LARGEST = 5_000_000_000
 class ToTorch:
     """Write a weights folder as safetensors in PyTorch names, which the other projects load.
 
-    `wan` is the layout of the Wan and EgoSim releases; `diffusers` has a folder for each network.
+    `wan` is the layout of the Wan and EgoSim releases; `diffusers` has a folder for each network,
+    with the configs that `from_pretrained` reads; a tokenizer and an image processor are not in it.
     Networks above 5 GB become several files with an index.
     """
 
@@ -161,6 +174,7 @@ class ToTorch:
         from egosim_jax.io.mapped import read_safetensors
 
         config = configs.get(self.config)
+        apart(self.out, self.weights)
         planned = []
         here: list[Network] = [name for name in TABLES if getattr(config, name) is not None]
         for network in self.only or here:
@@ -169,9 +183,15 @@ class ToTorch:
             tensors = read_safetensors(file)
             theirs = to_theirs(tensors, config, network, naming, dtype=self.dtype)
             folder = self.out / FOLDERS[network] if self.layout == "diffusers" else self.out
-            planned.append((folder / STEMS[network, naming], file, theirs))
-        for stem, file, theirs in planned:
-            _write_sharded(stem, theirs, origin=[file])
+            planned.append((network, folder / STEMS[network, naming], file, theirs))
+        with lock_folder(self.out):
+            for _, stem, file, theirs in planned:
+                _write_sharded(stem, theirs, origin=[file])
+            if self.layout == "diffusers":
+                for path, settings in pipeline(
+                    config, [network for network, *_ in planned]
+                ).items():
+                    write_json(self.out / path, settings)
         return command.DONE
 
 
@@ -198,28 +218,48 @@ class Lora:
     def run(self) -> int:
         """Read, check, write."""
         from egosim_jax import configs
-        from egosim_jax.convert.lora import BASE, about_lora, base_of, exported, read_lora
+        from egosim_jax.convert.lora import (
+            about_lora,
+            check_base,
+            exported,
+            metadata_of,
+            read_lora,
+        )
         from egosim_jax.convert.plan import merged
         from egosim_jax.io.mapped import read_safetensors
+        from egosim_jax.models.lora import BASE, check_scale
 
         config = configs.get(self.config).dit
-        deltas = read_lora(self.source, config)
-        origin = sorted(self.source.iterdir()) if self.source.is_dir() else [self.source]
+        check_scale(self.scale)
+        for source in (self.source, self.merge):
+            if source is not None:
+                apart(self.out, source)
+        base = {_hash(folder) for folder in (self.merge, self.base) if folder is not None}
+        if base:
+            check_base(self.source, base)
+        changes = read_lora(self.source, config)
+        origin = [self.source]
+        if self.source.is_dir():
+            origin = sorted(file for file in self.source.iterdir() if file.is_file())
         if self.merge is None:
-            base = base_of(self.source) if self.base is None else {BASE: hashes(self.base)["dit"]}
+            said = about_lora(changes)
+            for known in (*base, *filter(None, [metadata_of(self.source).get(BASE)])):
+                said[BASE] = known
             weights = [
                 Weight(
                     name=name, shape=tensor.shape, dtype=tensor.dtype, pieces=(lambda t=tensor: t,)
                 )
-                for name, tensor in exported(deltas, config).items()
+                for name, tensor in exported(changes, config).items()
             ]
-            _write(self.out, weights, origin=origin, about=about_lora(deltas) | base)
+            with lock_folder(self.out.parent):
+                _write(self.out, weights, origin=origin, about=said)
             return command.DONE
         file = self.merge / "dit.safetensors"
-        weights = merged(read_safetensors(file), deltas, config, scale=self.scale)
-        about = {"format": "egosim_jax", "config": self.config, "lora": self.source.name}
-        _write(self.out / file.name, weights, origin=[file, *origin], about=about)
-        link_others(self.out, self.merge)
+        weights = merged(read_safetensors(file), changes, config, scale=self.scale)
+        about = {"format": OURS, "config": self.config, "lora": quote_path(self.source.name)}
+        with lock_folder(self.out):
+            _write(self.out / file.name, weights, origin=[file, *origin], about=about)
+            link_others(self.out, self.merge)
         return command.DONE
 
 
@@ -227,8 +267,9 @@ class Lora:
 class Verify:
     """Compare a weights folder with the checkpoint that it was made from, tensor by tensor.
 
-    Every value must be the source's, bit for bit, after the change of layout and dtype. Where
-    torch, diffusers and transformers are installed, one forward of each network is compared, too.
+    Every value must be the source's, bit for bit, after the change of layout and dtype, and what
+    its checksums say. Where torch, diffusers and transformers are installed, one forward of each
+    network is compared, too.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -249,8 +290,14 @@ class Verify:
         config = configs.get(self.config)
         wrong = []
         folder = recognise(self.source)
+        files = {f.network: self.weights / f"{f.network}.safetensors" for f in folder.found}
+        if not any(file.exists() for file in files.values()):
+            raise InputError(
+                f"{quote_path(self.weights)} has none of the networks of "
+                f"{quote_path(self.source)}, {', '.join(files) or 'which holds none'}."
+            )
         for found in folder.found:
-            file = self.weights / f"{found.network}.safetensors"
+            file = files[found.network]
             if not file.exists():
                 print(f"{found.network}: not converted")
                 continue
@@ -259,14 +306,19 @@ class Verify:
             tensors = read_safetensors(file)
             if problems := mismatches(tensors, {w.name: w.shape for w in weights}):
                 raise WeightsError(problems, source=str(file))
+            damaged = [name for name, tensor in tensors.items() if not tensor.intact]
+            wrong += [f"{found.network}: {name} is not what was written" for name in damaged]
+            if not any(tensor.checksums for tensor in tensors.values()):
+                print(f"{found.network}: carries no checksums; converting again adds them")
             differ = [
                 weight.name
                 for weight in track(weights, f"comparing {found.network}", total=len(weights))
-                if not _same(weight, tensors[weight.name])
+                if weight.name not in damaged and not _same(weight, tensors[weight.name])
             ]
-            print(f"{found.network}: {len(weights) - len(differ)} of {len(weights)} weights equal")
+            equal = len(weights) - len(differ) - len(damaged)
+            print(f"{found.network}: {equal} of {len(weights)} weights equal")
             wrong += [f"{found.network}: {name} differs" for name in differ]
-            if forward.possible():
+            if forward.possible() and not damaged:
                 error = forward.difference(found, file, config, widen=widen)
                 print(f"{found.network}: forward differs from PyTorch's by {error:.1e}")
                 if not error <= forward.TOLERANCE:
@@ -275,6 +327,44 @@ class Verify:
             print(f"no forward compared: that takes {', '.join(forward.MODULES)}")
         print("\n".join(wrong), end="\n" if wrong else "")
         return command.FAILED if wrong else command.DONE
+
+
+def apart(out: Path, source: Path) -> None:
+    """Raise `InputError` if what is written is, or lies in, what it is made from."""
+    here, there = (Path(os.path.realpath(path)) for path in (out, source))
+    if there in (here, *here.parents):
+        raise InputError(
+            f"{quote_path(out)} is, or lies in, {quote_path(source)}, which is read: choose a "
+            "place apart. (--out)"
+        )
+
+
+TOKENIZER_FILES = (
+    "tokenizer.json", "spiece.model", "tokenizer_config.json", "special_tokens_map.json",
+)  # fmt: skip
+MOST_TOKENIZER = 64 << 20
+"""Bytes of each."""
+
+
+def tokenizer_files(folder: Path, *, within: Path) -> dict[str, bytes]:
+    """The files of a tokenizer. Raises `InputError` for links, which may lead anywhere."""
+    files = [folder / name for name in TOKENIZER_FILES if os.path.lexists(folder / name)]
+    inner = [path for path in (folder, *folder.parents) if within in path.parents]
+    for path in (*inner, *files):
+        if path.is_symlink():
+            raise InputError(
+                f"{quote_path(path)} is a link: those of a tokenizer are not followed. Copy the "
+                "checkpoint's folder with `cp -rL`, if you trust where its links lead."
+            )
+    return {file.name: read_bytes(file, limit=MOST_TOKENIZER) for file in files}
+
+
+def _hash(folder: Path) -> str:
+    """Of the video transformer of a weights folder."""
+    found = hashes(folder, only=("dit",))
+    if not found:
+        raise InputError(f"{quote_path(folder)} has no dit.safetensors. (--merge, --base)")
+    return found["dit"]
 
 
 def _same(weight: Weight, tensor: Tensor) -> bool:
@@ -298,7 +388,7 @@ def _write(
     pieces = write(target, weights, origin=origin, about=about)
     for _ in track_bytes(pieces, f"writing {target.name}", total=total):
         pass
-    print(target)
+    print(quote_path(target))
 
 
 def _write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Path]) -> None:

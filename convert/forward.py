@@ -19,6 +19,7 @@ from einops import rearrange
 from egosim_jax.convert.layouts import Found, naming_in
 from egosim_jax.convert.plan import BASE_CHANNELS, MASK, Widening, to_theirs
 from egosim_jax.convert.skeleton import skeleton
+from egosim_jax.convert.theirs import arguments
 from egosim_jax.generator import ModelConfig, Program
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import fill, flat_shapes
@@ -150,20 +151,7 @@ def _dit(
 
     draw = np.random.default_rng(0).standard_normal
     channels = BASE_CHANNELS if widen else shape.in_channels
-    module = WanTransformer3DModel(
-        num_attention_heads=shape.heads,
-        attention_head_dim=shape.head_dim,
-        in_channels=channels,
-        out_channels=shape.out_channels,
-        text_dim=shape.text_dim,
-        freq_dim=shape.freq_dim,
-        ffn_dim=shape.ffn_dim,
-        num_layers=shape.layers,
-        cross_attn_norm=True,
-        eps=shape.eps,
-        image_dim=shape.image_dim,
-        added_kv_proj_dim=shape.image_dim and shape.dim,
-    )
+    module = WanTransformer3DModel(**arguments("dit", replace(shape, in_channels=channels)))
     latents = draw((1, 2, 8, 8, shape.in_channels), np.float32)
     text = draw((1, TEXT_TOKENS, shape.text_dim), np.float32)
     image = shape.image_dim and draw((1, IMAGE_TOKENS, shape.image_dim), np.float32)
@@ -188,13 +176,7 @@ def _vae(ours: Any, shape: WanVAEConfig, theirs: _Theirs) -> tuple[np.ndarray, n
     import torch
     from diffusers import AutoencoderKLWan
 
-    module = AutoencoderKLWan(
-        base_dim=shape.dim,
-        z_dim=shape.z_dim,
-        dim_mult=list(shape.dim_mult),
-        num_res_blocks=shape.res_blocks,
-        temperal_downsample=list(shape.temporal_downsample),
-    )
+    module = AutoencoderKLWan(**arguments("vae", shape))
     theirs.load(module)
     video = np.random.default_rng(0).uniform(-1, 1, (1, 5, 32, 32, 3)).astype(np.float32)
     have = Program(lambda vae, x: vae.decode(vae.encode(x)), ours)(video)
@@ -211,18 +193,7 @@ def _text(ours: Any, shape: UMT5Config, theirs: _Theirs) -> tuple[np.ndarray, np
     from transformers import UMT5Config as TheirConfig
     from transformers import UMT5EncoderModel
 
-    config = TheirConfig(
-        vocab_size=shape.vocab,
-        d_model=shape.dim,
-        d_kv=shape.head_dim,
-        d_ff=shape.ffn_dim,
-        num_layers=shape.layers,
-        num_heads=shape.heads,
-        relative_attention_num_buckets=shape.buckets,
-        relative_attention_max_distance=shape.max_distance,
-        layer_norm_epsilon=shape.eps,
-        feed_forward_proj="gated-gelu",
-    )
+    config = TheirConfig(**arguments("text", shape))
     ids = np.random.default_rng(0).integers(0, shape.vocab, (1, TEXT_TOKENS // 4), np.int32)
     mask = np.ones(ids.shape, bool)
     have = _run(ours, ids, mask)
@@ -238,16 +209,7 @@ def _image(ours: Any, shape: CLIPVisionConfig, theirs: _Theirs) -> tuple[np.ndar
     from transformers import CLIPVisionConfig as TheirConfig
     from transformers import CLIPVisionModel
 
-    config = TheirConfig(
-        hidden_size=shape.dim,
-        intermediate_size=shape.ffn_dim,
-        num_hidden_layers=shape.layers,
-        num_attention_heads=shape.heads,
-        image_size=shape.image_size,
-        patch_size=shape.patch,
-        layer_norm_eps=shape.eps,
-        hidden_act="gelu",
-    )
+    config = TheirConfig(**arguments("image", shape))
     size = (1, shape.image_size, shape.image_size, 3)
     pixels = np.random.default_rng(0).standard_normal(size, np.float32)
     have = _run(ours, pixels)

@@ -14,6 +14,7 @@ from typing import Literal
 
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.io.mapped import Tensor
+from egosim_jax.io.untrusted import quote_path
 from egosim_jax.types import InputError
 
 Network = Literal["dit", "vae", "text", "image"]
@@ -32,6 +33,8 @@ TELLTALES: dict[tuple[Network, Naming], str] = {
 TOKENIZER = ("tokenizer.json", "spiece.model")
 DEEPEST = 2
 """Folders in the folder that are searched."""
+MOST_NETWORKS = 16
+"""Networks in a checkpoint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +75,8 @@ class Folder:
         if len(here) != 1:
             names = ", ".join(found.source.name for found in here) or "none"
             raise InputError(
-                f"{self.path} holds {len(here)} checkpoints of the network {name} ({names}); it "
-                "takes one. Name the file itself. (--source)"
+                f"{quote_path(self.path)} holds {len(here)} checkpoints of the network {name} "
+                f"({names}); it takes one. Name the file itself. (--source)"
             )
         return here[0]
 
@@ -90,7 +93,8 @@ def recognise(path: Path) -> Folder:
             unknown += [] if networks else [source]
     if not found and not unknown:
         raise InputError(
-            f"{path} holds no checkpoint: no .safetensors, .pth, .pt or .bin. (--source)"
+            f"{quote_path(path)} holds no checkpoint: no .safetensors, .pth, .pt or .bin. "
+            "(--source)"
         )
     return Folder(path=path, found=tuple(found), unknown=tuple(unknown), tokenizer=tokenizer)
 
@@ -109,6 +113,11 @@ def networks_of(source: Source) -> list[Found]:
             prefix = name.removesuffix(telltale)
             if prefix != name and (not prefix or prefix.endswith(".")):
                 found.append(Found(network=network, naming=naming, prefix=prefix, source=source))
+    if len(found) > MOST_NETWORKS:
+        raise InputError(
+            f"{source.name} holds {len(found)} networks, more than the {MOST_NETWORKS} that are "
+            "read from a file. Split it."
+        )
     return found
 
 

@@ -13,15 +13,15 @@ import numpy as np
 
 from egosim_jax.convert.layouts import Found, Naming, Network
 from egosim_jax.convert.rules import Leaf, Rule, assign, outline
-from egosim_jax.convert.skeleton import shapes, skeleton
+from egosim_jax.convert.skeleton import shapes
 from egosim_jax.convert.stream import Weight, stored_as
 from egosim_jax.io.mapped import Tensor
-from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
+from egosim_jax.io.weights import WeightsError, mismatches
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
-    from egosim_jax.models.lora import Delta
+    from egosim_jax.models.lora import Change
     from egosim_jax.models.wan_dit import WanDiTConfig
 
 TABLES: dict[Network, str] = {
@@ -103,34 +103,38 @@ def to_theirs(
 
 def merged(
     tensors: Mapping[str, Tensor],
-    deltas: Mapping[str, Delta],
+    changes: Mapping[str, Change],
     config: WanDiTConfig,
     *,
     scale: float,
 ) -> list[Weight]:
-    """The weights of a video transformer with a LoRA in their kernels, in their own dtypes.
+    """The weights of a video transformer with a LoRA in them, in their own dtypes.
 
     Raises `InputError` if the weights or the LoRA are not of the config.
     """
     from egosim_jax.models import lora
 
-    network = skeleton("dit", config)
-    if problems := mismatches(tensors, flat_shapes(network)):
+    want = shapes("dit", config)
+    if problems := mismatches(tensors, want):
         raise WeightsError(problems, source="dit.safetensors")
-    lora.check(network, deltas)
+    lora.check_scale(scale)
+    lora.check(want, changes)
 
-    def piece(tensor: Tensor, delta: Delta | None, layer: int | None) -> np.ndarray:
-        kernel = tensor.array() if layer is None else tensor.array()[layer]
-        if delta is None:
-            return kernel
-        down, up = (x if layer is None else x[layer] for x in (delta.down, delta.up))
-        return kernel.astype(np.float32) + scale * (down @ up)
+    def piece(path: str, layer: int | None) -> np.ndarray:
+        at = ... if layer is None else layer
+        weight = tensors[path].array()[at]
+        low, whole = changes.get(path.removesuffix(".kernel")), changes.get(path)
+        added = []
+        if path.endswith(".kernel") and isinstance(low, lora.Delta):
+            added.append(low.down[at] @ low.up[at])
+        if isinstance(whole, np.ndarray):
+            added.append(whole[at])
+        return weight.astype(np.float32) + scale * sum(added) if added else weight
 
     weights = []
     for path, tensor in tensors.items():
         layers = range(tensor.shape[0]) if path.startswith("blocks.") else (None,)
-        delta = deltas.get(path.removesuffix(".kernel")) if path.endswith(".kernel") else None
-        pieces = tuple(partial(piece, tensor, delta, layer) for layer in layers)
+        pieces = tuple(partial(piece, path, layer) for layer in layers)
         weights.append(Weight(name=path, shape=tensor.shape, dtype=tensor.dtype, pieces=pieces))
     return weights
 

@@ -11,18 +11,27 @@ until it is.
 from __future__ import annotations
 
 import math
-import mmap
 import pickletools
 import struct
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from egosim_jax.io.mapped import DTYPES, Tensor
+from egosim_jax.io.mapped import (
+    DTYPES,
+    MOST_AXES,
+    MOST_TENSORS,
+    RefusedError,
+    Tensor,
+    check_name,
+    check_sizes,
+    map_file,
+    strides_of,
+)
+from egosim_jax.io.untrusted import quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 STORAGES = {
@@ -31,13 +40,16 @@ STORAGES = {
     "ShortStorage": "int16", "CharStorage": "int8", "ByteStorage": "uint8", "BoolStorage": "bool",
 }  # fmt: skip
 UNTYPED = "torch.storage.UntypedStorage"
-MOST_PICKLE, MOST_ENTRIES, DEEPEST = 64 << 20, 1 << 20, 64
-"""Bytes of the pickle, entries of the zip and of all containers, and containers in containers."""
-LOCAL_HEADER, LOCAL_MAGIC = 30, b"PK\x03\x04"
-
-
-class RefusedError(Exception):
-    """What in the pickle cannot be read, and why."""
+MOST_PICKLE, MOST_STEPS, MOST_ENTRIES, DEEPEST = 16 << 20, 1 << 20, 1 << 17, 64
+"""Bytes and operations of the pickle, entries of the zip, and containers in containers."""
+MOST_ITEMS, MOST_KEY = 1 << 22, 1 << 31
+"""Items of all containers, counted wherever they are referred to, and the highest number as key."""
+END, END64_PLACE = struct.Struct("<10xH4xI2x"), struct.Struct("<8xQ4x")
+END64, LOCAL = struct.Struct("<32xQ8xQ"), struct.Struct("<26xHH")
+LISTED = struct.Struct("<8xHH8xIIHHH8xI")
+"""What is read of the records of a zip: its end, the same in 64 bits, and each entry twice."""
+STORED, NARROW = 0, 0xFFFFFFFF
+"""The method of entries that are not compressed, and what stands for a number of 64 bits."""
 
 
 @dataclass(frozen=True)
@@ -62,41 +74,39 @@ def read_pth(path: Path) -> dict[str, Tensor]:
     The file stays mapped as long as any of them is held. Raises `InputError` with the reason if it
     is no such file, is damaged, or holds anything but tensors, plain values and containers.
     """
+    data = map_file(path)
     try:
-        with path.open("rb") as file:
-            data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-            entries = _entries(file, data)
-        return _flat(_Machine(entries).run())
-    except (RefusedError, zipfile.BadZipFile, ValueError, OSError, struct.error) as error:
+        return _flat(_Machine(_entries(data)).run())
+    except (ValueError, struct.error) as error:
+        reason = str(error) if isinstance(error, RefusedError) else quote_text(str(error))
         raise InputError(
-            f"{path} is not read: {error}. Only tensors in plain containers, as torch.save writes "
-            "state dicts, are; resave the weights as such, or better as safetensors."
+            f"{quote_path(path)} is not read: {reason}. Only tensors in plain containers, as "
+            "torch.save writes state dicts, are; resave the weights as such, or better as "
+            "safetensors."
         ) from error
 
 
-def _entries(file: Any, data: memoryview) -> dict[str, memoryview]:
+def _entries(data: memoryview) -> dict[str, memoryview]:
     """The bytes of every entry, without the folder that they all lie in."""
     if bytes(data[:2]) != b"PK":
         raise RefusedError(
             "it is no zip; files from before torch 1.6 and bare pickles are not read"
         )
-    with zipfile.ZipFile(file) as archive:
-        listed = archive.infolist()
-    if len(listed) > MOST_ENTRIES:
-        raise RefusedError(f"it has {len(listed)} entries, more than {MOST_ENTRIES}")
-    if sum(entry.file_size for entry in listed) > len(data):
-        raise RefusedError("its entries are larger than the file")
-    found = {}
-    for entry in listed:
-        parts = entry.filename.split("/")
-        if ".." in parts or entry.filename.startswith("/") or "\\" in entry.filename:
-            raise RefusedError(f"entry {entry.filename!r} points outside")
-        if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-            raise RefusedError(f"entry {entry.filename!r} is compressed or encrypted")
+    found: dict[str, memoryview] = {}
+    total = 0
+    for listed in _directory(data):
+        total += listed.size
+        if total > len(data):
+            raise RefusedError("its entries are larger than the file")
+        parts = listed.name.split("/")
+        if ".." in parts or listed.name.startswith("/") or "\\" in listed.name:
+            raise RefusedError(f"entry {quote(listed.name)} points outside")
+        if listed.method != STORED or listed.flags & 1:
+            raise RefusedError(f"entry {quote(listed.name)} is compressed or encrypted")
         name = "/".join(parts[1:])
         if name in found:
-            raise RefusedError(f"entry {entry.filename!r} is there twice")
-        found[name] = _stored(entry, data)
+            raise RefusedError(f"entry {quote(listed.name)} is there twice")
+        found[name] = _stored(listed, data)
     if found.get("byteorder", b"little") != b"little":
         raise RefusedError("its numbers are big-endian")
     if "data.pkl" not in found:
@@ -104,17 +114,67 @@ def _entries(file: Any, data: memoryview) -> dict[str, memoryview]:
     return found
 
 
-def _stored(entry: zipfile.ZipInfo, data: memoryview) -> memoryview:
+class Entry(NamedTuple):
+    """What the directory of a zip says of an entry."""
+
+    name: str
+    flags: int
+    method: int
+    size: int
+    offset: int
+
+
+def _directory(data: memoryview) -> Iterator[Entry]:
+    """The entries that a zip says it has, as many as it says, and no more than `MOST_ENTRIES`."""
+    tail = max(0, len(data) - END.size - 0xFFFF)
+    end = bytes(data[tail:]).rfind(b"PK\5\6") + tail
+    if end < tail or end + END.size > len(data):
+        raise RefusedError("it is a zip without its end: it was cut off")
+    count, place = END.unpack_from(data, end)
+    if end >= END64_PLACE.size and data[end - END64_PLACE.size :][:4] == b"PK\6\7":
+        (wide,) = END64_PLACE.unpack_from(data, end - END64_PLACE.size)
+        if wide + END64.size > len(data) or data[wide : wide + 4] != b"PK\6\6":
+            raise RefusedError("its directory is not where it says")
+        count, place = END64.unpack_from(data, wide)
+    if count > MOST_ENTRIES:
+        raise RefusedError(f"it has {count:,} entries, more than {MOST_ENTRIES:,}")
+    for _ in range(count):
+        if place + LISTED.size > len(data) or data[place : place + 4] != b"PK\1\2":
+            raise RefusedError("its directory is damaged")
+        flags, method, packed, size, name, extra, comment, offset = LISTED.unpack_from(data, place)
+        names = place + LISTED.size
+        after = names + name + extra + comment
+        if after > len(data):
+            raise RefusedError("its directory is damaged")
+        more = _wide(bytes(data[names + name : names + name + extra]))
+        size = next(more, size) if size == NARROW else size
+        packed = next(more, packed) if packed == NARROW else packed
+        offset = next(more, offset) if offset == NARROW else offset
+        text = bytes(data[names : names + name]).decode("utf-8", "replace")
+        if packed != size and method == STORED:
+            raise RefusedError(f"entry {quote(text)} has two sizes")
+        yield Entry(text, flags, method, size, offset)
+        place = after
+
+
+def _wide(extra: bytes) -> Iterator[int]:
+    """The numbers of an entry that do not fit in 32 bits."""
+    while len(extra) >= 4:
+        kind, size = struct.unpack_from("<HH", extra)
+        if kind == 1:
+            yield from (number for (number,) in struct.iter_unpack("<Q", extra[4 : 4 + size & ~7]))
+        extra = extra[4 + size :]
+
+
+def _stored(entry: Entry, data: memoryview) -> memoryview:
     """The bytes of an entry; its own header repeats and lengthens what the directory says."""
-    start = entry.header_offset
-    header = bytes(data[start : start + LOCAL_HEADER])
-    if len(header) < LOCAL_HEADER or header[:4] != LOCAL_MAGIC:
-        raise RefusedError(f"entry {entry.filename!r} has no header where the directory says")
-    name, extra = struct.unpack_from("<HH", header, 26)
-    begin = start + LOCAL_HEADER + name + extra
-    if begin + entry.file_size > len(data):
-        raise RefusedError(f"entry {entry.filename!r} goes on after the file's end")
-    return data[begin : begin + entry.file_size]
+    if entry.offset + LOCAL.size > len(data) or data[entry.offset :][:4] != b"PK\3\4":
+        raise RefusedError(f"entry {quote(entry.name)} has no header where the directory says")
+    name, extra = LOCAL.unpack_from(data, entry.offset)
+    begin = entry.offset + LOCAL.size + name + extra
+    if begin + entry.size > len(data):
+        raise RefusedError(f"entry {quote(entry.name)} goes on after the file's end")
+    return data[begin : begin + entry.size]
 
 
 class _Machine:
@@ -131,7 +191,9 @@ class _Machine:
         program = self.entries["data.pkl"]
         if len(program) > MOST_PICKLE:
             raise RefusedError(f"its pickle has {len(program)} bytes, more than {MOST_PICKLE}")
-        for opcode, argument, _ in pickletools.genops(bytes(program)):
+        for step, (opcode, argument, _) in enumerate(pickletools.genops(bytes(program))):
+            if step == MOST_STEPS:
+                raise RefusedError(f"its pickle has more than {MOST_STEPS:,} operations")
             if opcode.name == "STOP":
                 return self._pop()
             action = ACTIONS.get(opcode.name)
@@ -162,7 +224,7 @@ class _Machine:
             text = f"{module} {last}"
         full = text.replace(" ", ".", 1)
         if full not in KNOWN:
-            raise RefusedError(f"its pickle asks for {full}")
+            raise RefusedError(f"its pickle asks for {quote_text(full)}")
         self.push(Name(full))
 
     def tuple_of(self, count: int | None) -> None:
@@ -182,10 +244,15 @@ class _Machine:
         if not isinstance(target, dict) or len(items) % 2:
             raise RefusedError("its pickle sets items of what is no dictionary")
         for key, value in zip(items[::2], items[1::2], strict=True):
-            if not isinstance(key, (str, int)):
-                raise RefusedError(f"a key is {type(key).__name__}, neither text nor a number")
+            match key:
+                case str():
+                    check_name(key)
+                case int() if abs(key) < MOST_KEY:  # wider ones may be made to collide
+                    pass
+                case _:
+                    raise RefusedError(f"a key is {quote(key)}, neither text nor a usual number")
             if key in target:
-                raise RefusedError(f"the key {key!r} is there twice")
+                raise RefusedError(f"the key {quote(key)} is there twice")
             target[key] = value
 
     def storage(self, _: None) -> None:
@@ -193,16 +260,18 @@ class _Machine:
             case ("storage", Name(kind), str(key), str(), int(count)):
                 pass
             case other:
-                raise RefusedError(f"its pickle refers to {other!r:.60}, which is no storage")
+                raise RefusedError(f"its pickle refers to {quote(other)}, which is no storage")
         data = self.entries.get(f"data/{key}")
         if data is None:
-            raise RefusedError(f"the storage {key} is missing")
+            raise RefusedError(f"the storage {quote_text(key)} is missing")
         dtype = None if kind == UNTYPED else STORAGES.get(kind.removeprefix("torch."))
         if dtype is None and kind != UNTYPED:
             raise RefusedError(f"{kind} is no storage")
         size = count * (1 if dtype is None else np.dtype(DTYPES[dtype]).itemsize)
         if count < 0 or size > len(data):
-            raise RefusedError(f"the storage {key} says {size} bytes and has {len(data)}")
+            raise RefusedError(
+                f"the storage {quote_text(key)} says {quote(size)} bytes and has {len(data)}"
+            )
         self.push(Storage(data[:size], dtype))
 
     def call(self, _: None) -> None:
@@ -305,14 +374,13 @@ ACTIONS: dict[str, Callable[[_Machine, Any], None]] = {
 
 def _tensor(storage: Storage, dtype: str, offset: Any, size: tuple, stride: tuple) -> Tensor:
     """A tensor of a storage, if all its elements lie there."""
-    numbers = (offset, *size, *stride)
-    if len(size) != len(stride) or not all(type(n) is int and n >= 0 for n in numbers):
-        raise RefusedError(
-            f"a tensor has offset {offset!r:.40}, size {size!r:.80}, stride {stride!r:.80}"
-        )
     if dtype not in DTYPES:
         raise RefusedError(f"a tensor is of {dtype}")
+    if len(size) != len(stride) or len(size) > MOST_AXES:
+        raise RefusedError(f"a tensor has {len(size)} axes and {len(stride)} strides")
     kind = np.dtype(DTYPES[dtype])
+    check_sizes("a tensor", (offset, *size, *stride))
+    strides_of("a tensor", size, kind)
     count = math.prod(size)
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     here = len(storage.data) // kind.itemsize
@@ -321,7 +389,7 @@ def _tensor(storage: Storage, dtype: str, offset: Any, size: tuple, stride: tupl
     if count > max(here, 1):
         raise RefusedError(f"a tensor of size {size} repeats the {here} elements of its storage")
     return Tensor(
-        shape=tuple(size),
+        shape=size,
         dtype=kind,
         data=storage.data[offset * kind.itemsize :],
         strides=tuple(kind.itemsize * step for step in stride),
@@ -332,20 +400,25 @@ def _flat(tree: Any) -> dict[str, Tensor]:
     """The tensors of nested containers, by their keys joined with dots."""
     found: dict[str, Tensor] = {}
     left = [(tree, "", 0)]
-    visited = 0
+    nodes = items = 0
     while left:
         node, name, depth = left.pop()
-        visited += 1
-        if visited > MOST_ENTRIES or depth > DEEPEST:
-            raise RefusedError("its containers are nested too deeply or repeat without end")
+        nodes += 1
         if isinstance(node, Tensor):
             if name in found:
-                raise RefusedError(f"there are two tensors {name!r}")
+                raise RefusedError(f"there are two tensors {quote(name)}")
             found[name] = node
-        elif isinstance(node, dict):
-            left += [(v, f"{name}.{k}" if name else str(k), depth + 1) for k, v in node.items()]
-        elif isinstance(node, (list, tuple)):
-            left += [(v, f"{name}.{i}" if name else str(i), depth + 1) for i, v in enumerate(node)]
+        elif isinstance(node, (dict, list, tuple)):
+            items += len(node)
+            if items > MOST_ITEMS or depth > DEEPEST:
+                raise RefusedError("its containers are nested too deeply or repeat without end")
+            for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+                if isinstance(value, (Tensor, dict, list, tuple, Name, Storage)):
+                    inner = f"{name}.{key}" if name else str(key)
+                    check_name(inner)
+                    left.append((value, inner, depth + 1))
+            if nodes + len(left) > MOST_TENSORS:
+                raise RefusedError(f"it has more than {MOST_TENSORS:,} tensors and containers")
         elif isinstance(node, (Name, Storage)):
             raise RefusedError(
                 f"{name or 'the whole'} is no tensor but {type(node).__name__.lower()}"

@@ -120,9 +120,7 @@ def assign(
             problems.append(f"{name}: not known to this network's name table")
         for rule, hit in matches:
             layer = int(hit.group(1)) if hit.groups() else 0
-            other = found.setdefault(rule, {}).setdefault(layer, name)
-            if other != name:
-                problems.append(f"{name}: is there twice, as {other}")
+            found.setdefault(rule, {})[layer] = name
             try:
                 shape = rule.ours(outline(tensor)).shape
             except (EinopsError, ValueError):
@@ -137,7 +135,8 @@ def assign(
             problems.append(f"{rule.source}: missing (fills {rule.target})")
         elif sorted(layers) != list(range(len(layers))):
             gaps = sorted(set(range(max(layers))) - set(layers))
-            problems.append(f"{rule.source}: layers {gaps} are missing")
+            more = f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
+            problems.append(f"{rule.source}: layers {gaps[:8]}{more} are missing")
         elif len(kinds) > 1:
             problems.append(f"{rule.source}: the layers differ in shape or dtype")
         elif kinds:
@@ -188,4 +187,5 @@ def outline(tensor: Any) -> np.ndarray:
 
 
 def _regex(pattern: str) -> re.Pattern[str]:
-    return re.compile(re.escape(pattern).replace(r"\*", r"(\d+)"))
+    """A layer has up to four digits, so that a list of all before it is short."""
+    return re.compile(re.escape(pattern).replace(r"\*", "(0|[1-9][0-9]{0,3})"))

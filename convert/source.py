@@ -6,8 +6,8 @@ lies in which. Nothing is read but headers until a tensor is asked for its value
 
 from __future__ import annotations
 
-import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,10 +15,11 @@ from pathlib import Path
 
 from egosim_jax.convert.pth import read_pth
 from egosim_jax.io.mapped import Tensor, read_safetensors
+from egosim_jax.io.untrusted import quote, quote_path, read_json
 from egosim_jax.types import InputError
 
 INDEX = ".safetensors.index.json"
-SHARD = re.compile(r"(.+)-\d{5}-of-(\d{5})")
+SHARD = re.compile(r"(.+)-[0-9]{5}-of-([0-9]{5})")
 PTH = (".pth", ".pt", ".bin")
 
 
@@ -43,45 +44,59 @@ def sources(path: Path) -> Iterator[Source]:
     Files of one index, or numbered `NAME-00001-of-00003`, are one. Raises `InputError` if a file is
     damaged or a numbered one is missing, and for a name that two files of one have.
     """
-    if path.is_file():
-        yield _joined(path.name, [path])
-        return
     if not path.is_dir():
-        raise InputError(f"{path} is not there. (--source)")
+        yield _joined(quote_path(path.name), [path])
+        return
     left = {f for f in path.iterdir() if f.suffix in (".safetensors", *PTH) and f.is_file()}
     for index in sorted(path.glob(f"*{INDEX}")):
-        files = _indexed(index)
+        places = _indexed(index)
+        files = sorted({index.parent / place for place in places.values()})
         left -= set(files)
-        yield _joined(index.name.removesuffix(INDEX), files)
+        source = _joined(quote_path(index.name.removesuffix(INDEX)), files)
+        if lost := places.keys() - source.tensors.keys():
+            raise InputError(
+                f"{quote_path(index)} names {len(lost)} tensors that its files lack, such as "
+                f"{quote(min(lost))}: the files are not all of one download."
+            )
+        yield source
     groups: dict[str, list[Path]] = {}
     for file in sorted(left):
         part = SHARD.fullmatch(file.stem)
-        groups.setdefault(part[1] if part else file.name, []).append(file)
+        groups.setdefault(quote_path(part[1] if part else file.name), []).append(file)
     for name, files in groups.items():
         part = SHARD.fullmatch(files[0].stem)
         if part and len(files) != int(part[2]):
-            raise InputError(f"{path} has {len(files)} of the {int(part[2])} files of {name}.")
+            raise InputError(
+                f"{quote_path(path)} has {len(files)} of the {int(part[2])} files of {name}."
+            )
         yield _joined(name, files)
 
 
-def _indexed(index: Path) -> list[Path]:
-    """The files of an index, all there."""
-    try:
-        places = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-        files = sorted({index.parent / place for place in places.values()})
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{index} is no index of safetensors: {error!r}.") from error
-    for file in files:
-        if file.parent != index.parent or not file.is_file():
-            raise InputError(f"{index} names {file.name}, which is not beside it.")
-    return files
+def _indexed(index: Path) -> dict[str, str]:
+    """The file, beside the index and there, of each tensor."""
+    match read_json(index):
+        case {"weight_map": dict(places)} if places:
+            pass
+        case _:
+            raise InputError(f"{quote_path(index)} is no index of safetensors: no weight_map.")
+    for place in set(map(type, places.values())) - {str}:
+        raise InputError(f"{quote_path(index)} names a {place.__name__} where a file has to be.")
+    beside = set(os.listdir(index.parent))
+    for place in sorted(set(places.values())):
+        if place not in beside or not place.endswith(".safetensors"):
+            raise InputError(
+                f"{quote_path(index)} names {quote(place)}, which is no safetensors beside it."
+            )
+    return places
 
 
 def _joined(name: str, files: Sequence[Path]) -> Source:
     tensors: dict[str, Tensor] = {}
     for file in files:
         found = read_pth(file) if file.suffix in PTH else read_safetensors(file)
-        if twice := sorted(tensors.keys() & found.keys()):
-            raise InputError(f"{file} has {', '.join(twice)}, which another file of {name} has.")
+        if twice := tensors.keys() & found.keys():
+            raise InputError(
+                f"{quote_path(file)} has {quote(min(twice))}, which another file of {name} has."
+            )
         tensors |= found
     return Source(name=name, files=tuple(files), tensors=tensors)

@@ -2,32 +2,31 @@
 
 A weight is made of pieces, as a stack is of layers; the place of each in the file is known from the
 start, so that what lies apart in the source is put together without being held. Beside the growing
-file lies a log with the hash of each piece that is in it; the file takes its name when all are. Its
-own hash, over those of the pieces, stands in its header.
+file lies a log with the hash of each piece that is in it; the file takes its name when all are.
+Those hashes are the checksums in its header, so that they cost nothing more.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import mmap
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from io import FileIO
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.io.mapped import CODES
-from egosim_jax.io.weights import HASH
+from egosim_jax.io.atomic import sync
+from egosim_jax.io.mapped import BLANK, Named, digest, header
+from egosim_jax.types import InputError
 
 WORKERS, AHEAD = 2, 3
 """Threads that prepare pieces, and pieces that are held at most."""
-BLANK = b"0" * 64
-"""Stands in the header where the hash will be."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,80 +51,78 @@ def write(
     """Write the weights to `target`; yields the bytes of each piece when it is in the file.
 
     `origin` are the files that the pieces come from: a file that is half written goes on only if
-    they have not changed. `about` goes into the header.
+    they have not changed. `about` goes into the header, which is sealed if the format is ours.
+    Pieces that turn out to be damaged leave nothing behind.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # The widest first, so that every weight lies at a multiple of its width.
     ordered = sorted(weights, key=lambda weight: (-weight.dtype.itemsize, weight.name))
-    header = _header(ordered, about)
     pieces = [(weight, piece) for weight in ordered for piece in weight.pieces]
     sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
+    blank = _header(ordered, about, len(pieces) * [BLANK])
+    plan = _plan(blank, origin)
     part, log = (target.with_name(target.name + end) for end in (".part", ".part.log"))
-    plan = _plan(header, origin)
-    done = _resume(part, log, plan, start=len(header), sizes=sizes)
-    if not done:
-        log.unlink(missing_ok=True)  # first, so that no old log stands beside the new file
-        part.write_bytes(header)
-        os.truncate(part, len(header) + sum(sizes))
-        log.write_text(plan + "\n", encoding="utf-8")
-    before = sum(sizes[: len(done)])
-    yield before
-    with part.open("r+b") as file, log.open("a", encoding="utf-8") as journal:
-        places = accumulate(sizes, initial=len(header))
-        left = list(zip(places, pieces, strict=False))[len(done) :]
-        for size, digest in zip(sizes[len(done) :], _put(left, file.fileno()), strict=True):
-            journal.write(digest + "\n")
-            journal.flush()
-            done.append(digest)
-            yield size
-        file.seek(header.index(BLANK))
-        file.write(hashlib.sha256("".join(done).encode()).hexdigest().encode())
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with _open(part) as file, _open(log) as journal:
+            done = _resume(file, journal, plan, start=len(blank), sizes=sizes)
+            journal.truncate(0)  # first, so that no old log stands beside the new file
+            if not done:
+                file.truncate(0)
+                file.truncate(len(blank) + sum(sizes))
+            journal.write("\n".join([plan, *done, ""]).encode())
+            yield sum(sizes[: len(done)])
+            places = accumulate(sizes, initial=len(blank))
+            left = list(zip(places, pieces, strict=False))[len(done) :]
+            for size, checksum in zip(sizes[len(done) :], _put(left, file.fileno()), strict=True):
+                journal.write(f"{checksum}\n".encode())
+                done.append(checksum)
+                yield size
+            file.write(_header(ordered, about, done))
+            os.fsync(file.fileno())
+    except InputError:
+        part.unlink()
+        log.unlink()
+        raise
     part.replace(target)
     log.unlink()
+    sync(target.parent)
 
 
-def _header(weights: Sequence[Weight], about: Mapping[str, str]) -> bytes:
-    codes = {name: code for code, name in CODES.items()}
-    listed: dict[str, object] = {"__metadata__": {**about, HASH: BLANK.decode()}}
-    end = 0
-    for weight in weights:
-        begin, end = end, end + weight.bytes
-        listed[weight.name] = {
-            "dtype": codes[weight.dtype.name],
-            "shape": weight.shape,
-            "data_offsets": [begin, end],
-        }
-    text = json.dumps(listed).encode()
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text
+def _open(path: Path) -> FileIO:
+    """A file of ours to read and write, made if need be; no link is followed."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+    return FileIO(os.open(path, flags, 0o666), "r+")
+
+
+def _header(weights: Sequence[Weight], about: Mapping[str, str], pieces: Sequence[str]) -> bytes:
+    left = iter(pieces)
+    checksums = {weight.name: [next(left) for _ in weight.pieces] for weight in weights}
+    named = [Named(weight.name, weight.shape, weight.dtype) for weight in weights]
+    return header(named, about, checksums)
 
 
 def _plan(header: bytes, origin: Sequence[Path]) -> str:
     """What tells this file's making from another's."""
     files = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in origin]
-    return hashlib.sha256(header + repr(files).encode()).hexdigest()
+    return hashlib.sha256(header + repr(files).encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _resume(part: Path, log: Path, plan: str, *, start: int, sizes: Sequence[int]) -> list[str]:
+def _resume(
+    file: FileIO, journal: FileIO, plan: str, *, start: int, sizes: Sequence[int]
+) -> list[str]:
     """The hashes of the pieces that a file of the same plan has, and that still are what they were.
 
     After a crash of the machine the log may know of pieces that never reached the disk.
     """
-    if not (part.exists() and log.exists() and part.stat().st_size == start + sum(sizes)):
-        return []
-    first, *lines = log.read_text(encoding="utf-8").split("\n")
-    if first != plan:
-        return []
-    whole = []
-    with part.open("rb") as file:
-        file.seek(start)
-        for size, digest in zip(sizes, lines[:-1], strict=False):  # the last is torn, or empty
-            if hashlib.sha256(file.read(size)).hexdigest() != digest:
+    lines = journal.read((1 + len(sizes)) * (len(BLANK) + 1)).split(b"\n")
+    whole: list[str] = []
+    if os.fstat(file.fileno()).st_size == start + sum(sizes) and lines[0] == plan.encode():
+        places = accumulate(sizes, initial=start)
+        for place, size, said in zip(places, sizes, lines[1:-1], strict=False):  # the last is torn
+            if digest(os.pread(file.fileno(), size, place)).encode() != said:
                 break
-            whole.append(digest)
-    log.write_text("\n".join([plan, *whole, ""]), encoding="utf-8")
+            whole.append(said.decode())
+    journal.seek(0)
     return whole
 
 
@@ -147,7 +144,7 @@ def _put_one(file: int, place: int, weight: Weight, piece: Callable[[], np.ndarr
     written = 0
     while written < len(data):  # at most 2 GiB at once
         written += os.pwrite(file, data[written:], place + written)
-    return hashlib.sha256(data).hexdigest()
+    return digest(data)
 
 
 def in_rows(x: np.ndarray) -> np.ndarray:

@@ -16,24 +16,40 @@ import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.mapped import Tensor, read_metadata, read_safetensors
+from egosim_jax.io.mapped import (
+    HASH,
+    OURS,
+    Named,
+    Tensor,
+    digest,
+    header,
+    read_metadata,
+    read_safetensors,
+)
+from egosim_jax.io.untrusted import quote_path
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
-HASH = "sha256"
-"""Entry of a converted file's header: the hash of its weights, known without reading them."""
+LISTED = 12
+"""Differences that a message names."""
 
 
 class WeightsError(InputError):
     """Weights do not match the network; the message lists every differing path, have and want."""
 
     def __init__(self, problems: Sequence[str], *, source: str):
-        listing = "\n".join(f"  {line}" for line in problems)
-        super().__init__(f"{len(problems)} weights of {source} do not match:\n{listing}")
+        what = f"{len(problems)} weights of {quote_path(source)} do not match"
+        super().__init__(listing(what, problems))
         self.problems = list(problems)
+
+
+def listing(what: str, problems: Sequence[str]) -> str:
+    """Name the first problems, a line each, and how many more there are."""
+    more = [f"and {len(problems) - LISTED:,} more"] if len(problems) > LISTED else []
+    return "\n  ".join([f"{what}:", *problems[:LISTED], *more])
 
 
 def flat_shapes(module: nnx.Module) -> dict[str, tuple[int, ...]]:
@@ -88,6 +104,7 @@ def fill(
     where = {} if mesh is None else dict(nnx.to_flat_state(state_sharding(mesh, state)))
     for path, leaf in nnx.to_flat_state(state):
         tensor = tensors[".".join(map(str, path))]
+        tensor = tensor.array() if isinstance(tensor, Tensor) else tensor
         if mesh is None:
             value = jnp.array(tensor)  # a copy: the file may be mapped
         else:
@@ -131,20 +148,24 @@ def write(
     path: Path, tensors: Mapping[str, np.ndarray], *, about: Mapping[str, str] | None = None
 ) -> None:
     """Write tensors, and what is to be said about them, as safetensors, whole or not at all."""
-    from safetensors.numpy import save_file
-
-    with atomic_write(path) as temporary:
-        temporary.touch()
-        mode = temporary.stat().st_mode
-        save_file(dict(tensors), temporary, dict(about or {}))
-        temporary.chmod(mode)  # safetensors' own is for the owner alone
+    arrays = {name: np.asarray(tensor, order="C") for name, tensor in tensors.items()}
+    # The widest first, so that every tensor lies at a multiple of its width.
+    names = sorted(arrays, key=lambda name: (-arrays[name].dtype.itemsize, name))
+    bytes_of = {name: arrays[name].reshape(-1).view(np.uint8).data for name in names}
+    named = [Named(name, arrays[name].shape, arrays[name].dtype) for name in names]
+    said = {"format": OURS, **(about or {})}
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(header(named, said, {name: [digest(bytes_of[name])] for name in names}))
+        for name in names:
+            file.write(bytes_of[name])
 
 
 def link_others(folder: Path, origin: Path) -> None:
     """Link what a weights folder lacks of another one: networks that stayed, the tokenizer."""
     for path in origin.iterdir():
         link = folder / path.name
-        if not link.exists() and (path.is_dir() or path.suffix == ".safetensors"):
+        kept = path.is_dir() or path.suffix == ".safetensors"
+        if kept and not link.exists() and not path.name.startswith("."):
             link.symlink_to(path.resolve())
 
 
@@ -162,9 +183,7 @@ def load(
     path: Path, module: nnx.Module, *, dtype: str | None = None, mesh: Mesh | None = None
 ) -> None:
     """Fill a module from a file that `save` or a conversion wrote (`fill`)."""
-    tensors = _read(path)
-    arrays = {name: tensor.array() for name, tensor in tensors.items()}
-    fill(module, arrays, dtype=dtype, source=str(path), mesh=mesh)
+    fill(module, _read(path), dtype=dtype, source=str(path), mesh=mesh)
 
 
 def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:

@@ -7,8 +7,10 @@ times what a user asks for. Merged, the same is W + s A B. Source: Hu et al. 202
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +18,12 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
+from egosim_jax.io.mapped import OURS
+from egosim_jax.io.weights import flat_shapes, listing
 from egosim_jax.models.layers import Linear, LowRank
 from egosim_jax.types import InputError
 
-OURS = "egosim_jax"
-"""The format that a file's header names if its names are ours."""
+T = TypeVar("T")
 BASE = "base_sha256"
 """In that header: the hash of the weights that the LoRA was trained on."""
 
@@ -35,6 +38,12 @@ class Delta:
     """B, with alpha / r in it."""
 
 
+Change = Delta | np.ndarray
+"""What a file adds: to a linear layer, of this path; or all of it to the weight of this path."""
+MOST_RANK = 2048
+"""Highest rank that is read; with the network's own widths it bounds the memory."""
+
+
 def linears(network: nnx.Module) -> Iterator[tuple[str, Linear]]:
     """The linear layers of a network by their dotted paths."""
     for path, module in nnx.iter_modules(network):
@@ -42,15 +51,25 @@ def linears(network: nnx.Module) -> Iterator[tuple[str, Linear]]:
             yield ".".join(map(str, path)), module
 
 
-def apply(network: nnx.Module, deltas: Mapping[str, Delta], *, scale: float = 1.0) -> None:
-    """Add low-rank summands to the layers of these paths, in place; the kernels stay.
+def apply(network: nnx.Module, changes: Mapping[str, Change], *, scale: float = 1.0) -> None:
+    """Add summands to the layers and weights of these paths, in place; low-rank ones stay apart.
 
     Raises what `check` raises.
     """
-    check(network, deltas)
+    check_scale(scale)
+    check(flat_shapes(network), changes)
     layers = dict(linears(network))
-    for path, delta in deltas.items():
-        layers[path].low_rank = LowRank(jnp.asarray(delta.down), jnp.asarray(scale * delta.up))
+    state = nnx.state(network, nnx.Param)
+    weights = {".".join(map(str, path)): leaf for path, leaf in nnx.to_flat_state(state)}
+    for path, change in changes.items():
+        if not isinstance(change, Delta):
+            value = weights[path].get_value()
+            weights[path].set_value((value + scale * jnp.asarray(change)).astype(value.dtype))
+    nnx.update(network, state)
+    for path, change in changes.items():
+        if isinstance(change, Delta):
+            up = jnp.asarray(scale * change.up)
+            layers[path].low_rank = LowRank(jnp.asarray(change.down), up)
 
 
 def deltas_of(network: nnx.Module) -> dict[str, Delta]:
@@ -76,14 +95,16 @@ def tensors(deltas: Mapping[str, Delta]) -> dict[str, np.ndarray]:
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Delta]:
     """The inverse of `tensors`. Raises `InputError` naming what is of no pair."""
-    paths = {name.rpartition(".")[0] for name in tensors}
-    pairs = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
-    if odd := sorted(pairs ^ tensors.keys()):
-        raise InputError(f"The LoRA has no pairs of down and up of {', '.join(odd)}.")
-    return {
-        path: Delta(down=tensors[f"{path}.down"], up=tensors[f"{path}.up"])
-        for path in sorted(paths)
-    }
+    return {path: Delta(down=down, up=up) for path, (down, up) in pairs(tensors).items()}
+
+
+def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
+    """What is named `down` and `up`, by path. Raises `InputError` naming what is of no pair."""
+    paths = sorted({name.rpartition(".")[0] for name in tensors})
+    both = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
+    if odd := sorted(both ^ tensors.keys()):
+        raise InputError(listing("The LoRA has no pairs of down and up of these", odd))
+    return {path: (tensors[f"{path}.down"], tensors[f"{path}.up"]) for path in paths}
 
 
 def about(config: str, *, base: str) -> dict[str, str]:
@@ -106,19 +127,45 @@ def start(network: nnx.Module, rank: int, *, rngs: nnx.Rngs) -> None:
             layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
 
 
-def check(network: nnx.Module, deltas: Mapping[str, Delta]) -> None:
-    """Raise `InputError` naming every summand that is not of a layer or does not fit it."""
-    layers = dict(linears(network))
+def check_scale(scale: float) -> None:
+    """Raise `InputError` for what is no strength of a LoRA."""
+    if not math.isfinite(scale):
+        raise InputError(f"A LoRA's scale is a finite number, not {scale}. (--scale)")
+
+
+def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) -> None:
+    """Raise `InputError` naming every summand that does not fit the weights, or is not finite."""
     problems = []
-    for path, delta in deltas.items():
-        if path not in layers:
-            problems.append(f"{path} is no linear layer")
-            continue
-        *stacked, wide, out = layers[path].kernel.shape
-        rank = delta.down.shape[-1]
-        want = ((*stacked, wide, rank), (*stacked, rank, out))
-        if (delta.down.shape, delta.up.shape) != want:
-            problems.append(f"{path}: have {delta.down.shape} and {delta.up.shape}, want {want}")
+    for path, change in changes.items():
+        if isinstance(change, Delta):
+            why = misfit(shapes, path, change.down.shape, change.up.shape)
+            arrays = (change.down, change.up)
+        else:
+            arrays, want = (change,), shapes.get(path)
+            why = f"have {change.shape}, want {want}" if change.shape != want else None
+        if why is None and not all(np.isfinite(array).all() for array in arrays):
+            why = "has values that are not finite"
+        if why is not None:
+            problems.append(f"{path}: {why}")
+    refuse(problems)
+
+
+def misfit(
+    shapes: Mapping[str, tuple[int, ...]], path: str, down: tuple[int, ...], up: tuple[int, ...]
+) -> str | None:
+    """Say why a pair of such shapes does not fit the linear layer of a path, if it does not."""
+    kernel = shapes.get(f"{path}.kernel", ())
+    if len(kernel) != (3 if path.startswith("blocks.") else 2):
+        return "is no linear layer"
+    *stacked, wide, out = kernel
+    rank = down[-1] if down else 0
+    if not 1 <= rank <= MOST_RANK:
+        return f"has rank {rank}, want 1 to {MOST_RANK}"
+    want = ((*stacked, wide, rank), (*stacked, rank, out))
+    return None if (down, up) == want else f"have {down} and {up}, want {want[0]} and {want[1]}"
+
+
+def refuse(problems: Sequence[str]) -> None:
+    """Raise `InputError` if there are problems."""
     if problems:
-        listing = "\n".join(f"  {line}" for line in problems)
-        raise InputError(f"The LoRA is not of this network:\n{listing}")
+        raise InputError(listing("The LoRA is not of this network", problems))

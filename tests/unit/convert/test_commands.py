@@ -4,14 +4,12 @@ import importlib
 import json
 import math
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +18,7 @@ import pytest
 import torch
 from flax import nnx
 from safetensors.flax import load_file as load_flax
+from safetensors.flax import save_file as save_flax
 from safetensors.numpy import load_file
 from safetensors.torch import save_file
 
@@ -134,7 +133,7 @@ def test_every_network_of_every_layout_is_converted_bit_for_bit(checkpoint, tmp_
         assert back.keys() == expected.keys()
         assert all(np.array_equal(back[name], expected[name].numpy()) for name in back)
     Networks.load(CONFIG, tmp_path / "out")
-    names = {path.name for path in (tmp_path / "out").iterdir()}
+    names = {path.name for path in (tmp_path / "out").glob("[!.]*")}
     assert names == {f"{network}.safetensors" for network in NETWORKS}
     assert "GB/s" in capsys.readouterr().err
 
@@ -155,13 +154,14 @@ def of_any(checkpoint, network):
 
 
 def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
+    (source := tmp_path / "theirs").mkdir()
     tensors = foreign("image", "wan")
     less = {name: tensor for name, tensor in tensors.items() if "pre_norm" not in name}
     less["visual.cls_embedding"] = torch.rand(1, 1, 7)
     less["surprise"] = torch.rand(1)
-    torch.save(foreign("vae", "wan"), tmp_path / "vae.pth")
-    save_file(less, tmp_path / "clip.safetensors")
-    assert convert(tmp_path, tmp_path / "weights") == 2
+    torch.save(foreign("vae", "wan"), source / "vae.pth")
+    save_file(less, source / "clip.safetensors")
+    assert convert(source, tmp_path / "weights") == 2
     message = capsys.readouterr().err
     for name in (
         "visual.pre_norm.weight: missing", "visual.pre_norm.bias: missing", "surprise: not known",
@@ -173,9 +173,10 @@ def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
 
 
 def test_weights_are_stored_as_asked_and_half_precision_as_it_is(tmp_path):
-    save_file(foreign("dit", "wan", torch.bfloat16), tmp_path / "dit.safetensors")
-    assert convert(tmp_path, tmp_path / "same", "--only", "dit") == 0
-    assert convert(tmp_path, tmp_path / "wide", "--dtype", "float32") == 0
+    (source := tmp_path / "theirs").mkdir()
+    save_file(foreign("dit", "wan", torch.bfloat16), source / "dit.safetensors")
+    assert convert(source, tmp_path / "same", "--only", "dit") == 0
+    assert convert(source, tmp_path / "wide", "--dtype", "float32") == 0
     same, wide = (load_flax(tmp_path / name / "dit.safetensors") for name in ("same", "wide"))
     for path in wide:
         assert same[path].dtype == "bfloat16"
@@ -184,11 +185,12 @@ def test_weights_are_stored_as_asked_and_half_precision_as_it_is(tmp_path):
 
 
 def test_a_network_or_tokenizer_that_is_asked_for_must_be_there(tmp_path, capsys):
-    save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
-    assert convert(tmp_path, tmp_path / "out", "--only", "dit") == 2
+    (source := tmp_path / "theirs").mkdir()
+    save_file(foreign("vae", "wan"), source / "vae.safetensors")
+    assert convert(source, tmp_path / "out", "--only", "dit") == 2
     assert "network dit" in capsys.readouterr().err
-    save_file({"a": torch.rand(1)}, tmp_path / "vae.safetensors")
-    assert convert(tmp_path, tmp_path / "out") == 2
+    save_file({"a": torch.rand(1)}, source / "vae.safetensors")
+    assert convert(source, tmp_path / "out") == 2
     assert "no network of ours" in capsys.readouterr().err
 
 
@@ -231,7 +233,7 @@ def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path, lost):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert [path.name for path in sorted(out.iterdir())] == [
+    assert [path.name for path in sorted(out.glob("[!.]*"))] == [
         "dit.safetensors.part",
         "dit.safetensors.part.log",
     ]
@@ -247,18 +249,19 @@ def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path, lost):
     assert 10 <= done < 60
     whole, resumed = (folder / "dit.safetensors" for folder in (tmp_path / "whole", out))
     assert whole.read_bytes() == resumed.read_bytes()
-    assert [path.name for path in out.iterdir()] == ["dit.safetensors"]
+    assert [path.name for path in out.glob("[!.]*")] == ["dit.safetensors"]
 
 
 def test_a_half_written_file_of_another_source_is_not_gone_on_with(tmp_path):
-    save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
+    (source := tmp_path / "theirs").mkdir()
+    save_file(foreign("vae", "wan"), source / "vae.safetensors")
     out = tmp_path / "out"
-    assert convert(tmp_path, out) == 0
+    assert convert(source, out) == 0
     expected = (out / "vae.safetensors").read_bytes()
     part = out / "vae.safetensors.part"
     part.write_bytes(bytes(len(expected)))
     (out / "vae.safetensors.part.log").write_text("another plan\n" + 5 * "0\n", encoding="utf-8")
-    assert convert(tmp_path / "vae.safetensors", out) == 0
+    assert convert(source / "vae.safetensors", out) == 0
     assert (out / "vae.safetensors").read_bytes() == expected
 
 
@@ -346,20 +349,27 @@ def test_a_widened_model_is_verified_with_its_base(tmp_path, capsys, naming, pre
 
 
 def test_verify_finds_one_changed_value(tmp_path, capsys):
-    save_file(foreign("image", "wan"), tmp_path / "clip.safetensors")
-    save_file(foreign("dit", "wan"), tmp_path / "dit.safetensors")
+    (source := tmp_path / "theirs").mkdir()
+    save_file(foreign("image", "wan"), source / "clip.safetensors")
+    save_file(foreign("dit", "wan"), source / "dit.safetensors")
     out = tmp_path / "ours"
-    assert convert(tmp_path, out, "--dtype", "bfloat16") == 0
-    apart = Path(shutil.move(out, tmp_path.parent / "apart"))  # the source's folder is searched
-    check = ["verify", str(tmp_path), str(apart), "--config", "debug"]
+    assert convert(source, out, "--dtype", "bfloat16") == 0
+    check = ["verify", str(source), str(out), "--config", "debug"]
     assert main(check) == 0
-    assert "weights equal" in capsys.readouterr().out
-    file = apart / "dit.safetensors"
+    said = capsys.readouterr().out
+    assert "weights equal" in said
+    assert "no checksums" not in said
+    file = out / "dit.safetensors"
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(data)
     assert main(check) == 1
-    assert "differs" in capsys.readouterr().out
+    assert "is not what was written" in capsys.readouterr().out
+    save_flax(load_flax(file), file)  # as before there were checksums
+    assert main(check) == 1
+    said = capsys.readouterr().out
+    assert "dit: carries no checksums" in said
+    assert "differs" in said
 
 
 def test_a_wider_model_of_a_base_model_gives_the_same_velocity(tmp_path):

@@ -146,7 +146,8 @@ def test_applied_and_merged_are_the_same_and_scaled_as_asked(pairs, tmp_path):
 
 
 def test_what_is_written_is_read_by_diffusers_own_rules(pairs, tmp_path):
-    file = written("PEFT", pairs, tmp_path)
+    (tmp_path / "peft").mkdir()
+    file = written("PEFT", pairs, tmp_path / "peft")
     out = tmp_path / "out" / "lora.safetensors"
     assert main(["lora", str(file), "--config", "debug", "--out", str(out)]) == 0
     about = read_metadata(out)
@@ -189,14 +190,15 @@ def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
         f"{base}.q.lora_A.weight": torch.rand(3, CONFIG.dim),
         f"{base}.k.lora_A.weight": torch.rand(3, CONFIG.dim),
         f"{base}.k.lora_B.weight": torch.rand(CONFIG.dim, 4),
-        f"{base}.v.diff": torch.rand(CONFIG.dim, CONFIG.dim),
+        f"{base}.v.diff": torch.rand(CONFIG.dim, 7),
         "diffusion_model.blocks.99.self_attn.q.lora_A.weight": torch.rand(3, CONFIG.dim),
     }
     save_file(bad, tmp_path / "bad.safetensors")
     with pytest.raises(InputError) as error:
         read_lora(tmp_path / "bad.safetensors", CONFIG)
     for reason in (
-        "q, block 0: has no lora_B", "are no product", "v.diff: not of", "blocks.99", "4 tensors",
+        "q, block 0: has no lora_B", "want (3, 48) and (48, 3)", "v, block 0: have (7, 48)",
+        "blocks.99", "4 tensors",
     ):  # fmt: skip
         assert reason in str(error.value)
     wide = {
@@ -204,9 +206,12 @@ def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
         f"{base}.q.lora_B.weight": torch.rand(7, 3),
     }
     save_file(wide, tmp_path / "bad.safetensors")
-    deltas = read_lora(tmp_path / "bad.safetensors", CONFIG)
+    with pytest.raises(InputError, match="no LoRA of the network"):
+        read_lora(tmp_path / "bad.safetensors", CONFIG)
+    narrow = np.zeros((CONFIG.layers, 7, 3), np.float32)
+    wide = {"blocks.self_attn.q": lora.Delta(down=narrow, up=narrow.transpose(0, 2, 1))}
     with pytest.raises(InputError, match="not of this network"):
-        lora.apply(network(), deltas)
+        lora.apply(network(), wide)
     weights.save(tmp_path / "base" / "dit.safetensors", network())
     args = ["lora", str(tmp_path / "bad.safetensors"), "--config", "debug", "--merge"]
     assert main([*args, str(tmp_path / "base"), "--out", str(tmp_path / "out")]) == 2

@@ -1,0 +1,337 @@
+"""Files that others made badly, or on purpose: refused in one line, little time and memory."""
+
+import contextlib
+import json
+import os
+import pickle
+import resource
+import struct
+import time
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+from egosim_jax.convert import pth
+from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.pth import read_pth
+from egosim_jax.convert.rules import Rule, assign
+from egosim_jax.convert.source import sources
+from egosim_jax.io import mapped, weights
+from egosim_jax.io.mapped import read_metadata, read_safetensors
+from egosim_jax.types import InputError
+
+SECONDS, MEBIBYTES, CHARACTERS = 10, 700, 2000
+
+
+@pytest.fixture(autouse=True)
+def bounded():
+    """Little time and memory, whatever the test reads."""
+    started, before = time.monotonic(), peak()
+    yield
+    assert time.monotonic() - started < SECONDS
+    assert peak() - before < MEBIBYTES
+
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def refused(read, path):
+    with pytest.raises(InputError) as error:
+        read(path)
+    message = str(error.value)
+    assert "\n" not in message
+    assert len(message) < CHARACTERS
+    assert message.isprintable()
+    return message
+
+
+def header(path, text, body=b""):
+    text = text if isinstance(text, bytes) else json.dumps(text).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + body)
+    return path
+
+
+def entry(dtype="U8", shape=(4,), places=(0, 4)):
+    return {"dtype": dtype, "shape": list(shape), "data_offsets": list(places)}
+
+
+def pickled(path, program):
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("a/data.pkl", program)
+        file.writestr("a/data/0", bytes(16))
+    return path
+
+
+# Safetensors.
+
+HEADERS = {
+    "a dtype that is a list": ({"a": {**entry(), "dtype": []}}, "is not described"),
+    "lists in lists": (b'{"a":' + 50_000 * b"[" + 50_000 * b"]" + b"}", "nested too deeply"),
+    "half a surrogate pair": (b'{"a\\ud800": ' + json.dumps(entry()).encode() + b"}", "surrogate"),
+    "a name of 600 characters": ({600 * "a": entry()}, "512 characters"),
+    "a name with a line feed": ({"a\nb": entry()}, "cannot be printed"),
+    "metadata that is no text": ({"__metadata__": {"a": 1}, "a": entry()}, "not text by name"),
+    "metadata that is a list": ({"__metadata__": [], "a": entry()}, "not text by name"),
+    "one place twice": ({"a": entry(), "b": entry()}, "overlap"),
+    "places that overlap": ({"a": entry(), "b": entry(places=(2, 6))}, "overlap"),
+    "a hole before the first": ({"a": entry(places=(1, 5))}, "holes"),
+    "a hole between": ({"a": entry(), "b": entry(shape=(1,), places=(5, 6))}, "holes"),
+    "bytes after the last": ({"a": entry()}, "holes"),
+    "40 axes": ({"a": entry(shape=(1,) * 39 + (4,))}, "40 axes"),
+    "an axis of 4,000 digits": (
+        b'{"a": {"dtype": "U8", "shape": [0, 1%s], "data_offsets": [0, 0]}}' % (4000 * b"0"),
+        "over 77 digits",
+    ),
+    "an empty tensor without end": (
+        {"a": entry(shape=(0, 2**40, 2**40), places=(0, 0))}, "more than",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_a_bad_header_is_refused_in_one_line(tmp_path, name):
+    text, reason = HEADERS[name]
+    assert reason in refused(read_safetensors, header(tmp_path / "x.safetensors", text, bytes(6)))
+
+
+def test_a_header_of_100_megabytes_is_refused(tmp_path):
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(struct.pack("<Q", 100 << 20) + b"{")
+    os.truncate(path, 101 << 20)
+    assert "104,857,600 bytes" in refused(read_safetensors, path)
+    assert "104,857,600 bytes" in refused(read_metadata, path)
+
+
+def test_150_000_names_that_are_there_twice_are_refused(tmp_path):
+    once = ",".join(f'"{number}":0' for number in range(150_000))
+    path = header(tmp_path / "x.safetensors", f"{{{once},{once}}}".encode())
+    assert "repeated" in refused(read_safetensors, path)
+
+
+def test_a_pointer_of_git_lfs_is_called_that(tmp_path):
+    for name, read in (("x.safetensors", read_safetensors), ("x.pth", read_pth)):
+        path = tmp_path / name
+        path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+        assert "git lfs pull" in refused(read, path)
+
+
+@pytest.mark.parametrize("name", ["x.safetensors", "x.pth", "x.safetensors.index.json"])
+def test_a_pipe_does_not_block(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    where = tmp_path if name.endswith(".json") else tmp_path / name
+    assert "not a regular file" in refused(lambda path: list(sources(path)), where)
+
+
+INDICES = {
+    "no JSON": (b"{", "not valid JSON"),
+    "a list": (b"[]", "no weight_map"),
+    "an empty map": (b'{"weight_map": {}}', "no weight_map"),
+    "a number as file": (b'{"weight_map": {"a": 1}}', "names a int"),
+    "lists in lists": (50_000 * b"[", "nested too deeply"),
+    "a file outside": (b'{"weight_map": {"a": "../x.safetensors"}}', "beside it"),
+    "a long name": (b'{"weight_map": {"a": "%s"}}' % ((1 << 20) * b"a"), "beside it"),
+    "a NUL": (b'{"weight_map": {"a": "x\\u0000.safetensors"}}', "beside it"),
+    "a tensor that is not there": (b'{"weight_map": {"b": "x.safetensors"}}', "tensors that its"),
+}
+
+
+@pytest.mark.parametrize("name", INDICES)
+def test_a_bad_index_is_refused_in_one_line(tmp_path, name):
+    text, reason = INDICES[name]
+    save_file({"a": np.zeros(3)}, tmp_path / "x.safetensors")
+    (tmp_path / "x.safetensors.index.json").write_bytes(text)
+    assert reason in refused(lambda path: list(sources(path)), tmp_path)
+
+
+# Names of layers.
+
+
+def test_a_layer_of_a_high_number_is_not_known():
+    tensors = {"blocks.0.w": np.zeros(1), "blocks.99999999999.w": np.zeros(1)}
+    with pytest.raises(InputError, match=r"99999999999\.w: not known"):
+        assign(tensors, [Rule("blocks.*.w", "w")])
+    tensors = {"blocks.9999.w": np.zeros(1)}
+    with pytest.raises(InputError, match="and 9991 more are missing"):
+        assign(tensors, [Rule("blocks.*.w", "w")])
+
+
+def test_a_message_names_a_few_of_many_problems():
+    with pytest.raises(InputError) as error:
+        assign({f"name {number}": np.zeros(1) for number in range(100_000)}, [Rule("a", "a")])
+    assert "and 99,989 more" in str(error.value)
+    assert len(str(error.value)) < CHARACTERS
+
+
+def test_a_file_of_many_networks_is_refused(tmp_path):
+    empty = np.zeros(0, np.float32)
+    tensors = {f"{number}.visual.cls_embedding": empty for number in range(1000)}
+    save_file(tensors, tmp_path / "x.safetensors")
+    assert "1000 networks" in refused(recognise, tmp_path)
+
+
+# Pickles.
+
+
+def text(value):
+    return b"X" + struct.pack("<I", len(value)) + value
+
+
+def number(value):
+    data = value.to_bytes(16, "little")
+    return b"\x8a\x10" + data
+
+
+MANY = b"(" + (1 << 14) * b"h\x00" + b"e"
+PICKLES = {
+    "a key of ten megabytes over a thousand": (
+        b"\x80\x02}" + text((10 << 20) * b"k") + b"](" + 1000 * b"N" + b"es.", "512 characters",
+    ),
+    "a name of keys that is too long": (
+        b"\x80\x02" + b"".join(b"}" + text(400 * b"k") for _ in range(3)) + b"]sss.", "512 char",
+    ),
+    "tuples in tuples in a message": (
+        b"\x80\x02)" + 60 * b"q\x00h\x00\x86" + b"Q.", "refers to a tuple of 2",
+    ),
+    "tuples in tuples as a key": (
+        b"\x80\x02})" + 60 * b"q\x00h\x00\x86" + b"Ns.", "a key is a tuple of 2",
+    ),
+    "a chain of lists of many references": (
+        b"\x80\x02]q\x00" + 3 * (b"]" + MANY + b"q\x00") + b".", "more than 131,072",
+    ),
+    "nothing, many times, in many lists": (
+        b"\x80\x02Nq\x00](" + (1 << 14) * b"h\x00" + b"eq\x00]" + MANY + b".", "repeat without",
+    ),
+    "numbers as keys that collide": (
+        b"\x80\x02}(" + b"".join(number(i * (2**61 - 1)) + b"N" for i in range(1, 5_000)) + b"u.",
+        "neither text nor a usual number",
+    ),
+    "a key with half a surrogate pair": (b"\x80\x02}" + text(b"\xed\xa0\x80") + b"Ns.", "printed"),
+    "a class of a long name": (
+        b"\x80\x02c" + (1 << 20) * b"m" + b"\nn\n.", "asks for mmm",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PICKLES)
+def test_a_bomb_in_a_pickle_is_refused_in_one_line(tmp_path, name):
+    program, reason = PICKLES[name]
+    assert reason in refused(read_pth, pickled(tmp_path / "x.pth", program))
+
+
+def test_a_long_pickle_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(pth, "MOST_STEPS", 1000)
+    path = pickled(tmp_path / "x.pth", b"\x80\x02]q\x00]" + MANY + b".")
+    assert "more than 1,000 operations" in refused(read_pth, path)
+
+
+def test_a_zip_of_five_million_entries_is_refused(tmp_path):
+    path = tmp_path / "x.pth"
+    torch.save({"w": torch.rand(2)}, path)
+    data = bytearray(path.read_bytes())
+    wide, narrow = data.index(b"PK\6\6"), data.index(b"PK\5\6")
+    struct.pack_into("<QQ", data, wide + 24, 5_000_000, 5_000_000)
+    struct.pack_into("<HH", data, narrow + 8, 0xFFFF, 0xFFFF)
+    path.write_bytes(data)
+    assert "5,000,000 entries" in refused(read_pth, path)
+    struct.pack_into("<QQ", data, wide + 24, 100_000, 100_000)
+    path.write_bytes(data)
+    assert "directory is damaged" in refused(read_pth, path)
+
+
+@pytest.mark.parametrize("where", [b"PK\1\2", b"PK\5\6", b"PK\6\6", b"PK\6\7", b"PK\3\4"])
+def test_a_damaged_zip_is_refused_or_read(tmp_path, where):
+    path = tmp_path / "x.pth"
+    torch.save({"w": torch.rand(2)}, path)
+    whole = path.read_bytes()
+    at = whole.index(where)
+    for byte in range(0, 40, 3):
+        data = bytearray(whole)
+        data[(at + byte) % len(data)] ^= 0xFF
+        path.write_bytes(data)
+        with contextlib.suppress(InputError):
+            read_pth(path)
+
+
+def test_a_usual_optimizer_beside_the_weights_is_read(tmp_path):
+    network = torch.nn.Linear(2, 2)
+    optimizer = torch.optim.Adam(network.parameters())
+    network(torch.rand(1, 2)).sum().backward()
+    optimizer.step()
+    torch.save({"m": network.state_dict(), "o": optimizer.state_dict()}, tmp_path / "x.pth")
+    assert "o.state.0.exp_avg" in read_pth(tmp_path / "x.pth")
+
+
+# Flipped bytes.
+
+
+def sealed(path):
+    rng = np.random.default_rng(0)
+    arrays = {"a": rng.normal(size=(3, 4)), "b": rng.integers(0, 9, 5), "c": np.float32(2)}
+    weights.write(path, arrays, about={"config": "debug"})
+    return arrays
+
+
+def test_what_we_write_is_read_by_others_and_us(tmp_path):
+    from safetensors.numpy import load_file
+
+    arrays = sealed(path := tmp_path / "x.safetensors")
+    theirs, ours = load_file(path), read_safetensors(path)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(theirs[name], array)
+        np.testing.assert_array_equal(ours[name].array(), array)
+        assert ours[name].intact
+        assert ours[name].checksums
+    assert weights.hashes(tmp_path)["x"] == read_metadata(path)["sha256"]
+
+
+def test_every_flipped_byte_is_noticed_or_changes_nothing(tmp_path):
+    arrays = sealed(path := tmp_path / "x.safetensors")
+    whole = path.read_bytes()
+    noticed = 0
+    for place in range(len(whole)):
+        data = bytearray(whole)
+        data[place] ^= 1 << place % 8
+        path.write_bytes(data)
+        try:
+            found = {name: tensor.array() for name, tensor in read_safetensors(path).items()}
+        except InputError:
+            noticed += 1
+        else:
+            assert found.keys() == arrays.keys()
+            assert all(np.array_equal(found[name], arrays[name]) for name in found)
+    assert noticed > 0.99 * len(whole)
+
+
+def test_only_the_tensor_that_is_asked_for_is_checked(tmp_path):
+    arrays = sealed(path := tmp_path / "x.safetensors")
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1  # of `c`, the narrowest
+    path.write_bytes(data)
+    found = read_safetensors(path)
+    np.testing.assert_array_equal(found["a"].array(), arrays["a"])
+    assert "c of" in refused(lambda tensor: tensor.array(), found["c"])
+
+
+def test_weights_without_checksums_are_read(tmp_path):
+    save_file({"a": np.arange(3.0)}, tmp_path / "x.safetensors", {"format": "egosim_jax"})
+    (tensor,) = read_safetensors(tmp_path / "x.safetensors").values()
+    assert tensor.intact
+    assert not tensor.checksums
+    np.testing.assert_array_equal(tensor.array(), np.arange(3.0))
+
+
+def test_checksums_are_verified_once(tmp_path, monkeypatch):
+    sealed(path := tmp_path / "x.safetensors")
+    found, calls = read_safetensors(path), []
+    monkeypatch.setattr(mapped, "digest", lambda data: calls.append(data) or "")
+    assert not found["a"].intact
+    assert not found["a"].intact
+    assert len(calls) == 1
+
+
+def test_the_pickles_of_these_tests_are_readable_ones(tmp_path):
+    assert read_pth(pickled(tmp_path / "x.pth", pickle.dumps({"a": [1, None]}, 2))) == {}
