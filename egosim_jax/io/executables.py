@@ -24,6 +24,7 @@ from typing import Any
 import jax
 
 from egosim_jax.command import cache_folder
+from egosim_jax.io.atomic import atomic_write
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
@@ -95,9 +96,8 @@ def _write(path: Path, compiled: Any) -> None:
 
     try:
         data = pickle.dumps(serialize_executable.serialize(compiled))
-        mine = path.with_name(f"{path.name}.{os.getpid()}")  # others may write the same one
-        mine.write_bytes(data)
-        mine.replace(path)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(data)
         files = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
         for old in files[:-MOST]:
             old.unlink(missing_ok=True)
