@@ -9,7 +9,8 @@ import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a fork has none of its parent's threads
+for library in ("OPENBLAS", "OMP"):  # a fork has none of its parent's threads
+    os.environ[f"{library}_NUM_THREADS"] = "1"
 
 
 def points(given: argparse.Namespace) -> int:

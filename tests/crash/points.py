@@ -63,6 +63,8 @@ _FLAGS = {2: 1, 257: 2}
 """Which argument of a call that opens says how."""
 _WRITES = {1: None, 18: 3}
 """Calls that can be torn, and which argument is their place in the file."""
+PATIENCE = 60
+"""Seconds without a change after which a process hangs."""
 _NO_NEW_PRIVILEGES, _SECCOMP, _SET_FILTER, _LISTENER = 38, 317, 1, 8
 _RECEIVE, _SEND, _CONTINUE = 0xC0502100, 0xC0182101, 1
 _PIDFD_OPEN, _PIDFD_GETFD = 434, 438
@@ -147,7 +149,9 @@ def _supervise(child: int, listener: int, root: str, last: int | None, torn: boo
     killed = False
     poll = select.poll()
     poll.register(listener, select.POLLIN)
-    while not any(event & select.POLLHUP for _, event in poll.poll()):
+    while ready := poll.poll(1000 * PATIENCE):
+        if ready[0][1] & select.POLLHUP:
+            break
         asked = bytearray(80)
         try:
             fcntl.ioctl(listener, _RECEIVE, asked)
@@ -168,6 +172,8 @@ def _supervise(child: int, listener: int, root: str, last: int | None, torn: boo
             fcntl.ioctl(listener, _SEND, answer)
         except FileNotFoundError:
             continue
+    if not ready:
+        os.killpg(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     return Outcome(changes, killed, 0 if killed else os.waitstatus_to_exitcode(status))
 

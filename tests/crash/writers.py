@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import open3d  # noqa: F401 - what is imported once is not imported in every fork
 from flax import nnx
 from jax.sharding import SingleDeviceSharding
 from PIL import Image
@@ -71,7 +72,7 @@ def inputs(folder: Path) -> None:
     for name, part in networks.items():
         rng = np.random.default_rng(0)
         tensors = {
-            path: rng.normal(size=shape).astype(np.float32)
+            path: 0.02 * rng.normal(size=shape).astype(np.float32)
             for path, shape in weights.flat_shapes(part).items()
         }
         weights.write(folder / "weights" / f"{name}.safetensors", tensors)
@@ -112,7 +113,7 @@ def _triplet(name: str) -> Triplet:
     )  # fmt: skip
 
 
-def _state(version: int) -> SceneState:
+def state(version: int) -> SceneState:
     rng = np.random.default_rng(version)
     return SceneState(
         points_m=rng.normal(size=(500, 3)).astype(np.float32),
@@ -154,7 +155,8 @@ def _shards(place: Path) -> Read:
 
 
 def _weights(place: Path) -> Read:
-    return {path.name: _tensors(path) for path in sorted((place / "out").glob("*.safetensors"))}
+    files = [path for path in (place / "out").glob("*.safetensors") if path.name[0] != "."]
+    return {path.name: _tensors(path) for path in files}
 
 
 def _tensors(path: Path) -> str:
@@ -183,7 +185,7 @@ def _journal(place: Path, inputs: Path, version: int) -> None:
         journal.phase(
             f"{number} fuse",
             place / f"clip_{number}" / "state",
-            make=lambda number=number: _state(number),
+            make=lambda number=number: state(number),
             save=snapshot.save,
             load=snapshot.load,
         )
@@ -195,7 +197,7 @@ def _config(place: Path, inputs: Path, version: int) -> None:
 
 
 def _read_config(place: Path) -> Read:
-    files = sorted((place / "run").glob("*.json"))
+    files = [path for path in (place / "run").glob("*.json") if path.name[0] != "."]
     return {path.name: json.dumps(json.loads(path.read_text("utf-8"))) for path in files}
 
 
@@ -305,15 +307,15 @@ def _merge(place: Path, inputs: Path, version: int) -> None:
 
 WRITERS = {
     "snapshot": Writer(
-        lambda place, _, version: snapshot.save(place / "state", _state(version)),
+        lambda place, _, version: snapshot.save(place / "state", state(version)),
         _file("state", lambda path: snapshot.fingerprint(snapshot.load(path))),
     ),
     "points": Writer(
-        lambda place, _, version: snapshot.write_ply(place / "state.ply", _state(version)),
+        lambda place, _, version: snapshot.write_ply(place / "state.ply", state(version)),
         _file("state.ply", lambda path: _sha256(snapshot.read_ply(path).points_m)),
     ),
     "portrait": Writer(
-        lambda place, _, version: view.write_portrait(place / "a.png", _state(version), up="z"),
+        lambda place, _, version: view.write_portrait(place / "a.png", state(version), up="z"),
         _file("a.png", _picture),
     ),
     "sheet": Writer(_sheet, _file("sheet.png", _picture)),

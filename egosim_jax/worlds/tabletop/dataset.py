@@ -90,7 +90,8 @@ def _gather(plan: Plan, parts: Path, out: Path) -> None:
     with ShardWriter(out, kind="frames", spec=plan.spec, provenance=provenance) as writer:
         for path in paths:
             record = from_bytes(path.read_bytes(), name=path.name)
-            writer.add(record.arrays, record.metadata)
+            arrays = dict(sorted(record.arrays.items()))  # safetensors gives them in any order
+            writer.add(arrays, record.metadata)
     for path in paths:
         path.unlink()
     parts.rmdir()
