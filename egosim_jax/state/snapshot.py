@@ -6,8 +6,10 @@ have equal fingerprints, whatever wrote them.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -159,9 +161,11 @@ def write_ply(path: Path, state: SceneState) -> None:
     for name in ("object_ids", "last_seen"):
         column = np.ascontiguousarray(getattr(state, name).reshape(-1, 1))
         cloud.point[name] = o3d.core.Tensor(column)
+    least = sum(getattr(state, name).nbytes for name in ARRAYS)
     with atomic_write(path) as temporary:
-        if not o3d.t.io.write_point_cloud(str(temporary), cloud):
-            raise OSError(f"{path} could not be written")
+        written = o3d.t.io.write_point_cloud(str(temporary), cloud)
+        if not written or temporary.stat().st_size < least:  # it does not see that a disk is full
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def read_ply(path: Path, template: SceneState | None = None) -> SceneState:

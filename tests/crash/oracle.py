@@ -101,16 +101,12 @@ TORN = ("write", "pwrite64")
 
 
 def files(place: Path, writer: Writer) -> dict[str, str]:
-    """Digests of all files, by path; without bytes where two runs differ in them."""
+    """Digests of all files, by path; only temporary names where two runs differ in the others."""
     if not writer.same_bytes:
-        found = [*place.iterdir(), *place.glob("*/*")]
-        return {_generic(path): "" for path in found}
+        left = [path for path in place.rglob("*") if "tmp" in path.name]
+        return {str(path.relative_to(place)): "" for path in (*place.iterdir(), *left)}
     paths = [path for path in sorted(place.rglob("*")) if path.name != LOCK]  # it holds the PID
     return {str(path.relative_to(place)): _digest(path) for path in paths}
-
-
-def _generic(path: Path) -> str:
-    return path.name
 
 
 def _digest(path: Path) -> str:

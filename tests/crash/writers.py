@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,8 +63,7 @@ class Writer:
     before: bool = True
     """Whether there is a version 0."""
     same_bytes: bool = True
-    """Whether two runs write the same files; else only what is read is compared, and the names in
-    the place."""
+    """Whether two runs write the same files; else only what is read is compared."""
 
 
 def inputs(folder: Path) -> None:
@@ -206,21 +206,15 @@ def _checkpoint(place: Path, inputs: Path, version: int) -> None:
     for step in ((1, 2), (3,))[version]:
         if step not in checkpoints.steps:
             tree = {"weights": np.arange(6.0) + step, "step": np.int32(step)}
-            checkpoints.save(step, jax.tree.map(jnp.asarray, tree), _Position(step))
+            data = _numbers()
+            for _ in range(step):
+                next(data)
+            checkpoints.save(step, jax.tree.map(jnp.asarray, tree), data)
     checkpoints.close()
 
 
-class _Position:
-    """Of an iterator of data."""
-
-    def __init__(self, step: int):
-        self.step = step
-
-    def get_state(self) -> dict[str, int]:
-        return {"step": self.step}
-
-    def set_state(self, state: dict[str, int]) -> None:
-        self.step = state["step"]
+def _numbers() -> grain.DatasetIterator:
+    return iter(grain.MapDataset.range(100).shuffle(seed=1).repeat().to_iter_dataset())
 
 
 def _read_checkpoints(place: Path) -> Read:
@@ -231,12 +225,11 @@ def _read_checkpoints(place: Path) -> Read:
         "weights": jax.ShapeDtypeStruct((6,), np.float32, sharding=sharding),
         "step": jax.ShapeDtypeStruct((), np.int32, sharding=sharding),
     }
-    position = _Position(0)
-    state = checkpoints.restore(abstract, position)
-    steps = checkpoints.steps
+    data = _numbers()
+    found = checkpoints.restore(abstract, data)
     checkpoints.close()
-    assert position.step == int(state["step"]) == steps[-1]
-    return {"newest": f"{np.asarray(state['weights']).tolist()} at {state['step']}"}
+    values, left = np.asarray(found["weights"]).tolist(), [int(next(data)) for _ in range(5)]
+    return {"newest": f"{values} after {found['step']}, then {left}"}
 
 
 def _encode(place: Path, inputs: Path, version: int) -> None:
