@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from egosim_jax import interrupts
 from egosim_jax.types import InputError
 
 DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = 0, 1, 2, 3, 70, 75
@@ -54,18 +54,18 @@ def main(
     Results go to stdout, progress and errors to stderr. A wrong option or bad input is one clear
     message; a traceback means that something is broken.
     """
-    import tyro
-
-    _keep_compiled_programs()
-    command: Command = tyro.cli(
-        commands,
-        prog=program,
-        description=description,
-        args=args,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
 
     def run() -> int:
+        import tyro
+
+        _keep_compiled_programs()
+        command: Command = tyro.cli(
+            commands,
+            prog=program,
+            description=description,
+            args=args,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+        )
         with within():
             return command.run()
 
@@ -96,7 +96,7 @@ def guarded(run: Callable[[], int]) -> int:
         print(stop, file=sys.stderr)
         return stop.code
     except KeyboardInterrupt:
-        print(f"interrupted; to continue: {shlex.join(sys.argv)}", file=sys.stderr)
+        interrupts.tell()
         return FAILED
     except Exception as error:
         if (reason := system_failure(error)) is not None:

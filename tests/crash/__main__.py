@@ -1,7 +1,7 @@
 """What is written, and killed while it is written: at every change, or (`kills`) at random times.
 
-    python -m tests.crash [--writer NAME ...] [--most N] [--seed S]
-    python -m tests.crash kills [--commands NAME ...] [--kills N] [--seed S]
+python -m tests.crash [--writer NAME ...] [--most N] [--seed S]
+python -m tests.crash kills [--commands NAME ...] [--kills N] [--seed S]
 """
 
 import argparse

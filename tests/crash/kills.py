@@ -49,7 +49,16 @@ WEIGHTS = "from egosim_jax import configs, generator; from pathlib import Path; 
 WEIGHTS += "generator.Networks.random(configs.get('debug'), seed=0).save(Path('weights'))"
 INPUTS = {
     "weights": ["-c", WEIGHTS],
-    "torch": "-m egosim_jax.convert to-torch weights --config debug --out torch".split(),
+    "torch": [
+        "-m",
+        "egosim_jax.convert",
+        "to-torch",
+        "weights",
+        "--config",
+        "debug",
+        "--out",
+        "torch",
+    ],
     "clips": f"-m egosim_jax.cli generate {MODEL[:-10]}weights --limit 2 --out clips".split(),
     "frames": f"-m {MAKE} --out frames".split(),
     "latents": f"-m {ENCODE} --out latents".replace("../", "").split(),

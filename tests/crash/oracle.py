@@ -38,7 +38,9 @@ class Report:
     def __str__(self) -> str:
         tried = f"{self.points} points tried, {self.torn} of them within a write"
         sample = ", a sample" if self.points < self.changes else ""
-        return f"{self.name}: {self.changes} changes, {tried}{sample}, {len(self.failures)} failures"
+        return (
+            f"{self.name}: {self.changes} changes, {tried}{sample}, {len(self.failures)} failures"
+        )
 
 
 def check(name: str, work: Path, *, seed: int = 0, most: int | None = None) -> Report:
@@ -82,7 +84,9 @@ def check(name: str, work: Path, *, seed: int = 0, most: int | None = None) -> R
     for last, torn in points:
         outcome = watch(write, start(), last=last, torn=torn)
         where = f"{name}, {'within' if torn else 'before'} change {last}"
-        where += f" ({straight.changes[last]}; {' -> '.join(straight.changes[max(0, last - 2) : last])})"
+        where += (
+            f" ({straight.changes[last]}; {' -> '.join(straight.changes[max(0, last - 2) : last])})"
+        )
         report.points += 1
         report.torn += torn
         try:

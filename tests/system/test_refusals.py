@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import os
 import random
 import shutil
@@ -78,9 +77,7 @@ def disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
 
     def mount(options: str) -> Path:
         again = "remount," if folder.is_mount() else ""
-        subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", again + options, "tmpfs", folder], check=True
-        )
+        subprocess.run(["mount", "-t", "tmpfs", "-o", again + options, "tmpfs", folder], check=True)
         return folder
 
     yield mount

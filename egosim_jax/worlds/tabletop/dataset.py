@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from egosim_jax import interrupts
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, to_bytes
 from egosim_jax.io.atomic import atomic_write
@@ -61,11 +62,15 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
     # One thread a process: two that share the cores among threads take twice as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
+    pool = ProcessPoolExecutor(workers, mp_context=context)
+    try:
+        with interrupts.not_inherited():
+            jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
         for job in as_completed(jobs):
             job.result()
             yield jobs[job]
+    finally:  # after an error or Ctrl-C, scenes that are not begun are left
+        pool.shutdown(cancel_futures=True)
     _gather(plan, parts, out)
 
 
