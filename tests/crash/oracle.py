@@ -1,7 +1,7 @@
 """What has to hold wherever a writer is killed.
 
-What was complete before is still there complete, in its old or its new version; and the same writer,
-run again, leaves what it leaves if it is never killed, with no temporary name.
+What was complete before is still there complete, in its old or its new version; and the same
+writer, run again, leaves what it leaves if it is never killed, with no temporary name.
 """
 
 from __future__ import annotations
@@ -36,11 +36,9 @@ class Report:
     failures: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
-        tried = f"{self.points} points tried, {self.torn} of them within a write"
-        sample = ", a sample" if self.points < self.changes else ""
-        return (
-            f"{self.name}: {self.changes} changes, {tried}{sample}, {len(self.failures)} failures"
-        )
+        sample = " (a sample)" if self.points < self.changes else ""
+        tried = f"{self.points} points tried{sample}, {self.torn} of them within a write"
+        return f"{self.name}: {self.changes} changes, {tried}, {len(self.failures)} failures"
 
 
 def check(name: str, work: Path, *, seed: int = 0, most: int | None = None) -> Report:
@@ -84,9 +82,7 @@ def check(name: str, work: Path, *, seed: int = 0, most: int | None = None) -> R
     for last, torn in points:
         outcome = watch(write, start(), last=last, torn=torn)
         where = f"{name}, {'within' if torn else 'before'} change {last}"
-        where += (
-            f" ({straight.changes[last]}; {' -> '.join(straight.changes[max(0, last - 2) : last])})"
-        )
+        where += f" ({' -> '.join(straight.changes[max(0, last - 1) : last + 1])})"
         report.points += 1
         report.torn += torn
         try:

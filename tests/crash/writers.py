@@ -339,7 +339,8 @@ WRITERS = {
     "lora": Writer(
         lambda place, inputs, version: _run(
             egosim_convert,
-            f"lora {inputs}/lora{version}.safetensors --config debug --out {place}/out/a.safetensors",
+            f"lora {inputs}/lora{version}.safetensors --config debug "
+            f"--out {place}/out/a.safetensors",
         ),
         _weights,
     ),
