@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import errno
 import os
-import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from contextlib import AbstractContextManager, nullcontext
 from importlib import metadata
 from typing import Any, Protocol, get_args, get_type_hints, runtime_checkable
 
+from egosim_jax import interrupts
 from egosim_jax.types import InputError
 
 DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = 0, 1, 2, 3, 70, 75
@@ -54,24 +54,24 @@ def main(
     Results go to stdout, progress and errors to stderr. A wrong option or bad input is one clear
     message; a traceback means that something is broken.
     """
-    import tyro
 
-    args = list(sys.argv[1:] if args is None else args)
-    if args == ["--version"]:
-        print(f"{program} {metadata.version('egosim-jax')}")
-        return DONE
-    if (mistake := _mistyped(commands, args, program)) is not None:
-        print(f"error: {mistake}", file=sys.stderr)
-        return USAGE
-    command: Command = tyro.cli(
-        commands,
-        prog=program,
-        description=f"{description} --version prints the version.",
-        args=args,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
+    given = list(sys.argv[1:] if args is None else args)
 
     def run() -> int:
+        import tyro
+
+        if given == ["--version"]:
+            print(f"{program} {metadata.version('egosim-jax')}")
+            return DONE
+        if (mistake := _mistyped(commands, given, program)) is not None:
+            raise InputError(mistake)
+        command: Command = tyro.cli(
+            commands,
+            prog=program,
+            description=f"{description} --version prints the version.",
+            args=given,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+        )
         with within():
             return command.run()
 
@@ -102,7 +102,7 @@ def guarded(run: Callable[[], int]) -> int:
         print(stop, file=sys.stderr)
         return stop.code
     except KeyboardInterrupt:
-        print(f"interrupted; to continue: {shlex.join(sys.argv)}", file=sys.stderr)
+        interrupts.tell()
         return FAILED
     except Exception as error:
         if (reason := system_failure(error)) is not None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from egosim_jax import interrupts
+
+interrupts.expect()
+
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -21,6 +21,7 @@ import jax
 from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
+from egosim_jax.io.atomic import TEMPORARY
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import listing, quote_text, read_json
@@ -54,6 +55,8 @@ class Checkpoints:
         )
         self._thread = ThreadPoolExecutor(1)
         self._saving: tuple[int, Future[None]] | None = None
+        if self.steps and not (self.folder / str(self.steps[-1]) / HASHES).exists():
+            self._write_hashes(self.steps[-1])  # it was killed just then
 
     @property
     def steps(self) -> list[int]:
@@ -141,6 +144,9 @@ class Checkpoints:
     def _seal(self, step: int, response: Any) -> None:
         """Once the checkpoint is whole, write the hashes of its files into it."""
         response.result()
+        self._write_hashes(step)
+
+    def _write_hashes(self, step: int) -> None:
         if jax.process_index() == 0:
             folder = self.folder / str(step)
             digests = {name: sha256(file) for name, file in _files(folder).items()}
@@ -224,8 +230,13 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+def _is_ours(path: Path) -> bool:
+    """Whether it is the file of hashes, or what a kill left of it."""
+    return path.name == HASHES or (path.name.startswith(".sha256.") and TEMPORARY in path.name)
+
+
 def _files(folder: Path) -> dict[str, Path]:
-    found = (path for path in folder.rglob("*") if path.is_file() and path.name != HASHES)
+    found = (path for path in folder.rglob("*") if path.is_file() and not _is_ours(path))
     return {str(path.relative_to(folder)): path for path in sorted(found)}
 
 

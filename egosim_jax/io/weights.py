@@ -123,7 +123,9 @@ def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, st
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of weights. (--weights)")
     files = [
-        path for path in sorted(folder.glob("*.safetensors")) if only is None or path.stem in only
+        path
+        for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden ones are half written
+        if only is None or path.stem in only
     ]
     return {path.stem: read_metadata(path).get(HASH) or sha256(path) for path in files}
 
@@ -162,7 +164,7 @@ def write(
 
 def link_others(folder: Path, origin: Path) -> None:
     """Link what a weights folder lacks of another one: networks that stayed, the tokenizer."""
-    for path in origin.iterdir():
+    for path in origin.glob("[!.]*"):
         link = folder / path.name
         kept = path.is_dir() or path.suffix == ".safetensors"
         if kept and not link.exists() and not path.name.startswith("."):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from egosim_jax import interrupts
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, gather, to_bytes
 from egosim_jax.io.atomic import atomic_write
@@ -63,11 +64,15 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
     # One thread a process: two that share the cores among threads take twice as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
+    pool = ProcessPoolExecutor(workers, mp_context=context)
+    try:
+        with interrupts.not_inherited():
+            jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
         for job in as_completed(jobs):
             job.result()
             yield jobs[job]
+    finally:  # after an error or Ctrl-C, scenes that are not begun are left
+        pool.shutdown(cancel_futures=True)
     _gather(plan, parts, out)
 
 
@@ -94,6 +99,7 @@ def _gather(plan: Plan, parts: Path, out: Path) -> None:
     ) as writer:
         for path in (_part(parts, s, n) for s in plan.seeds for n in range(plan.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)
-            writer.add(record.arrays, record.metadata)
+            arrays = dict(sorted(record.arrays.items()))  # safetensors gives them in any order
+            writer.add(arrays, record.metadata)
     gather([whole], out)
     shutil.rmtree(parts)

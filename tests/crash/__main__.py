@@ -1,0 +1,55 @@
+"""What is written, and killed while it is written: at every change, or (`kills`) at random times.
+
+python -m tests.crash [--writer NAME ...] [--most N] [--seed S]
+python -m tests.crash kills [--commands NAME ...] [--kills N] [--seed S]
+"""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+for library in ("OPENBLAS", "OMP"):  # a fork has none of its parent's threads
+    os.environ[f"{library}_NUM_THREADS"] = "1"
+
+
+def points(given: argparse.Namespace) -> int:
+    """Kill writers at every change; the exit code."""
+    from tests.crash.oracle import check
+    from tests.crash.writers import WRITERS
+
+    unknown = {*given.writer} - WRITERS.keys()
+    assert not unknown, f"unknown: {unknown}; known: {', '.join(WRITERS)}"
+    reports = []
+    for name in given.writer or WRITERS:
+        reports.append(check(name, given.folder, seed=given.seed, most=given.most))
+        print("\n  ".join([str(reports[-1]), *reports[-1].failures]), flush=True)
+    print(f"{sum(report.points for report in reports)} points in all")
+    return int(any(report.failures for report in reports))
+
+
+def kills(given: argparse.Namespace) -> int:
+    """Kill commands at random times; the exit code."""
+    from tests.crash import kills
+
+    names = given.commands or [*kills.COMMANDS]
+    return kills.main(names, given.folder, kills=given.kills, seed=given.seed)
+
+
+def main() -> int:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(prog="python -m tests.crash", description=__doc__)
+    parser.add_argument("what", nargs="?", choices=["points", "kills"], default="points")
+    parser.add_argument("--writer", nargs="+", default=[], help="all, if none is named")
+    parser.add_argument("--most", type=int, help="points of a writer; all, if not given")
+    parser.add_argument("--commands", nargs="+", help="all, if none is named")
+    parser.add_argument("--kills", type=int, default=100, help="of all commands together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, default=Path("/tmp/egosim_crash"))  # noqa: S108
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    return kills(given) if given.what == "kills" else points(given)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""Commands that are killed at random times and run again, until what they write is complete.
+
+What is written is then compared, byte for byte, with what one run without a kill writes. Only what
+says when, or by which process, something was written is left out: `IGNORED` and `TOLD`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.flags import QUICK
+
+IGNORED = {
+    ".lock": "the PID of the process that wrote last",
+    "simulation.rrd": "Rerun puts a random id and the time of day into a recording",
+    "checkpoints": "Orbax names files by random ids and notes times; what comes of a checkpoint, "
+    "the log and the weights, is compared",
+}
+"""Files, and folders with all that is in them, that two runs without a kill do not share."""
+TOLD = ("seconds", "chain", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
+"""Fields of a log's lines that a clock tells, or that are a hash over such fields."""
+MODEL = "--config debug --weights ../weights"
+OF_A_CLIP = "--frames 9 --height 64 --width 96 --fps 16 --workers 1"
+MAKE = f"egosim_jax.cli data make tabletop --scenes 3 {OF_A_CLIP}"
+ENCODE = f"egosim_jax.cli data encode {MODEL} --shards ../frames --shard-windows 1 --batch-size 1"
+COMMANDS = {
+    "simulate": f"egosim_jax.cli simulate {MODEL} --clips 2 --perception oracle",
+    "generate": f"egosim_jax.cli generate {MODEL} --limit 2 --skip-existing",
+    "make": MAKE,
+    "pack": "egosim_jax.cli data pack --metadata ../clips/scenes/metadata.csv --overwrite",
+    "encode": ENCODE,
+    "train": f"egosim_jax.train egosim_14b_fewshot {MODEL} --latents ../latents --training.steps 8 "
+    "--training.batch-size 2 --training.log-every 1 --training.save-every 2",
+    "convert": "egosim_jax.convert weights ../torch --config debug",
+}
+"""Each without its `--out out`; run in a folder beside those of `INPUTS`."""
+WEIGHTS = "from egosim_jax import configs, generator; from pathlib import Path; "
+WEIGHTS += "generator.Networks.random(configs.get('debug'), seed=0).save(Path('weights'))"
+INPUTS = {
+    "weights": ["-c", WEIGHTS],
+    "torch": [
+        "-m",
+        "egosim_jax.convert",
+        "to-torch",
+        "weights",
+        "--config",
+        "debug",
+        "--out",
+        "torch",
+    ],
+    "clips": f"-m egosim_jax.cli generate {MODEL[:-10]}weights --limit 2 --out clips".split(),
+    "frames": f"-m {MAKE} --out frames".split(),
+    "latents": f"-m {ENCODE} --out latents".replace("../", "").split(),
+}
+"""What makes what the commands are given; they are made in this order."""
+
+
+@dataclass
+class Tally:
+    """What came of the kills of a command."""
+
+    name: str
+    seconds: float
+    kills: int = 0
+    trials: int = 0
+    reruns: int = 0
+    differences: int = 0
+
+    def __str__(self) -> str:
+        counts = f"{self.kills} kills, {self.reruns} reruns, {self.differences} differences"
+        return f"{self.name}: {counts} in {self.trials} trials of {self.seconds:.1f} s"
+
+
+def prepare(folder: Path) -> None:
+    """Make in `folder` what the commands are given."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, arguments in INPUTS.items():
+        if not (folder / name).exists():
+            _python(arguments, folder)
+
+
+def kill_often(name: str, folder: Path, *, kills: int, seed: int) -> Tally:
+    """Kill a command so many times; several times in each trial, whose end is compared."""
+    chance = random.Random(f"{seed} {name}")
+    arguments = ["-m", *COMMANDS[name].split(), "--out", "out"]
+    _finish(arguments, folder / f"{name}_warm")  # compiles what is kept
+    then = time.monotonic()
+    wanted = _finish(arguments, folder / f"{name}_reference")
+    tally = Tally(name, time.monotonic() - then)
+    while tally.kills < kills:
+        place = _emptied(folder / f"{name}_{tally.trials}")
+        times = [chance.uniform(0, tally.seconds) for _ in range(5)]
+        for seconds in times[: kills - tally.kills]:
+            tally.reruns += 1
+            if not _killed_after(seconds, arguments, place):
+                break
+            tally.kills += 1
+        else:
+            tally.reruns += 1
+        for line in _differences(wanted, _finish(arguments, place, anew=False)):
+            tally.differences += 1
+            print(f"{place}: {line}", flush=True)
+        tally.trials += 1
+    return tally
+
+
+def main(names: Sequence[str], folder: Path, *, kills: int, seed: int) -> int:
+    """Kill each of the commands; the exit code."""
+    os.environ |= {"XLA_FLAGS": QUICK, "XDG_CACHE_HOME": str(folder.absolute() / "cache")}
+    prepare(folder)
+    tallies = []
+    for name in names:
+        each = -(-kills // len(names))
+        tallies.append(kill_often(name, folder, kills=each, seed=seed))
+        print(tallies[-1], flush=True)
+    print(f"{sum(tally.kills for tally in tallies)} kills in all")
+    return int(any(tally.differences for tally in tallies))
+
+
+def artifacts(folder: Path) -> dict[str, str]:
+    """Digests of all files but those that are ignored, by their paths."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        parts = path.relative_to(folder).parts
+        if not IGNORED.keys() & {*parts}:
+            found["/".join(parts)] = hashlib.sha256(_content(path)).hexdigest()
+    return found
+
+
+def _content(path: Path) -> bytes:
+    if path.is_dir():
+        return b"a folder"
+    if path.suffix != ".jsonl":
+        return path.read_bytes()
+    lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    if path.name == "results.jsonl":  # the last line of a clip counts
+        lines = sorted({line["video_id"]: line for line in lines}.items())
+        lines = [line for _, line in lines]
+    return repr([{k: v for k, v in line.items() if k not in TOLD} for line in lines]).encode()
+
+
+def _differences(wanted: dict[str, str], have: dict[str, str]) -> list[str]:
+    paths = sorted(wanted.keys() | have.keys())
+    return [f"{path} differs" for path in paths if wanted.get(path) != have.get(path)]
+
+
+def _emptied(place: Path) -> Path:
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    return place
+
+
+def _finish(arguments: Sequence[str], place: Path, *, anew: bool = True) -> dict[str, str]:
+    _python(arguments, _emptied(place) if anew else place)
+    return artifacts(place / "out")
+
+
+def _python(arguments: Sequence[str], place: Path) -> None:
+    ran = subprocess.run([sys.executable, *arguments], cwd=place, capture_output=True, text=True)
+    assert ran.returncode == 0, f"{arguments}: {ran.stderr[-3000:]}"
+
+
+def _killed_after(seconds: float, arguments: Sequence[str], place: Path) -> bool:
+    """Start a process group and kill it; whether it had not ended by itself."""
+    with (place / "log").open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, *arguments], cwd=place, stdout=log, stderr=log, start_new_session=True
+        )
+    try:
+        code = process.wait(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        return True
+    assert code == 0, (place / "log").read_text("utf-8")[-3000:]
+    return False
