@@ -28,8 +28,7 @@ from egosim_jax.convert.skeleton import shapes
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import wan_dit
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
-from egosim_jax.io.untrusted import parse_json, quote, quote_path, quote_text, read_json
-from egosim_jax.io.weights import listing
+from egosim_jax.io.untrusted import listing, parse_json, quote, quote_path, quote_text, read_json
 from egosim_jax.models.lora import (
     BASE,
     MOST_RANK,
@@ -236,7 +235,7 @@ def _translated(
             problems.append(f"{place}: have {have}, want {shape}")
     if problems:
         what = f"{len(problems)} tensors of {source.name} are no LoRA of the network"
-        raise InputError(listing(what, problems))
+        raise InputError(f"{what}: {listing(problems)}.")
     changes: dict[str, Change] = {}
     for path in dict.fromkeys(place.path for place in pairs):
         shape = want[f"{path}.kernel"]

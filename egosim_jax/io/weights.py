@@ -26,7 +26,7 @@ from egosim_jax.io.mapped import (
     read_metadata,
     read_safetensors,
 )
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted import listing, quote_path
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -42,14 +42,8 @@ class WeightsError(InputError):
 
     def __init__(self, problems: Sequence[str], *, source: str):
         what = f"{len(problems)} weights of {quote_path(source)} do not match"
-        super().__init__(listing(what, problems))
+        super().__init__(f"{what}: {listing(problems, most=LISTED)}.")
         self.problems = list(problems)
-
-
-def listing(what: str, problems: Sequence[str]) -> str:
-    """Name the first problems, a line each, and how many more there are."""
-    more = [f"and {len(problems) - LISTED:,} more"] if len(problems) > LISTED else []
-    return "\n  ".join([f"{what}:", *problems[:LISTED], *more])
 
 
 def flat_shapes(module: nnx.Module) -> dict[str, tuple[int, ...]]:

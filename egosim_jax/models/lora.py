@@ -19,7 +19,8 @@ from flax import nnx
 from jaxtyping import Float
 
 from egosim_jax.io.mapped import OURS
-from egosim_jax.io.weights import flat_shapes, listing
+from egosim_jax.io.untrusted import listing
+from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.layers import Linear, LowRank
 from egosim_jax.types import InputError
 
@@ -103,7 +104,7 @@ def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
     paths = sorted({name.rpartition(".")[0] for name in tensors})
     both = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
     if odd := sorted(both ^ tensors.keys()):
-        raise InputError(listing("The LoRA has no pairs of down and up of these", odd))
+        raise InputError(f"The LoRA has no pairs of down and up of these: {listing(odd)}.")
     return {path: (tensors[f"{path}.down"], tensors[f"{path}.up"]) for path in paths}
 
 
@@ -168,4 +169,4 @@ def misfit(
 def refuse(problems: Sequence[str]) -> None:
     """Raise `InputError` if there are problems."""
     if problems:
-        raise InputError(listing("The LoRA is not of this network", problems))
+        raise InputError(f"The LoRA is not of this network: {listing(problems)}.")
