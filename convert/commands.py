@@ -151,7 +151,7 @@ class ToTorch:
     """Write a weights folder as safetensors in PyTorch names, which the other projects load.
 
     `wan` is the layout of the Wan and EgoSim releases; `diffusers` has a folder for each network,
-    with the configs that `from_pretrained` reads; a tokenizer and an image processor are not in it.
+    with the configs that `from_pretrained` reads, but for the tokenizer, which is passed to it.
     Networks above 5 GB become several files with an index.
     """
 

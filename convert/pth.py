@@ -42,7 +42,7 @@ STORAGES = {
 UNTYPED = "torch.storage.UntypedStorage"
 MOST_PICKLE, MOST_STEPS, MOST_ENTRIES, DEEPEST = 16 << 20, 1 << 20, 1 << 17, 64
 """Bytes and operations of the pickle, entries of the zip, and containers in containers."""
-MOST_ITEMS, MOST_KEY = 1 << 22, 1 << 31
+MOST_ITEMS, MOST_KEY = 1 << 20, 1 << 31
 """Items of all containers, counted wherever they are referred to, and the highest number as key."""
 END, END64_PLACE = struct.Struct("<10xH4xI2x"), struct.Struct("<8xQ4x")
 END64, LOCAL = struct.Struct("<32xQ8xQ"), struct.Struct("<26xHH")

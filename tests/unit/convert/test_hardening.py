@@ -185,7 +185,7 @@ def number(value):
     return b"\x8a\x10" + data
 
 
-MANY = b"(" + (1 << 14) * b"h\x00" + b"e"
+MANY = b"(" + (1 << 12) * b"h\x00" + b"e"
 PICKLES = {
     "a key of ten megabytes over a thousand": (
         b"\x80\x02}" + text((10 << 20) * b"k") + b"](" + 1000 * b"N" + b"es.", "512 characters",
@@ -203,7 +203,7 @@ PICKLES = {
         b"\x80\x02]q\x00" + 3 * (b"]" + MANY + b"q\x00") + b".", "more than 131,072",
     ),
     "nothing, many times, in many lists": (
-        b"\x80\x02Nq\x00](" + (1 << 14) * b"h\x00" + b"eq\x00]" + MANY + b".", "repeat without",
+        b"\x80\x02Nq\x00](" + (1 << 12) * b"h\x00" + b"eq\x00]" + MANY + b".", "repeat without",
     ),
     "numbers as keys that collide": (
         b"\x80\x02}(" + b"".join(number(i * (2**61 - 1)) + b"N" for i in range(1, 5_000)) + b"u.",

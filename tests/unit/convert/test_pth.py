@@ -209,7 +209,7 @@ RAW = {
         b"\x80\x02]q\x00" + b"".join(
             b"]q" + bytes([i + 1]) + b"(" + 10 * (b"h" + bytes([i])) + b"e" for i in range(9)
         ) + b".",
-        "without end",
+        "more than 131,072",
     ),
     "lists in lists in lists": (b"\x80\x02" + 5000 * b"]" + 4999 * b"a" + b".", "deeply"),
 }  # fmt: skip
