@@ -163,7 +163,7 @@ def test_an_interrupt_is_one_line_that_says_how_to_go_on(name, made, tmp_path):
     program, *arguments = COMMANDS[name].format(made=made, out=tmp_path / "out").split()
     module = {"egosim": "cli", "egosim-convert": "convert"}[program]
     chance = random.Random(name)  # noqa: S311
-    for _ in range(4):
+    for _ in range(3):
         process = subprocess.Popen(
             [sys.executable, "-m", f"egosim_jax.{module}", *arguments],
             stderr=subprocess.PIPE,
