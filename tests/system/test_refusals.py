@@ -141,7 +141,7 @@ def test_a_file_where_a_folder_has_to_be_is_named_and_stays(name, made, tmp_path
     assert out.read_text("utf-8") == "mine"
 
 
-@pytest.mark.parametrize("name", COMMANDS.keys() - UNLOCKED)
+@pytest.mark.parametrize("name", sorted(COMMANDS.keys() - UNLOCKED))
 def test_a_second_process_is_refused_while_the_first_one_writes(name, made, tmp_path, capfd):
     out = tmp_path / "out"
     hold = "import sys; from pathlib import Path; from egosim_jax.io.atomic import hold_folder; "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
     parts = out / "parts"
     open_folder(out, plan)
     if (out / MANIFEST).exists():
+        shutil.rmtree(parts, ignore_errors=True)  # it was killed just then
         yield from plan.seeds
         return
     parts.mkdir(exist_ok=True)
