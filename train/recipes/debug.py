@@ -60,9 +60,11 @@ class Debug(Recipe):
         """Make the clips, then do as `real_tiny` does."""
         from egosim_jax import configs
         from egosim_jax.data.clips import write_clips
+        from egosim_jax.io.atomic import hold_folder
         from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
         check_alone("debug")
+        hold_folder(self.out)
         spec = replace(configs.get("debug").video, frames=CLIP_FRAMES)
         if not self.metadata.exists():
             made = (to_triplet(next(make_sequence(seed, spec=spec))) for seed in range(self.clips))

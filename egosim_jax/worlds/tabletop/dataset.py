@@ -55,7 +55,7 @@ def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
     parts = out / "parts"
     open_folder(out, plan)
     if (out / MANIFEST).exists():
-        shutil.rmtree(parts, ignore_errors=True)
+        shutil.rmtree(parts, ignore_errors=True)  # it was killed just then
         yield from plan.seeds
         return
     parts.mkdir(exist_ok=True)
