@@ -207,6 +207,10 @@ class Generate:
         from egosim_jax.io.weights import hashes
 
         digests = None if self._weights is None else hashes(self._weights)
+        if self.lora is not None and digests is not None:
+            from egosim_jax.convert.lora import check_base
+
+            check_base(self.lora, [digests["dit"]])
         run = {
             "model": config,
             "weights": digests,
