@@ -18,7 +18,7 @@ _INNER = {
     b"moof", b"traf", b"mfra", b"wave",
 }  # fmt: skip
 _COUNTS = {b"stsz": 8, b"stz2": 8, b"trun": 4, b"stts": 4, b"ctts": 4, b"stsc": 4, b"stco": 4,
-           b"co64": 4, b"stss": 4, b"sbgp": 4, b"elst": 4}  # fmt: skip
+           b"co64": 4, b"stss": 4, b"sbgp": 8, b"elst": 4}  # fmt: skip
 """Where each table says its number of entries."""
 
 
@@ -41,8 +41,10 @@ def check_boxes(file: io.BufferedReader | io.BytesIO, name: str) -> None:
         if kind in _INNER:
             rest.append((content, stop))
         elif kind in _COUNTS:
-            file.seek(content + _COUNTS[kind])
-            samples += int.from_bytes(file.read(4), "big")
+            file.seek(content)
+            table = file.read(16)
+            place = _COUNTS[kind] + 4 * (kind == b"sbgp" and table[:1] == b"\1")
+            samples += int.from_bytes(table[place : place + 4], "big")
         seen += 1
         if samples > MAX_SAMPLES or seen > MAX_BOXES or kind == b"cmov":
             raise InputError(

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from egosim_jax.io import video as video_io
+from egosim_jax.io.boxes import check_boxes
 from egosim_jax.io.video import (
     decode_image,
     decode_video,
@@ -371,3 +372,12 @@ def test_an_image_of_32_bits_is_refused(tmp_path):
     Image.fromarray(np.ones((4, 4), np.float32)).save(tmp_path / "a.tiff")
     with pytest.raises(InputError, match="32 bits"):
         read_image(tmp_path / "a.tiff")
+
+
+def test_the_groups_of_samples_of_a_phones_video_are_counted():
+    """Its kind of group, four letters, stands where other tables have their number of entries."""
+    group = b"\0\0\0\0roll" + (1).to_bytes(4, "big") + (48_000).to_bytes(4, "big") + b"\0" * 4
+    check_boxes(io.BytesIO((8 + len(group)).to_bytes(4, "big") + b"sbgp" + group), "a.mp4")
+    many = group[:8] + (2**30).to_bytes(4, "big") + group[12:]
+    with pytest.raises(InputError, match="more than 4,194,304 samples"):
+        check_boxes(io.BytesIO((8 + len(many)).to_bytes(4, "big") + b"sbgp" + many), "a.mp4")
