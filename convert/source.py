@@ -48,6 +48,7 @@ def sources(path: Path) -> Iterator[Source]:
         yield _joined(quote_path(path.name), [path])
         return
     left = {f for f in path.iterdir() if f.suffix in (".safetensors", *PTH) and f.is_file()}
+    left = {file for file in left if not file.name.startswith(".")}  # half written ones
     for index in sorted(path.glob(f"*{INDEX}")):
         places = _indexed(index)
         files = sorted({index.parent / place for place in places.values()})

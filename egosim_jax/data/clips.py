@@ -24,6 +24,7 @@ from PIL import Image
 
 from egosim_jax.data.metadata import MASK_NAME, ClipFiles
 from egosim_jax.data.transforms import fit_length, resize_image, resize_mask
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted import listing, quote_path
 from egosim_jax.io.video import (
@@ -71,7 +72,8 @@ def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
             row = {"video": f"{name}/video.mp4", **row}
         for file, frames in videos.items():
             write_video(folder / name / file, frames, fps)
-        Image.fromarray(triplet.first_frame).save(folder / name / "first_frame.png")
+        with atomic_write(folder / name / "first_frame.png") as temporary:
+            Image.fromarray(triplet.first_frame).save(temporary)
         rows.append(row)
     table = io.StringIO()
     writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")

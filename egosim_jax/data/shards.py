@@ -132,7 +132,8 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     try:
         arrays = {
             key: np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(tensor["shape"])
-            for key, tensor in safetensors.deserialize(data)
+            # It gives them in any order.
+            for key, tensor in sorted(safetensors.deserialize(data), key=lambda pair: pair[0])
         }
         length = int.from_bytes(data[:8], "little")
         header = parse_json(data[8 : 8 + length], source="its header")

@@ -15,9 +15,8 @@ pytestmark = [
 ROOT = Path(__file__).parents[2]
 WRITERS = (
     "snapshot points portrait sheet video journal results config weights to-torch lora merge pack "
-    "encode make executables checkpoint"
+    "overwrite encode make executables checkpoint"
 )
-"""Not `overwrite`, whose old shards do not outlive a kill yet."""
 
 
 def test_nothing_is_lost_wherever_a_writer_is_killed(tmp_path):

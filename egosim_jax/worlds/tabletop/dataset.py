@@ -99,7 +99,6 @@ def _gather(plan: Plan, parts: Path, out: Path) -> None:
     ) as writer:
         for path in (_part(parts, s, n) for s in plan.seeds for n in range(plan.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)
-            arrays = dict(sorted(record.arrays.items()))  # safetensors gives them in any order
-            writer.add(arrays, record.metadata)
+            writer.add(record.arrays, record.metadata)
     gather([whole], out)
     shutil.rmtree(parts)
