@@ -197,12 +197,10 @@ class Checkpoints:
             # Orbax wraps what the data iterator says about a position of other data.
             if isinstance(error.__cause__, InputError):
                 raise error.__cause__ from error
-            if (self.folder / str(step) / HASHES).exists():  # then its files are as written
-                raise
             raise InputError(
-                f"The checkpoint of step {step} in {self.folder} cannot be read, and has no "
-                f"{HASHES} to tell why: {quote_text(str(error))}. Move it away to take the one "
-                "before it."
+                f"The checkpoint of step {step} in {self.folder} cannot be read, although its "
+                f"files are those of {HASHES}: {quote_text(str(error))}. Move it away to take the "
+                "one before it."
             ) from error
         return loaded[STATE]
 

@@ -120,7 +120,7 @@ def quote_text(text: str) -> str:
 
 def listing(items: Sequence[str], *, most: int = 5) -> str:
     """Put findings on one line: the first ones, and how many more there are."""
-    more = f"; and {len(items) - most} more" if len(items) > most else ""
+    more = f"; and {len(items) - most:,} more" if len(items) > most else ""
     return "; ".join(items[:most]) + more
 
 

@@ -27,6 +27,7 @@ from egosim_jax.train import cache as caching
 from egosim_jax.train.cache import cache, check_encoders
 from egosim_jax.types import InputError, VideoSpec
 
+pytestmark = pytest.mark.slow
 DEBUG = configs.get("debug")
 CONFIG = dataclasses.replace(DEBUG, video=VideoSpec(frames=5, height=16, width=32))
 FROZEN = dataclasses.replace(CONFIG, encoders="frozen")

@@ -372,6 +372,7 @@ def test_verify_finds_one_changed_value(tmp_path, capsys):
     assert "differs" in said
 
 
+@pytest.mark.slow
 def test_a_wider_model_of_a_base_model_gives_the_same_velocity(tmp_path):
     """The base's mask is 1 where ours is 0; the hands are not read yet."""
     narrow = replace(CONFIG.dit, in_channels=36)

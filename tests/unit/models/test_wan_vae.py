@@ -119,6 +119,7 @@ def test_standardised_latents_decode_to_the_same_video(vae):
     assert relative(have, call(vae, "decode_whole", latents_of() * std + mean)) <= REORDERED
 
 
+@pytest.mark.slow
 def test_reconstruction_trains_every_weight(vae):
     graph, state = nnx.split(vae)
 
@@ -173,6 +174,7 @@ def test_sizes_that_do_not_fit_each_other_are_refused(change, words):
         WanVAEConfig(**(SIZES | change))
 
 
+@pytest.mark.slow
 def test_an_untrained_vae_already_tells_dark_from_bright_everywhere_in_the_clip():
     config = WanVAEConfig(
         dim=8, z_dim=4, res_blocks=1, latent_mean=(0.0,) * 4, latent_std=(1.0,) * 4

@@ -10,6 +10,7 @@ SPEC = VideoSpec(frames=5, height=32, width=48)
 PLAN = Plan(seeds=(3, 4), clips=2, spec=SPEC, kind="human")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_and_gives_the_same_shards(tmp_path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert sorted(make_shards(PLAN, out=whole, workers=2)) == [3, 4]
