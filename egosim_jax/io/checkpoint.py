@@ -35,7 +35,8 @@ HASHES = "sha256.json"
 class Checkpoints:
     """The checkpoints of one run folder: the newest `keep`, and those of every `keep_every` steps.
 
-    Close it, also after an error: saving goes on in a thread.
+    Close it, also after an error: saving goes on in a thread. Raises `InputError` if what Orbax
+    has to know of a checkpoint before it reads any is damaged.
     """
 
     def __init__(self, folder: Path, *, keep: int = 2, keep_every: int | None = None):
@@ -46,13 +47,22 @@ class Checkpoints:
         if keep_every is not None:
             preserve.append(policies.EveryNSteps(keep_every))
         always = ocp.training.save_decision_policies.FixedIntervalPolicy(1)
-        # Orbax declares protocols that its own policies and pathlib do not meet to the letter.
-        self._checkpointer = ocp.training.Checkpointer(
-            self.folder,  # pyright: ignore[reportArgumentType]
-            preservation_policy=policies.AnyPreservationPolicy(preserve),  # pyright: ignore[reportArgumentType]
-            save_decision_policy=always,  # pyright: ignore[reportArgumentType]
-            cleanup_tmp_directories=True,
-        )
+        try:
+            # Orbax declares protocols that its own policies and pathlib do not meet to the letter.
+            self._checkpointer = ocp.training.Checkpointer(
+                self.folder,  # pyright: ignore[reportArgumentType]
+                preservation_policy=policies.AnyPreservationPolicy(preserve),  # pyright: ignore[reportArgumentType]
+                save_decision_policy=always,  # pyright: ignore[reportArgumentType]
+                cleanup_tmp_directories=True,
+            )
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            steps = sorted(int(path.name) for path in self.folder.iterdir() if path.name.isdigit())
+            damage = [line for step in steps for line in self._damage(step)]
+            raise InputError(
+                f"The checkpoints in {self.folder} cannot be listed: "
+                f"{listing(damage) or quote_text(str(error))}. Bring the files back, or move the "
+                "damaged checkpoint away."
+            ) from error
         self._thread = ThreadPoolExecutor(1)
         self._saving: tuple[int, Future[None]] | None = None
         if self.steps and not (self.folder / str(self.steps[-1]) / HASHES).exists():

@@ -138,6 +138,16 @@ def test_hashes_that_cannot_be_read_are_damage(tmp_path):
         Checkpoints(tmp_path).restore(abstract(state(1000)), numbers())
 
 
+def test_a_checkpoint_that_orbax_cannot_list_is_named(tmp_path):
+    saved_twice(tmp_path)
+    about = tmp_path / "8" / "_CHECKPOINT_METADATA"
+    about.write_text(
+        about.read_text().replace('"performance_metrics": {}', '"performance_metrics": 7')
+    )
+    with pytest.raises(InputError, match=r"cannot be listed: .*8/_CHECKPOINT_METADATA is not what"):
+        Checkpoints(tmp_path)
+
+
 def test_without_hashes_what_orbax_cannot_read_is_named(tmp_path):
     saved_twice(tmp_path)
     (tmp_path / "8" / HASHES).unlink()
