@@ -25,6 +25,7 @@ import open3d  # noqa: F401 - what is imported once is not imported in every for
 from flax import nnx
 from jax.sharding import SingleDeviceSharding
 from PIL import Image
+from safetensors.numpy import save_file
 
 from egosim_jax import configs
 from egosim_jax.cli import view
@@ -97,7 +98,7 @@ def _write_lora(path: Path, version: int) -> None:
         stem = f"diffusion_model.blocks.0.{name}"
         tensors[f"{stem}.lora_A.weight"] = rng.normal(size=(2, dim)).astype(np.float32)
         tensors[f"{stem}.lora_B.weight"] = rng.normal(size=(dim, 2)).astype(np.float32)
-    weights.write(path, tensors)
+    save_file(tensors, path)  # in names of others
 
 
 def _triplet(name: str) -> Triplet:
