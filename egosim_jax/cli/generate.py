@@ -141,7 +141,11 @@ class Generate:
         """Report clips whose video is there and whose line a kill prevented."""
         path = self._folder / RESULTS
         lines = read_lines(path) if path.exists() else ()
-        done = {line.get("video_id") for _, line in lines if line.get("status") == "done"}
+        done = {
+            line.get("video_id")
+            for _, line in lines
+            if isinstance(line, dict) and line.get("status") == "done"
+        }
         for item in items:
             if item.output_id not in done:
                 self._report(item, status="done", seed=_seed(self.seed, item.output_id))

@@ -21,6 +21,8 @@ from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 SPEC = VideoSpec(frames=9, height=64, width=96)
+BROKEN: dict[Path, Path] = {}
+"""The clips that a run in a folder was given."""
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +43,7 @@ def generated(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (broken / "sample_1" / "pc_mask_video.mp4").unlink()
     out = tmp_path_factory.mktemp("out") / "run"
     assert main(generate(broken / "metadata.csv", out)) == 3
+    BROKEN[out] = broken
     return out
 
 
@@ -100,6 +103,51 @@ def test_existing_clips_are_skipped_and_the_missing_one_is_made(generated, clips
     assert main(generate(clips, out, "--skip-existing")) == 0
     assert (out / "sample_0.mp4").stat().st_mtime_ns == before
     assert results(out)["sample_1"]["status"] == "done"
+
+
+def test_a_clip_named_like_the_temporary_file_of_another_is_not_lost(clips, tmp_path):
+    rows = clips.read_text("utf-8").replace("sample_1,", "sample_0.tmp,")
+    folder = tmp_path / "clips"
+    shutil.copytree(clips.parent, folder)
+    (folder / "metadata.csv").write_text(rows, "utf-8")
+    assert main(generate(folder / "metadata.csv", tmp_path / "out")) == 0
+    names = {path.name for path in (tmp_path / "out").glob("sample_0*.mp4")}
+    assert names == {f"sample_0{name}.mp4" for name in ("", "_cmp", ".tmp", ".tmp_cmp")}
+
+
+def test_columns_of_the_metadata_do_not_replace_those_of_the_result(clips, tmp_path):
+    folder = tmp_path / "clips"
+    shutil.copytree(clips.parent, folder)
+    with clips.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))[:1]
+    rows[0] |= {"status": "lost", "seed": "nine", "output": "elsewhere", "error": "yes"}
+    with (folder / "metadata.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    assert main(generate(folder / "metadata.csv", tmp_path / "out")) == 0
+    line = results(tmp_path / "out")["sample_0"]
+    assert line["status"] == "done"
+    assert isinstance(line["seed"], int)
+    assert line["metadata_status"] == "lost"
+    assert line["metadata_seed"] == "nine"
+    assert line["metadata_error"] == "yes"
+
+
+def test_a_clip_whose_line_a_kill_prevented_is_listed(generated, clips, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(generated, out)
+    (out / "results.jsonl").unlink()
+    assert main(generate(clips, out, "--skip-existing", "--limit", "1")) == 0
+    assert results(out)["sample_0"]["status"] == "done"
+
+
+def test_damaged_clips_that_are_left_over_end_as_they_did_at_first(generated, tmp_path, capsys):
+    """The first run of `generated` gave 3."""
+    out = tmp_path / "run"
+    shutil.copytree(generated, out)
+    assert main(generate(BROKEN[generated] / "metadata.csv", out, "--skip-existing")) == 3
+    assert "0 done, 1 failed" in capsys.readouterr().err
 
 
 def test_evaluate_reports_the_generated_clips_beside_the_baselines(generated, clips, capsys):
