@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from egosim_jax import command
-from egosim_jax.convert.layouts import Naming, Network, naming_in, recognise
+from egosim_jax.convert.layouts import Naming, Network, naming_in, recognize
 from egosim_jax.convert.plan import TABLES, Widening, fits, to_ours, to_theirs
 from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, in_rows, write
@@ -41,13 +41,13 @@ class Inspect:
     """List every tensor, too: name, shape and dtype."""
 
     def run(self) -> int:
-        """Recognise, match with the configs, print."""
+        """Recognize, match with the configs, print."""
         from rich.console import Console
         from rich.table import Table
 
         from egosim_jax import configs
 
-        folder = recognise(self.source)
+        folder = recognize(self.source)
         table = Table("network", "names of", "checkpoint", "weights", "dtype", "GB", "fits")
         for found in folder.found:
             tensors = found.tensors.values()
@@ -99,11 +99,11 @@ class Weights:
     for us."""
 
     def run(self) -> int:
-        """Recognise, check, write."""
+        """Recognize, check, write."""
         from egosim_jax import configs
 
         config = configs.get(self.config)
-        folder = recognise(self.source)
+        folder = recognize(self.source)
         names = self.only or tuple(dict.fromkeys(found.network for found in folder.found))
         if not names:
             raise InputError(
@@ -199,7 +199,7 @@ class ToTorch:
 class Lora:
     """Bring a LoRA into the names that ComfyUI and diffusers both read, or merge it into weights.
 
-    Reads PEFT's, diffusers', kohya's (VideoX-Fun, musubi) and ComfyUI's names, alpha honoured.
+    Reads PEFT's, diffusers', kohya's (VideoX-Fun, musubi) and ComfyUI's names, alpha honored.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -289,7 +289,7 @@ class Verify:
 
         config = configs.get(self.config)
         wrong = []
-        folder = recognise(self.source)
+        folder = recognize(self.source)
         files = {f.network: self.weights / f"{f.network}.safetensors" for f in folder.found}
         if not any(file.exists() for file in files.values()):
             raise InputError(

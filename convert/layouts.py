@@ -81,7 +81,7 @@ class Folder:
         return here[0]
 
 
-def recognise(path: Path) -> Folder:
+def recognize(path: Path) -> Folder:
     """Look through a file or folder. Raises `InputError` if it holds no checkpoint at all."""
     found, unknown, tokenizer = [], [], None
     for folder in _folders(path):

@@ -1,6 +1,6 @@
 """From conditions to a clip: encode, denoise, decode.
 
-    triplet --tokenise, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
+    triplet --tokenize, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
 
 Each arrow is one compiled program (`program.py`). All denoising steps are one, a scan without a
 round trip to the host; what the steps share (embeddings, cross-attention keys and values, the
@@ -37,7 +37,7 @@ from egosim_jax.io import weights
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
-from egosim_jax.models.layers import initialise
+from egosim_jax.models.layers import initialize
 from egosim_jax.models.umt5 import UMT5, UMT5Config
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
@@ -135,7 +135,7 @@ class Networks(nnx.Module):
     def random(cls, config: ModelConfig, *, seed: int) -> Networks:
         """Untrained networks, made in one compiled program."""
         graph = nnx.graphdef(nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))))
-        params = initialise(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
+        params = initialize(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
         return nnx.merge(graph, params)
 
     def save(self, folder: Path, *, dtype: str | None = None) -> None:
@@ -164,7 +164,7 @@ class Inputs:
 
     @classmethod
     def of(cls, triplets: Sequence[Triplet], config: ModelConfig) -> Inputs:
-        """Tokenise the prompts, pack the masks and prepare the image for CLIP."""
+        """Tokenize the prompts, pack the masks and prepare the image for CLIP."""
         tokens = config.tokenizer.tokenize([t.prompt for t in triplets])
         return cls(
             prior=np.stack([t.prior for t in triplets]),
@@ -376,7 +376,7 @@ def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
 
 def truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
     """The true videos. Raises `InputError` naming the clips that have none."""
-    without = [t.video_id for t in triplets if t.truth is None]
+    without = [t.video_id for t in triplets if t.target is None]
     if without:
         raise InputError(f"{', '.join(without)}: no truth to encode. (column video)")
-    return np.stack([t.truth for t in triplets if t.truth is not None])
+    return np.stack([t.target for t in triplets if t.target is not None])

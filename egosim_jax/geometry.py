@@ -1,6 +1,6 @@
 """Rigid motions and the pinhole camera, for NumPy arrays and jax's alike.
 
-Cameras follow OpenCV: x right, y down, z forward, in metres, with pixel centres at integer
+Cameras follow OpenCV: x right, y down, z forward, in meters, with pixel centers at integer
 coordinates. A matrix `a_from_b` takes coordinates in b to coordinates in a, so that
 `a_from_c = a_from_b @ b_from_c`.
 """
@@ -69,7 +69,7 @@ def pixel_rays(
 def finer(intrinsics_px: Float[np.ndarray, "3 3"], times: int) -> Float[np.ndarray, "3 3"]:
     """The same camera with each pixel split into `times` x `times`.
 
-    The centres of pixel i's parts lie around `times` i + (`times` - 1) / 2.
+    The centers of pixel i's parts lie around `times` i + (`times` - 1) / 2.
     """
     split = intrinsics_px.copy()
     split[:2] *= times
@@ -110,8 +110,8 @@ def umeyama(
     three, or all on one line.
     """
     middle, aim = points.mean(axis=0), targets.mean(axis=0)
-    centred, aimed = points - middle, targets - aim
-    u, strength, vt = np.linalg.svd(aimed.T @ centred / len(points))
+    centerd, aimed = points - middle, targets - aim
+    u, strength, vt = np.linalg.svd(aimed.T @ centerd / len(points))
     if len(points) < 3 or strength[1] <= 1e-12 * max(strength[0], 1e-300):
         raise InputError(
             f"{len(points)} points do not determine a motion: it takes three that are not in line."
@@ -120,7 +120,7 @@ def umeyama(
     motion = np.eye(4)
     motion[:3, :3] = (u * signs) @ vt
     if scaled:
-        motion[:3, :3] *= (strength * signs).sum() / np.square(centred).sum(axis=1).mean()
+        motion[:3, :3] *= (strength * signs).sum() / np.square(centerd).sum(axis=1).mean()
     motion[:3, 3] = aim - motion[:3, :3] @ middle
     return motion
 

@@ -9,7 +9,7 @@ the two tables here map them.
     context   devices that share samples, too, each with a part of the tokens; in self-attention
               each has all tokens of a part of the heads (Ulysses: Jacobs et al. 2023, section 3)
 
-Weights, gradients and optimiser state are split over fsdp and context together, along the model
+Weights, gradients and optimizer state are split over fsdp and context together, along the model
 width.
 """
 

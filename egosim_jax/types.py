@@ -125,9 +125,9 @@ class Cameras:
     """A camera's path: where it is at each frame, in OpenCV axes (x right, y down, z forward)."""
 
     world_from_camera: Float[np.ndarray, "f 4 4"]
-    """Rigid, in metres."""
+    """Rigid, in meters."""
     intrinsics_px: Float[np.ndarray, "3 3"]
-    """Focal lengths and principal point, with pixel centres at integer coordinates."""
+    """Focal lengths and principal point, with pixel centers at integer coordinates."""
     height: int
     """Rows of a picture."""
     width: int
@@ -171,12 +171,12 @@ class Triplet:
     prior: UInt8[np.ndarray, "f h w 3"]
     """The scene rendered along the camera path, without hands."""
     mask: UInt8[np.ndarray, "f h w"]
-    """Where the render shows nothing: 255 not observed, 0 observed, grey where it was resized."""
+    """Where the render shows nothing: 255 not observed, 0 observed, gray where it was resized."""
     hands: UInt8[np.ndarray, "f h w 3"]
     """The hand skeletons on black."""
     first_frame: UInt8[np.ndarray, "h w 3"]
     """The image for CLIP: the scene at the first frame."""
-    truth: UInt8[np.ndarray, "f h w 3"] | None = None
+    target: UInt8[np.ndarray, "f h w 3"] | None = None
     """The video that was really recorded."""
     extra: Mapping[str, str] = field(default_factory=dict)
     """Further metadata columns, carried to the results."""
@@ -185,7 +185,7 @@ class Triplet:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """What the denoiser is told, for a batch; the same at every step. Latents are normalised."""
+    """What the denoiser is told, for a batch; the same at every step. Latents are normalized."""
 
     mask: Float[Any, "b f h w 4"]
     """1 = generate, 0 = keep; the four channels are a 2 x 2 block of the mask (space to depth)."""
@@ -215,11 +215,11 @@ class Clip:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class SceneState:
-    """The 3D memory: coloured points in the world, and what is known of each."""
+    """The 3D memory: colored points in the world, and what is known of each."""
 
     points_m: Float32[np.ndarray, "n 3"]
     """In the world."""
-    colours: UInt8[np.ndarray, "n 3"]
+    colors: UInt8[np.ndarray, "n 3"]
     object_ids: Int32[np.ndarray, " n"]
     """The thing that each point belongs to; 0 is the background."""
     last_seen: Int32[np.ndarray, " n"]
@@ -239,7 +239,7 @@ class SceneState:
     def __post_init__(self) -> None:
         """Check that there are points, all finite, and as much of everything as of points."""
         count = len(self.points_m)
-        for name in ("colours", "object_ids", "last_seen"):
+        for name in ("colors", "object_ids", "last_seen"):
             if len(getattr(self, name)) != count:
                 raise InputError(
                     f"A state of {count} points has {len(getattr(self, name))} {name}: there must "

@@ -1,7 +1,7 @@
 """XLA's flags in the tests, where compiling takes longer than what is compiled."""
 
 QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-"""The same operations, whose machine code is not optimised."""
+"""The same operations, whose machine code is not optimized."""
 
 
 def devices(count: int) -> dict[str, str]:

@@ -24,7 +24,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.video import to_model
-from egosim_jax.data.transforms import COLOURS, DecodeWindow
+from egosim_jax.data.transforms import COLORS, DecodeWindow
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
 from egosim_jax.train.step import Batch, Metrics
 from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
@@ -118,7 +118,7 @@ class _RandomPiece(grain.transforms.RandomMap):
     def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
         """A piece at a random place of a random stream."""
         task, (rows, columns) = self.task, self.task.crop
-        stream = str(rng.choice(COLOURS, p=task.weights))
+        stream = str(rng.choice(COLORS, p=task.weights))
         video = DecodeWindow(task.video).random_map(element, rng)[stream]
         top = int(rng.integers(0, task.video.height - rows + 1))
         left = int(rng.integers(0, task.video.width - columns + 1))

@@ -103,7 +103,7 @@ def _encode(encoders: Encoders, inputs: Inputs, truth: jax.Array) -> dict[str, j
     """One video after the other, so that the VAE is compiled once and needs little memory."""
     videos = jnp.stack([truth, jnp.asarray(inputs.prior), jnp.asarray(inputs.hands)])
     latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), videos)
-    arrays = {"truth": latents[0], "prior": latents[1], "hands": latents[2]}
+    arrays = {"target": latents[0], "prior": latents[1], "hands": latents[2]}
     if encoders.text is not None:
         arrays["text"] = encoders.text(inputs.ids, inputs.ids_mask)
     if encoders.image is not None and inputs.pixels is not None:
@@ -132,7 +132,7 @@ def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     if the records are no clips with their truth.
     """
     manifest = source.manifest
-    if manifest.kind == "latents" or "truth" not in manifest.arrays:
+    if manifest.kind == "latents" or "target" not in manifest.arrays:
         raise InputError(
             f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}: to be encoded "
             "there must be videos or frames, with their truth. (--shards)"

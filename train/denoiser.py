@@ -112,14 +112,14 @@ class Denoising:
         """The flow-matching loss of a batch under dropped conditions."""
         condition = self.dropout.apply(networks.condition(batch), keys[:, 0])
         velocity = _velocity(networks, condition)
-        places = changed_places(batch["truth"], batch["prior"], self.change)
-        loss, _ = self.objective.loss(velocity, batch["truth"], keys[:, 1], places=places)
+        places = changed_places(batch["target"], batch["prior"], self.change)
+        loss, _ = self.objective.loss(velocity, batch["target"], keys[:, 1], places=places)
         return loss, {}
 
     def validate(self, networks: Denoiser, batch: Batch) -> Metrics:
         """Errors at fixed noise levels and with fixed noise, under the full condition."""
         velocity = _velocity(networks, networks.condition(batch))
-        truth = batch["truth"]
+        truth = batch["target"]
         noise = jax.random.normal(jax.random.key(0), truth.shape)
         errors = {
             f"loss_{time}": self.objective.loss_at(

@@ -1,6 +1,6 @@
 """One process or many: every run has jax's coordination service, which is what hears SIGTERM.
 
-Slurm, Open MPI and TPU pods are recognised by jax. Anywhere else, give every process
+Slurm, Open MPI and TPU pods are recognized by jax. Anywhere else, give every process
 
     JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
 

@@ -105,7 +105,7 @@ class FromScratch:
             validation=self.frames["test"],
             out=self.out / "vae",
         )
-        videos = (record.arrays["truth"] for record in ShardReader(self.frames["train"]))
+        videos = (record.arrays["target"] for record in ShardReader(self.frames["train"]))
         standardise_latents(vae, *latent_statistics(vae, videos))
         return vae
 

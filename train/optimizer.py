@@ -1,4 +1,4 @@
-"""The optimiser of a run: a learning-rate schedule, clipping, and AdamW or Muon, all from optax."""
+"""The optimizer of a run: a learning-rate schedule, clipping, and AdamW or Muon, all from optax."""
 
 from __future__ import annotations
 

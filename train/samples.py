@@ -67,7 +67,7 @@ class Samples:
 
     @cached_property
     def _truth(self) -> np.ndarray:
-        return self._frames(self._batch["truth"])
+        return self._frames(self._batch["target"])
 
     @cached_property
     def _vae(self) -> tuple[nnx.GraphDef, nnx.State]:
@@ -99,8 +99,8 @@ def _generate(
     graph: nnx.GraphDef, params: nnx.State, batch: dict[str, jax.Array], model: ModelConfig
 ) -> Any:
     networks: Any = nnx.merge(graph, params)
-    keys = jax.random.split(jax.random.key(0), len(batch["truth"]))
-    noise = jax.vmap(lambda key: jax.random.normal(key, batch["truth"].shape[1:]))(keys)
+    keys = jax.random.split(jax.random.key(0), len(batch["target"]))
+    noise = jax.vmap(lambda key: jax.random.normal(key, batch["target"].shape[1:]))(keys)
     return denoise(networks.dit, networks.condition(batch), noise, model)
 
 

@@ -32,7 +32,7 @@ from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
-from egosim_jax.models.layers import initialise
+from egosim_jax.models.layers import initialize
 from egosim_jax.sharding import (
     batch_sharding,
     make_mesh,
@@ -108,7 +108,7 @@ def train(
                     _placed(abstract, sharding), batches, fallback=training.fallback
                 )
             elif weights is None or jax.tree.leaves(frozen):
-                state = initialise(programs.create, out_shardings=sharding)
+                state = initialize(programs.create, out_shardings=sharding)
             else:
                 params = place(weights, abstract.params, sharding.params)
                 begin = partial(TrainState.create, config=training.optimizer, steps=training.steps)

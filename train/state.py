@@ -1,4 +1,4 @@
-"""The state of a training run: finished updates, weights and the optimiser's moments."""
+"""The state of a training run: finished updates, weights and the optimizer's moments."""
 
 from __future__ import annotations
 

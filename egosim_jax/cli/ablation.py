@@ -112,21 +112,21 @@ class Tabletop:
                         scene.block({"generated": video})
                         for scene, video in zip(scenes, videos, strict=True)
                     ]
-            table[name] = summarise(runs)
+            table[name] = summarize(runs)
         others = {
             **copies(scenes),
             "truth through the autoencoder": list(reconstruct(generator, scenes, batch_size=size)),
             "truth": [scene.clip.frames for scene in scenes],
         }
         for name, videos in others.items():
-            table[name] = summarise([judge(scenes, videos)])
+            table[name] = summarize([judge(scenes, videos)])
         draw_sheet(
             shown[:SHEET_SCENES], self.out / f"contact_sheet_{kind}.png", moments=SHEET_MOMENTS
         )
         return table
 
 
-def summarise(runs: Sequence[Sequence[Mapping[str, float]]]) -> dict[str, Summary]:
+def summarize(runs: Sequence[Sequence[Mapping[str, float]]]) -> dict[str, Summary]:
     """Mean and spreads of each measure; `runs` has a list of scenes for each seed.
 
     Where a measure is NaN, because there was nothing to measure, it does not count.

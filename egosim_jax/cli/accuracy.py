@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import Backend, backend
-from egosim_jax.cli.spread import print_table, summarise
+from egosim_jax.cli.spread import print_table, summarize
 from egosim_jax.command import DONE
 from egosim_jax.progress import track
 from egosim_jax.types import VideoSpec, check_counts
@@ -76,7 +76,7 @@ class Update:
         for seed in track(self._seeds(config.video), "scenes", total=self.scenes):
             for row, found in _rows(seed, config.video, generator):
                 table.setdefault(row, []).append(found)
-        summary = {row: summarise(found, MEASURES) for row, found in table.items()}
+        summary = {row: summarize(found, MEASURES) for row, found in table.items()}
         write_json(self.out / "report.json", {"definitions": DEFINITIONS, "table": summary})
         print_table("state after", summary, MEASURES)
         return DONE
@@ -104,7 +104,7 @@ def _rows(
     yield f"oracle, {LARGE.width} x {LARGE.height}", judge(large, large.frames, "oracle")
     clip = next(make_sequence(seed, spec=spec))
     view = render(clip.state, clip.cameras, point_px=2)
-    generated = generator(view, to_action(clip), clip.first.colours, seed)
+    generated = generator(view, to_action(clip), clip.first.colors, seed)
     yield f"oracle, {spec.width} x {spec.height}", judge(clip, clip.frames, "oracle")
     yield "classical, true frames", judge(clip, clip.frames, "classical")
     yield "classical, generated frames", judge(clip, generated, "classical")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
-from egosim_jax.cli.spread import Line, print_table, summarise
+from egosim_jax.cli.spread import Line, print_table, summarize
 from egosim_jax.command import DONE
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.progress import track
@@ -66,7 +66,7 @@ class Continuous:
         for method, seed in track(jobs, "sequences", total=len(jobs)):
             scores[method].append(self._simulate(generator, method, seed))
         tables = {
-            method: [summarise(clips, MEASURES) for clips in zip(*runs, strict=True)]
+            method: [summarize(clips, MEASURES) for clips in zip(*runs, strict=True)]
             for method, runs in scores.items()
         }
         write_json(self.out / "report.json", {"definitions": DEFINITIONS, "tables": tables})
@@ -98,7 +98,7 @@ class Continuous:
         )
         actions = [to_action(clip) for clip in truth]
         steps = simulator.run(
-            truth[0].state, actions, out=folder, seed=seed, first_frame=truth[0].first.colours
+            truth[0].state, actions, out=folder, seed=seed, first_frame=truth[0].first.colors
         )
         scores = [score(step, clip) for step, clip in zip(steps, truth, strict=True)]
         write_json(path, scores)

@@ -228,7 +228,7 @@ class Look:
     """Take the first clip of each combination of values of these columns, for instance verb."""
     limit: int = 12
     """Take at most so many clips."""
-    streams: tuple[Literal["truth", "prior", "hands"], ...] = ("truth", "prior", "hands")
+    streams: tuple[Literal["target", "prior", "hands"], ...] = ("target", "prior", "hands")
     """What is shown of each, from top to bottom."""
     moments: int = 6
     """Frames of each."""

@@ -19,7 +19,7 @@ from egosim_jax.cli.held_out import (
     judge,
     reconstruct,
 )
-from egosim_jax.cli.spread import Line, print_table, summarise
+from egosim_jax.cli.spread import Line, print_table, summarize
 from egosim_jax.command import DONE
 from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.io.atomic import atomic_write
@@ -334,7 +334,7 @@ def _compare(
         if name in validations:
             first, *_, last = validations[name].values()
             losses = {"before": {"mean": first}, "after": {"mean": last}}
-        table[name] = {**losses, **summarise(judge(scenes, videos[name]), MEASURES)}
+        table[name] = {**losses, **summarize(judge(scenes, videos[name]), MEASURES)}
     return table
 
 

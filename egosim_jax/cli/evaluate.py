@@ -59,9 +59,9 @@ class Evaluate:
     """Folder of the report, if not that of the clips."""
 
     def run(self) -> int:
-        """Compare clip after clip, then summarise."""
+        """Compare clip after clip, then summarize."""
         from egosim_jax.io.run import write_json, write_text
-        from egosim_jax.metrics.report import DEFINITIONS, summarise_splits
+        from egosim_jax.metrics.report import DEFINITIONS, summarize_splits
 
         windows, failed = self._windows()
         windows, frames = self._whole(windows, failed)
@@ -87,7 +87,7 @@ class Evaluate:
             }
             for window, scores in compared
         ]
-        splits = summarise_splits([(window.split, scores) for window, scores in compared])
+        splits = summarize_splits([(window.split, scores) for window, scores in compared])
         out = self.out or self.generated
         write_text(out / "metrics.jsonl", "".join(f"{json.dumps(line)}\n" for line in lines))
         report = {
@@ -160,21 +160,21 @@ class Evaluate:
         import numpy as np
 
         from egosim_jax.io.video import probe_video
-        from egosim_jax.metrics.image import fit_colours
+        from egosim_jax.metrics.image import fit_colors
         from egosim_jax.metrics.report import score
 
         path = self._video(window)
-        if window.files.truth is None:
+        if window.files.target is None:
             raise InputError(f"{window.files.row} names no truth.")
         output = probe_video(path)
-        like = output if self.size == "output" else probe_video(window.files.truth)
+        like = output if self.size == "output" else probe_video(window.files.target)
         shape = output.frames, like.height, like.width
-        truth = _read_at(window.files.truth, shape, window.start)
+        truth = _read_at(window.files.target, shape, window.start)
         prior = _read_at(window.files.prior, shape, window.start)
         videos = {
             "generated": _read_at(path, shape, 0),
             "prior": prior,
-            "prior_fit": fit_colours(prior, truth),
+            "prior_fit": fit_colors(prior, truth),
             "still": np.broadcast_to(truth[:1], truth.shape),
         }
         vae = path.with_name(f"{path.stem}_vae.mp4")

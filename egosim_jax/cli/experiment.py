@@ -154,7 +154,7 @@ class Comparison:
 def _row(clip: ClipFiles, other: ClipFiles) -> dict[str, str]:
     """A metadata row with the prior (beside which the mask lies) and the hands of another clip."""
     return {
-        "video": str(clip.truth and clip.truth.resolve()),
+        "video": str(clip.target and clip.target.resolve()),
         "ego_prior_video": str(other.prior.resolve()),
         "hand_keypoint_video": str(other.hands.resolve()),
         "first_frame": str(clip.first_frame.resolve()),

@@ -346,8 +346,8 @@ class Generate:
         from egosim_jax.io.video import write_video
 
         shown = [triplet.prior, triplet.hands, clip.frames]
-        if triplet.truth is not None:
-            shown.append(triplet.truth)
+        if triplet.target is not None:
+            shown.append(triplet.target)
         comparison = np.concatenate(shown, axis=2)
         write_video(self._folder / f"{item.output_id}_cmp.mp4", comparison, clip.fps)
         if ceiling is not None:

@@ -27,9 +27,9 @@ DEFINITIONS = {
     "psnr, ssim": "as in evaluate, frames 1 to the last",
     "region_psnr": "dB over the pixels where the truth shows a hand or the thing acted on, all "
     "frames of a clip together",
-    "hand_iou": "silhouette of hands and arms, read off by colour and opened by 3 x 3, against the "
+    "hand_iou": "silhouette of hands and arms, read off by color and opened by 3 x 3, against the "
     "true ids; mean over frames",
-    "object_error": "distance between the centroids of the thing acted on, read off by colour, and "
+    "object_error": "distance between the centroids of the thing acted on, read off by color, and "
     "its true one, in percent of the width; mean over the frames in which it is seen",
 }
 SHEET_SCENES, SHEET_MOMENTS = 4, (0, 3, 6, 9, 12, 16)

@@ -1,6 +1,6 @@
 """A simulation as a Rerun recording: scene, cameras, hands and videos, to be looked at in time.
 
-Entities, in metres and the world's coordinates: `world/state`, the points before each clip;
+Entities, in meters and the world's coordinates: `world/state`, the points before each clip;
 `world/hands/N`, the skeletons; `world/camera`, with the generated picture in its frustum; beside
 it `view` and `truth`. The timeline `frame` counts through all clips.
 """
@@ -79,7 +79,7 @@ class Recording:
         self._writing.__exit__(None, None, None)
 
     def _points(self, state: SceneState) -> None:
-        points = self._rr.Points3D(state.points_m, colors=state.colours, radii=POINT_M)
+        points = self._rr.Points3D(state.points_m, colors=state.colors, radii=POINT_M)
         self._stream.log("world/state", points)
 
     def _picture(self, frame: np.ndarray) -> Any:

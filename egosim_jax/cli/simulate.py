@@ -121,13 +121,13 @@ class Simulate:
 
     def _image(self, clip: TabletopClip) -> np.ndarray:
         if self.first_frame is None:
-            return clip.first.colours
+            return clip.first.colors
         from egosim_jax.io.video import read_image
 
         image = read_image(self.first_frame)
-        if image.shape != clip.first.colours.shape:
+        if image.shape != clip.first.colors.shape:
             raise InputError(
-                f"{self.first_frame} is {image.shape}, the clips are {clip.first.colours.shape}. "
+                f"{self.first_frame} is {image.shape}, the clips are {clip.first.colors.shape}. "
                 "(--first-frame)"
             )
         return image

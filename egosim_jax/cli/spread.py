@@ -22,7 +22,7 @@ def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
     return mean, float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
 
 
-def summarise(found: Sequence[Mapping[str, float]], measures: Measures) -> Line:
+def summarize(found: Sequence[Mapping[str, float]], measures: Measures) -> Line:
     """Mean and spread of each measure."""
     line = {}
     for name in measures:

@@ -34,7 +34,7 @@ class View:
     """Draw a state or a point cloud from three sides, or open a simulation in the Rerun viewer.
 
     PATH is the folder of a simulation or its simulation.rrd (needs the extra `viewer`), a folder
-    that holds a state, such as OUT/clip_1/state, or a PLY of coloured points, such as EgoSim's.
+    that holds a state, such as OUT/clip_1/state, or a PLY of colored points, such as EgoSim's.
     """
 
     path: Annotated[Path, tyro.conf.Positional]

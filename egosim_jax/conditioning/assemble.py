@@ -6,7 +6,7 @@
     36-51   hands latents, not masked
 
 The prior is masked in latent space and by the first of the four mask channels alone: an unobserved
-cell is latent 0, not the latent of grey or black (EgoSim release).
+cell is latent 0, not the latent of gray or black (EgoSim release).
 """
 
 from __future__ import annotations

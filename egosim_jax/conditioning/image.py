@@ -1,7 +1,7 @@
 """The first frame, as the CLIP image encoder wants it.
 
 Wan 2.1 takes a picture in [-1, 1], resizes it to the encoder's square, maps it to [0, 1] and
-normalises it with CLIP's statistics:
+normalizes it with CLIP's statistics:
 
     pixels = (x / 2 + 1/2 - mean) / std
 
@@ -9,7 +9,7 @@ The EgoSim release hands over a picture in [0, 1] instead, so that its encoder s
 half of the range, in training too; `image_range="unit"` reproduces that, "signed" is Wan's.
 
 The resize is bicubic without antialiasing, on a grid of cells (not of corners), as torch's
-`interpolate`. Output cell i is centred on s = (i + 1/2) n_in / n_out - 1/2 and weighs the four
+`interpolate`. Output cell i is centerd on s = (i + 1/2) n_in / n_out - 1/2 and weighs the four
 cells around s, at distances d, by Keys' kernel (1981) with a = -3/4, the edge cells repeated:
 
     k(d) = (a + 2) d^3 - (a + 3) d^2 + 1              d <= 1
@@ -36,7 +36,7 @@ def clip_pixels(
     image_size: int,
     image_range: Literal["unit", "signed"],
 ) -> Float[np.ndarray, "b {image_size} {image_size} 3"]:
-    """Pictures of the model's size to the image encoder's normalised input, float32."""
+    """Pictures of the model's size to the image encoder's normalized input, float32."""
     _, height, width, _ = frames.shape
     x = frames.astype(np.float32) / 255
     if image_range == "signed":
@@ -48,14 +48,14 @@ def clip_pixels(
 
 def bicubic(size_in: int, size_out: int) -> Float[np.ndarray, "{size_out} {size_in}"]:
     """The matrix that resizes one axis."""
-    centre = (np.arange(size_out) + 0.5) * size_in / size_out - 0.5
+    center = (np.arange(size_out) + 0.5) * size_in / size_out - 0.5
     matrix = np.zeros((size_out, size_in))
     for tap in range(-1, 3):
-        cell = np.floor(centre).astype(int) + tap
+        cell = np.floor(center).astype(int) + tap
         np.add.at(
             matrix,
             (np.arange(size_out), cell.clip(0, size_in - 1)),
-            _keys(np.abs(centre - cell)),
+            _keys(np.abs(center - cell)),
         )
     return matrix.astype(np.float32)
 

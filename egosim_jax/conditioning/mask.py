@@ -1,11 +1,11 @@
-"""The mask of what must be generated: from grey pixels to four latent channels.
+"""The mask of what must be generated: from gray pixels to four latent channels.
 
 The rules are those of the EgoSim release; 1 says not observed, generate, and 0 observed, keep, the
 opposite of the Wan 2.1 inpainting models. For a mask video of the model's size:
 
-1. A grey level above one half of white is 1, everything else 0.
+1. A gray level above one half of white is 1, everything else 0.
 2. The first frame is all 0: the prior is complete where the video starts.
-3. Nearest-neighbour selection down to latent frames and twice the latent rows and columns, by the
+3. Nearest-neighbor selection down to latent frames and twice the latent rows and columns, by the
    index floor(i in / out). In space this takes every fourth pixel. In time, the release first
    repeats the last frame up to 4f + 1 frames for f latent frames, though a clip has
    4f - 3, and floor(i (4f + 1) / f) = 4i: latent frame i is decided by pixel frame 4i.
@@ -27,13 +27,13 @@ from jaxtyping import UInt8
 from egosim_jax.types import SPATIAL_STRIDE, TEMPORAL_STRIDE, InputError, check_frame_count
 
 HALF_WHITE = 127
-"""The last grey level that is not above one half of 255."""
+"""The last gray level that is not above one half of 255."""
 
 
 def pack_mask(
     frames: UInt8[np.ndarray, "f h w"], *, padding: Literal["to-4f+1", "none"] = "to-4f+1"
 ) -> UInt8[np.ndarray, "lf lh lw 4"]:
-    """Mask channels, 0 or 1, of a grey mask video (255 = not observed) of 4k+1 frames."""
+    """Mask channels, 0 or 1, of a gray mask video (255 = not observed) of 4k+1 frames."""
     count, height, width = frames.shape
     check_frame_count(count, what="a mask video")
     if height % SPATIAL_STRIDE or width % SPATIAL_STRIDE:

@@ -48,8 +48,8 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
     """Write triplets as files in EgoSim's layout; the path of their metadata.csv.
 
-    Each clip has a folder of its own; what `extra` holds becomes columns. All clips have a truth or
-    none, and the same columns.
+    Each clip has a folder; what `extra` holds becomes columns. All clips have a target video, or
+    none has, and all have the same columns.
     """
     rows: list[dict[str, str]] = []
     for triplet in triplets:
@@ -67,8 +67,8 @@ def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
             "video_id": name,
             **triplet.extra,
         }
-        if triplet.truth is not None:
-            videos["video.mp4"] = triplet.truth
+        if triplet.target is not None:
+            videos["video.mp4"] = triplet.target
             row = {"video": f"{name}/video.mp4", **row}
         for file, frames in videos.items():
             write_video(folder / name / file, frames, fps)
@@ -166,12 +166,12 @@ def _fit_mask(frame: UInt8[np.ndarray, "h w 3"], *, height: int, width: int) -> 
 
 
 def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
-    """The videos to read; the lenient policy does without a mask or a truth that is not there."""
+    """The videos to read; the lenient policy does without a mask or a target that is missing."""
     videos = {"prior": files.prior, "hands": files.hands, "mask": files.mask}
-    if files.truth is not None:
-        videos["truth"] = files.truth
+    if files.target is not None:
+        videos["target"] = files.target
     if policy == "lenient":
-        for name in ("mask", "truth"):
+        for name in ("mask", "target"):
             if name in videos and not videos[name].exists():
                 del videos[name]
     return videos

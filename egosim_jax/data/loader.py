@@ -28,7 +28,7 @@ from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
 
-LATENTS = ("truth", "prior", "hands", "mask")
+LATENTS = ("target", "prior", "hands", "mask")
 """Arrays of a latents record that are as long and as large as its clip."""
 _THREADS = 4
 

@@ -63,7 +63,7 @@ class ClipFiles:
     """Video of the hand skeletons."""
     first_frame: Path
     """Image for CLIP."""
-    truth: Path | None
+    target: Path | None
     """Recorded video, if the metadata names one."""
     extra: Mapping[str, str]
     """Further columns."""
@@ -259,7 +259,7 @@ def _files(path: Path, line: int, row: Mapping[str, str]) -> ClipFiles:
         mask=prior.parent / MASK_NAME,
         hands=beside("hand_keypoint_video", HANDS_NAME),
         first_frame=beside("first_frame", IMAGE_NAME),
-        truth=folder / row[TRUTH] if TRUTH in row else None,
+        target=folder / row[TRUTH] if TRUTH in row else None,
         extra={name: cell for name, cell in row.items() if name not in COLUMNS},
         row=f"{path.name} line {line}",
     )

@@ -78,8 +78,8 @@ def encoded_record(files: ClipFiles) -> Record:
         "mask": files.mask,
         "first_frame": files.first_frame,
     }
-    if files.truth is not None:
-        paths["truth"] = files.truth
+    if files.target is not None:
+        paths["target"] = files.target
     arrays = {
         name: np.frombuffer(read_bytes(path, limit=MAX_FILE), np.uint8)
         for name, path in paths.items()
@@ -100,6 +100,6 @@ def triplet_record(triplet: Triplet) -> Record:
         "mask": triplet.mask,
         "first_frame": triplet.first_frame,
     }
-    if triplet.truth is not None:
-        arrays["truth"] = triplet.truth
+    if triplet.target is not None:
+        arrays["target"] = triplet.target
     return Record(arrays=arrays, metadata=clip_metadata(triplet))

@@ -4,7 +4,7 @@ A folder holds `manifest.json` and `shard-00000.array_record`, ... A record is t
 safetensors file whose header carries the record's metadata as JSON. Three kinds of records:
 
     kind      arrays
-    videos    truth, prior, hands, mask, first_frame: bytes of the source's own files (uint8 "n")
+    videos    target, prior, hands, mask, first_frame: bytes of the source's own files (uint8 "n")
     frames    the same, decoded at the manifest's spec: uint8 "f h w 3", mask "f h w", image "h w 3"
     latents   what a training step reads: latents "f h w 16", packed mask "f h w 4", embeddings, ...
 
@@ -122,7 +122,7 @@ class Manifest:
 
 
 def to_bytes(record: Record) -> bytes:
-    """Serialise a record; `from_bytes` gives back equal arrays, bit for bit."""
+    """Serialize a record; `from_bytes` gives back equal arrays, bit for bit."""
     arrays = {name: np.ascontiguousarray(array) for name, array in record.arrays.items()}
     return safetensors.numpy.save(arrays, metadata={"json": json.dumps(dict(record.metadata))})
 
@@ -131,7 +131,9 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     """Parse the bytes of a record. Raises `RecordError` if they are not one."""
     try:
         arrays = {
-            key: np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(tensor["shape"])
+            _current_name(key): np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(
+                tensor["shape"]
+            )
             # It gives them in any order.
             for key, tensor in sorted(safetensors.deserialize(data), key=lambda pair: pair[0])
         }
@@ -145,6 +147,11 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     except (safetensors.SafetensorError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise RecordError(f"{name} is not a record of arrays: {quote_text(str(error))}.") from error
     return Record(arrays=arrays, metadata=metadata)
+
+
+def _current_name(key: str) -> str:
+    """Return today's name of an array; earlier datasets call the target `truth`."""
+    return "target" if key == "truth" else key
 
 
 class ShardWriter(AbstractContextManager["ShardWriter"]):
@@ -416,7 +423,7 @@ def _manifest(fields: Any, name: str) -> Manifest:
             f"record, not {', '.join(unsafe[:8]) or 'none, equal or empty ones'}."
         )
     arrays = {
-        key: ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
+        _current_name(key): ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
         for key, info in fields["arrays"].items()
     }
     axes = [axis for info in arrays.values() for axis in info.shape]

@@ -1,7 +1,7 @@
 """From the pixels of files to the pixels a model sees; the same code in training and inference.
 
 Every video is stretched to the model's size, without cropping and without keeping the aspect
-ratio: colours with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Pixels that
+ratio: colors with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Pixels that
 have the right size already pass unchanged.
 """
 
@@ -19,8 +19,8 @@ from PIL import Image
 from egosim_jax.io.video import Decoding, decode_image, decode_video, probe_encoded
 from egosim_jax.types import InputError, VideoSpec
 
-COLOURS = ("truth", "prior", "hands")
-"""The colour videos of a triplet, by their names in a record."""
+COLORS = ("target", "prior", "hands")
+"""The color videos of a triplet, by their names in a record."""
 
 
 def resize_image(
@@ -40,7 +40,7 @@ def resize_video(
 def resize_mask(
     mask: UInt8[np.ndarray, "f h w"], height: int, width: int
 ) -> UInt8[np.ndarray, "f height width"]:
-    """Stretch every frame of a mask with BILINEAR; edges become grey levels."""
+    """Stretch every frame of a mask with BILINEAR; edges become gray levels."""
     return _resize_all(mask, height, width, Image.Resampling.BILINEAR)
 
 
@@ -53,7 +53,7 @@ def fit_length(frames: UInt8[np.ndarray, "f ..."], count: int) -> UInt8[np.ndarr
 class DecodeWindow(grain.transforms.RandomMap):
     """A random window of `spec.frames` frames out of a record of videos, at the model's size.
 
-    Takes records of kind "videos", which it decodes, and of kind "frames". Gives `truth`, `prior`,
+    Takes records of kind "videos", which it decodes, and of kind "frames". Gives `target`, `prior`,
     `hands`, `mask` and `first_frame`; the image stays the clip's own wherever the window begins.
     """
 
@@ -92,7 +92,7 @@ def decode_record(
     absent = [name for name in ("prior", "hands", "mask", "first_frame") if name not in arrays]
     if absent:
         raise InputError(f"The record is no clip: it has no {', '.join(absent)}.")
-    for name in (*COLOURS, "mask"):
+    for name in (*COLORS, "mask"):
         if name not in arrays:
             continue
         frames = _frames(arrays[name], name, start, stop, decoding)

@@ -125,7 +125,7 @@ class Checkpoints:
 
         `data` is set to the saved position in place. With `fallback` a damaged checkpoint is set
         aside and the one before it taken. Raises `InputError` naming the damaged files, or listing
-        the paths that differ when the checkpoint was made by another model or optimiser.
+        the paths that differ when the checkpoint was made by another model or optimizer.
         """
         for step in reversed(self.steps):
             damage = self._damage(step)
@@ -228,7 +228,7 @@ class Checkpoints:
         if problems:
             raise InputError(
                 f"The checkpoint of step {step} in {self.folder} is of another model or "
-                f"optimiser. Use its config, or another --out: {listing(problems)}."
+                f"optimizer. Use its config, or another --out: {listing(problems)}."
             )
 
 

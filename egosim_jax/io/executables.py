@@ -53,7 +53,7 @@ def kept(about: Any, given: Any, compile: Callable[[], Any]) -> Any:
         compiled = compile()
     try:
         cache.put(name, pickle.dumps(serialize_executable.serialize(compiled)))
-    except (ValueError, NotImplementedError) as error:  # programs that cannot be serialised
+    except (ValueError, NotImplementedError) as error:  # programs that cannot be serialized
         warnings.warn(f"{name} was not kept: {error}", stacklevel=2)
     return compiled
 

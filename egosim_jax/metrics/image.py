@@ -1,4 +1,4 @@
-"""PSNR and SSIM of uint8 RGB videos, and the colour fit of a baseline.
+"""PSNR and SSIM of uint8 RGB videos, and the color fit of a baseline.
 
 PSNR of a frame is 10 log10(255^2 / MSE), the MSE over all its pixels and channels; a frame equal
 to its reference would be infinite and counts as 100 dB. A video's PSNR is the mean over frames.
@@ -24,7 +24,7 @@ from einops import rearrange
 from jaxtyping import Array, Float, UInt8
 
 MAX_PSNR = 100.0
-_GREY = 127.5
+_GRAY = 127.5
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
@@ -54,15 +54,15 @@ def ssim(
     """SSIM of every frame; frames must be at least 11 pixels high and wide."""
     values = []
     for frame, other in zip(video, reference, strict=True):
-        moments, centre = _moments(frame, other)
-        values.append(float(_similarity(_blur(_blur(moments, axis=1), axis=2), centre)))
+        moments, center = _moments(frame, other)
+        values.append(float(_similarity(_blur(_blur(moments, axis=1), axis=2), center)))
     return np.array(values)
 
 
-def fit_colours(
+def fit_colors(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> UInt8[np.ndarray, "f h w 3"]:
-    """Change the colours of a video to come nearest to a reference.
+    """Change the colors of a video to come nearest to a reference.
 
     One affine map, 3 x 4, for the whole clip, fitted by least squares over all pixels.
     """
@@ -71,29 +71,27 @@ def fit_colours(
         sums = _normal_equations(frame, other)
         gram, moment = gram + np.asarray(sums[0]), moment + np.asarray(sums[1])
     matrix = np.linalg.lstsq(gram, moment)[0].astype(np.float32)
-    return np.stack([np.asarray(_map_colours(frame, matrix)) for frame in video])
+    return np.stack([np.asarray(_map_colors(frame, matrix)) for frame in video])
 
 
 @jax.jit
 def _normal_equations(
     a: UInt8[Array, "h w 3"], b: UInt8[Array, "h w 3"]
 ) -> tuple[Float[Array, "4 4"], Float[Array, "4 3"]]:
-    colours = _with_one(a)
-    return colours.T @ colours, colours.T @ (_with_one(b)[:, :3])
+    colors = _with_one(a)
+    return colors.T @ colors, colors.T @ (_with_one(b)[:, :3])
 
 
 @jax.jit
-def _map_colours(
-    frame: UInt8[Array, "h w 3"], matrix: Float[Array, "4 3"]
-) -> UInt8[Array, "h w 3"]:
-    mapped = jnp.rint(_with_one(frame) @ matrix + _GREY)
+def _map_colors(frame: UInt8[Array, "h w 3"], matrix: Float[Array, "4 3"]) -> UInt8[Array, "h w 3"]:
+    mapped = jnp.rint(_with_one(frame) @ matrix + _GRAY)
     return jnp.clip(mapped, 0, 255).astype(jnp.uint8).reshape(frame.shape)
 
 
 def _with_one(frame: UInt8[Array, "h w 3"]) -> Float[Array, "n 4"]:
-    """Centred colours and a one for each pixel."""
-    colours = rearrange(frame, "h w c -> (h w) c").astype(jnp.float32) - _GREY
-    return jnp.concatenate([colours, jnp.ones((len(colours), 1))], axis=1)
+    """Centerd colors and a one for each pixel."""
+    colors = rearrange(frame, "h w c -> (h w) c").astype(jnp.float32) - _GRAY
+    return jnp.concatenate([colors, jnp.ones((len(colors), 1))], axis=1)
 
 
 @jax.jit
@@ -106,9 +104,9 @@ def _moments(
     keeps float32 exact enough.
     """
     a, b = a.astype(jnp.float32), b.astype(jnp.float32)
-    centre = jnp.rint((a.mean() + b.mean()) / 2)
-    a, b = a - centre, b - centre
-    return jnp.stack([a, b, a * b, a * a + b * b]), centre
+    center = jnp.rint((a.mean() + b.mean()) / 2)
+    a, b = a - center, b - center
+    return jnp.stack([a, b, a * b, a * a + b * b]), center
 
 
 @functools.partial(jax.jit, static_argnames="axis")
@@ -129,11 +127,11 @@ def _blur(x: Float[Array, "4 _ _ c"], *, axis: int) -> Float[Array, "4 _ _ c"]:
 
 
 @jax.jit
-def _similarity(blurred: Float[Array, "4 h w c"], centre: Float[Array, ""]) -> Float[Array, ""]:
+def _similarity(blurred: Float[Array, "4 h w c"], center: Float[Array, ""]) -> Float[Array, ""]:
     """Mean SSIM over windows and channels."""
     mu_a, mu_b, product, squares = blurred
     covariance = product - mu_a * mu_b
     variances = squares - mu_a**2 - mu_b**2
-    mu_a, mu_b = mu_a + centre, mu_b + centre
+    mu_a, mu_b = mu_a + center, mu_b + center
     above = (2 * mu_a * mu_b + _C1) * (2 * covariance + _C2)
     return (above / ((mu_a**2 + mu_b**2 + _C1) * (variances + _C2))).mean()

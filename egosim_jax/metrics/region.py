@@ -1,8 +1,8 @@
-"""Whether the right things are where they should be: silhouettes and places read off by colour.
+"""Whether the right things are where they should be: silhouettes and places read off by color.
 
-A thing of colour c that is lit by s shows s * c. Where the scene without hands and without the
-thing they move is known, each pixel belongs to whichever comes nearest to its colour: that
-background in some light, {s * b : 0.45 <= s <= 1.15}, or one of the colours of hands and thing. The
+A thing of color c that is lit by s shows s * c. Where the scene without hands and without the
+thing they move is known, each pixel belongs to whichever comes nearest to its color: that
+background in some light, {s * b : 0.45 <= s <= 1.15}, or one of the colors of hands and thing. The
 same rule reads the truth and the generated video; on the truth, where ids are known, it says how
 far it can be trusted.
 """
@@ -33,18 +33,18 @@ def label(
     """What each pixel shows: an id of `paints`, which are RGB by id, or 0 for the background."""
     pixels = video.astype(np.float32)
     numbers = np.array([0, *paints])
-    colours = [background, *(np.array(colour) for colour in paints.values())]
-    distances = [_distance(pixels, colour.astype(np.float32)) for colour in colours]
+    colors = [background, *(np.array(color) for color in paints.values())]
+    distances = [_distance(pixels, color.astype(np.float32)) for color in colors]
     return numbers[np.argmin(distances, axis=0)]
 
 
 def _distance(
-    pixels: Float[np.ndarray, "f h w 3"], colour: Float[np.ndarray, "*b 3"]
+    pixels: Float[np.ndarray, "f h w 3"], color: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "f h w"]:
-    """Squared distance from a colour in the light that brings it nearest."""
-    strength = np.maximum(np.square(colour).sum(axis=-1), 1e-6)
-    shade = np.clip((pixels * colour).sum(axis=-1) / strength, *SHADES)
-    return np.square(pixels - shade[..., None] * colour).sum(axis=-1)
+    """Squared distance from a color in the light that brings it nearest."""
+    strength = np.maximum(np.square(color).sum(axis=-1), 1e-6)
+    shade = np.clip((pixels * color).sum(axis=-1) / strength, *SHADES)
+    return np.square(pixels - shade[..., None] * color).sum(axis=-1)
 
 
 def opened(silhouette: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
@@ -95,7 +95,7 @@ def centroid_errors(
 
 
 def _centroid(silhouette: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
-    """Of the pixels around the median one: stray pixels of a like colour do not count."""
+    """Of the pixels around the median one: stray pixels of a like color do not count."""
     pixels = np.argwhere(silhouette)
     gaps = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
     near = gaps <= max(NEAR * silhouette.shape[1], gaps.min())

@@ -44,7 +44,7 @@ def score(video: UInt8[np.ndarray, "f h w 3"], truth: UInt8[np.ndarray, "f h w 3
     return Score(psnr=float(psnr(video, truth).mean()), ssim=float(ssim(video, truth).mean()))
 
 
-def summarise(scores: Sequence[Score]) -> Summary:
+def summarize(scores: Sequence[Score]) -> Summary:
     """Means over clips, and standard deviations (0 for a single clip)."""
     psnrs, ssims = [s.psnr for s in scores], [s.ssim for s in scores]
     return Summary(
@@ -56,7 +56,7 @@ def summarise(scores: Sequence[Score]) -> Summary:
     )
 
 
-def summarise_splits(
+def summarize_splits(
     clips: Sequence[tuple[str, Mapping[str, Score]]],
 ) -> dict[str, dict[str, Summary]]:
     """Sorted splits, and of each method its summary, from every clip's split and scores."""
@@ -65,7 +65,7 @@ def summarise_splits(
         for method, value in scores.items():
             gathered.setdefault(split, {}).setdefault(method, []).append(value)
     return {
-        split: {method: summarise(values) for method, values in methods.items()}
+        split: {method: summarize(values) for method, values in methods.items()}
         for split, methods in sorted(gathered.items())
     }
 

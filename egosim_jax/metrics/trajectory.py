@@ -39,11 +39,11 @@ def seen_from(
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     path = np.full((len(frames), 4, 4), np.nan)
     for number, pose in enumerate(cameras.world_from_camera):
-        grey = [cv2.cvtColor(picture[number], cv2.COLOR_RGB2GRAY) for picture in (truth, frames)]
-        row, column = _telling(grey[0], still[number] & np.isfinite(depth_m[number]))
+        gray = [cv2.cvtColor(picture[number], cv2.COLOR_RGB2GRAY) for picture in (truth, frames)]
+        row, column = _telling(gray[0], still[number] & np.isfinite(depth_m[number]))
         if len(row) < LEAST:
             continue
-        moved = flow.calc(grey[0], grey[1], None)[row, column]
+        moved = flow.calc(gray[0], gray[1], None)[row, column]
         pixels = np.stack([column, row], axis=1) + moved.astype(float)
         there = rays[row, column] * depth_m[number, row, column][:, None]
         path[number] = _pose(transform(pose, there), pixels, cameras)
@@ -51,13 +51,13 @@ def seen_from(
 
 
 def _telling(
-    grey: UInt8[np.ndarray, "h w"], usable: Bool[np.ndarray, "h w"]
+    gray: UInt8[np.ndarray, "h w"], usable: Bool[np.ndarray, "h w"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the usable pixels where the picture changes most."""
-    down, right = np.gradient(grey.astype(float))
+    down, right = np.gradient(gray.astype(float))
     strength = np.where(usable, np.hypot(down, right), -1.0)
     order = np.argsort(strength, axis=None, kind="stable")[::-1][: min(MOST, int(usable.sum()))]
-    row, column = np.unravel_index(order, grey.shape)
+    row, column = np.unravel_index(order, gray.shape)
     return row, column
 
 
@@ -90,7 +90,7 @@ def _pose(
 def camera_errors(
     world_from_camera: Float[np.ndarray, "f 4 4"], truth: Float[np.ndarray, "f 4 4"]
 ) -> tuple[float, float]:
-    """Root mean square error of position in metres and of rotation in degrees.
+    """Root mean square error of position in meters and of rotation in degrees.
 
     Frames whose pose is not finite do not count; NaN if none is.
     """
@@ -98,7 +98,7 @@ def camera_errors(
     if not known.any():
         return float("nan"), float("nan")
     between = invert(truth[known]) @ world_from_camera[known]
-    metres = np.linalg.norm(between[:, :3, 3], axis=1)
+    meters = np.linalg.norm(between[:, :3, 3], axis=1)
     cosines = (np.trace(between[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     degrees = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    return float(np.sqrt(np.mean(metres**2))), float(np.sqrt(np.mean(degrees**2)))
+    return float(np.sqrt(np.mean(meters**2))), float(np.sqrt(np.mean(degrees**2)))

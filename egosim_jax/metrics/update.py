@@ -49,7 +49,7 @@ def thing_accuracy(
 def both_ways(
     points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"], *, share: float = 0.95
 ) -> float:
-    """The larger of the two quantiles of nearest-neighbour distances, in metres.
+    """The larger of the two quantiles of nearest-neighbor distances, in meters.
 
     Infinite if there are no points on either side.
     """

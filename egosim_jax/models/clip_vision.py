@@ -2,7 +2,7 @@
 
 The vision transformer of open-clip's XLM-RoBERTa-Large ViT-H/14 (Dosovitskiy et al. 2021; Radford
 et al. 2021). The picture is cut into patches, a class token is put before them, positions are
-added and normalised, and each block adds
+added and normalized, and each block adds
 
     x += attention(LayerNorm(x))      x += D gelu(U LayerNorm(x)), gelu with the exact erf
 
@@ -150,7 +150,7 @@ class CLIPVision(nnx.Module):
     def __call__(
         self, pixels: Float[Array, "b {self.config.image_size} {self.config.image_size} 3"]
     ) -> Float[Array, "b {self.config.tokens} {self.config.dim}"]:
-        """Encode pictures whose channels have been normalised with CLIP's mean and deviation."""
+        """Encode pictures whose channels have been normalized with CLIP's mean and deviation."""
         dtype = jnp.dtype(self.config.dtype)
         patches = self.patch_embed(pixels)
         first = repeat(self.class_token[...].astype(dtype), "d -> b 1 d", b=len(pixels))

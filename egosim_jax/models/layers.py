@@ -97,7 +97,7 @@ class LayerNorm(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(dim), axes=("embed",)) if affine else None
 
     def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
-        """Normalise; the answer is float32."""
+        """Normalize; the answer is float32."""
         x = x.astype(jnp.float32)
         x = x - x.mean(-1, keepdims=True)
         x = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
@@ -114,7 +114,7 @@ class RMSNorm(nnx.Module):
         self.scale = nnx.Param(jnp.ones(dim), axes=axes)
 
     def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
-        """Normalise; the answer is float32."""
+        """Normalize; the answer is float32."""
         x = x.astype(jnp.float32)
         inverse = jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
         # Behind the barrier is one number per row. Without it, a GPU's compiler makes the sum and
@@ -122,11 +122,11 @@ class RMSNorm(nnx.Module):
         return x * jax.lax.optimization_barrier(inverse) * self.scale[...].astype(jnp.float32)
 
 
-def initialise(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
+def initialize(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
     """Run `make` as one program, straight into its shardings.
 
     Drawing hundreds of random arrays is a long program that runs once, so that on a CPU, where
-    optimising it would take longer than training a tiny model, it is compiled as it is.
+    optimizing it would take longer than training a tiny model, it is compiled as it is.
     """
     program = jax.jit(make, out_shardings=out_shardings).lower()
     on_cpu = jax.default_backend() == "cpu"

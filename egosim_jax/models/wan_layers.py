@@ -119,7 +119,7 @@ class WanDiTConfig:
 def modulate(
     x: Float[Array, "b n d"], shift: Float[Array, "b 1 d"], scale: Float[Array, "b 1 d"]
 ) -> Float[Array, "b n d"]:
-    """Scale and shift normalised tokens."""
+    """Scale and shift normalized tokens."""
     return x * (1 + scale) + shift
 
 
@@ -225,7 +225,7 @@ class ImageEmbedding(nnx.Module):
 
 
 class KeyValue(nnx.Module):
-    """Keys, normalised over the full width, and values, by head."""
+    """Keys, normalized over the full width, and values, by head."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         sizes, axes = (config.dim, config.dim), ("embed", "heads")
@@ -262,7 +262,7 @@ class Attention(KeyValue):
         self.o = linear(config, sizes, ("heads", "embed"), rngs)
 
     def queries(self, x: Float[Array, "b n d"]) -> Float[Array, "b n h k"]:
-        """Normalised queries, in float32."""
+        """Normalized queries, in float32."""
         return self._by_head(self.norm_q(kept(self.q(x))))
 
     def attend(
@@ -351,7 +351,7 @@ class Head(nnx.Module):
     def __call__(
         self, x: Float[Array, "b n d"], time: Float[Array, "b 1 d"]
     ) -> Float[Array, "b n o"]:
-        """Project; zero at initialisation."""
+        """Project; zero at initialization."""
         shifts = self.modulation[...].astype(jnp.float32) + time
         shift, scale = rearrange(shifts, "b k d -> k b 1 d")
         return self.linear(modulate(self.norm(x), shift, scale)).astype(jnp.float32)

@@ -94,7 +94,7 @@ class WanVAEConfig:
 
 
 class Encoder(nnx.Module):
-    """Video to twice `z_dim` channels of latent moments, before the quantisation convolution."""
+    """Video to twice `z_dim` channels of latent moments, before the quantization convolution."""
 
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
@@ -121,7 +121,7 @@ class Encoder(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Latents, after the quantisation convolution, to video."""
+    """Latents, after the quantization convolution, to video."""
 
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
@@ -189,7 +189,7 @@ class WanVAE(nnx.Module):
     def moments(
         self, video: Float[Array, "b f h w 3"]
     ) -> tuple[Float[Array, "b f2 h2 w2 z"], Float[Array, "b f2 h2 w2 z"]]:
-        """Mean and log variance of the latents, not normalised, in one pass: for training."""
+        """Mean and log variance of the latents, not normalized, in one pass: for training."""
         self._check(video)
         hidden, _ = self.encoder(video, None)
         mean, logvar = jnp.split(self.to_moments(hidden).astype(jnp.float32), 2, axis=-1)
@@ -197,15 +197,15 @@ class WanVAE(nnx.Module):
 
     def encode_whole(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
         """`encode` in one pass; memory grows with the length."""
-        return self.normalise(self.moments(video)[0])
+        return self.normalize(self.moments(video)[0])
 
     def decode_whole(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
-        """The video of latents not normalised, in one pass and not clipped: for training."""
+        """The video of latents not normalized, in one pass and not clipped: for training."""
         video, _ = self.decoder(self.from_latents(latents), None)
         return video.astype(jnp.float32)
 
     def encode(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
-        """Normalised mean latents, float32; the frames are coded in groups of 1, 4, 4, ...
+        """Normalized mean latents, float32; the frames are coded in groups of 1, 4, 4, ...
 
         Raises `InputError` unless the video is of floats (which should lie in [-1, 1]) and has 4k+1
         frames of a size in multiples of 8.
@@ -221,11 +221,11 @@ class WanVAE(nnx.Module):
         _, rest = jax.lax.scan(step, cache, groups)
         rest = rearrange(rest, "n b f h w c -> b (n f) h w c")
         moments = self.to_moments(jnp.concatenate([first, rest], axis=1))
-        return self.normalise(moments[..., : self.config.z_dim].astype(jnp.float32))
+        return self.normalize(moments[..., : self.config.z_dim].astype(jnp.float32))
 
     def decode(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
-        """The video of normalised latents, float32 in [-1, 1], one latent frame at a time."""
-        hidden = self.from_latents(self.denormalise(latents.astype(jnp.float32)))
+        """The video of normalized latents, float32 in [-1, 1], one latent frame at a time."""
+        hidden = self.from_latents(self.denormalize(latents.astype(jnp.float32)))
         first, cache = self.decoder(hidden[:, :1], None)
 
         def step(cache: Cache, frame: Array) -> tuple[Cache, Array]:
@@ -237,12 +237,12 @@ class WanVAE(nnx.Module):
         video = jnp.concatenate([first, rest], axis=1).astype(jnp.float32)
         return jnp.clip(video, -1.0, 1.0)
 
-    def normalise(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
+    def normalize(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
         """Latents with the configured mean and standard deviation taken out."""
         return (mean - jnp.array(self.config.latent_mean)) / jnp.array(self.config.latent_std)
 
-    def denormalise(self, latents: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
-        """The inverse of `normalise`."""
+    def denormalize(self, latents: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
+        """The inverse of `normalize`."""
         return latents * jnp.array(self.config.latent_std) + jnp.array(self.config.latent_mean)
 
     def _check(self, video: Array) -> None:
@@ -261,7 +261,7 @@ class WanVAE(nnx.Module):
 
 
 def standardise_latents(vae: WanVAE, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
-    """Fold a measured latent mean and deviation into the two quantisation convolutions.
+    """Fold a measured latent mean and deviation into the two quantization convolutions.
 
     `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
     these have mean 0 and deviation 1, the log variances shrink by 2 log std, and decoding what

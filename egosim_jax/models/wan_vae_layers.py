@@ -57,7 +57,7 @@ def copying(*taps: tuple[int, ...], times: int = 1) -> Initializer:
 
 
 def offset(conv: Conv) -> None:
-    """Give the channels that do not carry colour the constants 1 and -1.
+    """Give the channels that do not carry color the constants 1 and -1.
 
     The norms divide by the length of all channels: without a constant among them, dark and bright
     would look the same.

@@ -41,7 +41,7 @@ class Depth(Protocol):
     """How far things are."""
 
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Float32[Any, "f h w"]:
-        """Metres along the camera's axis; infinite where unknown."""
+        """Meters along the camera's axis; infinite where unknown."""
         ...
 
 

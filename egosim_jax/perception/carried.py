@@ -1,9 +1,9 @@
-"""What a hand carried, and how: the motion that explains the colours of a clip best.
+"""What a hand carried, and how: the motion that explains the colors of a clip best.
 
 A thing that was grasped moves as the hand does. Tried are every thing that a finger tip comes near
 to, every pair of frames in which it may have been grasped and released, and three ways in which a
 thing goes with a hand: without turning, turning only as things turn that stand on a surface, and as
-one body with the palm. A trial costs the mean difference between the thing's colours and those of
+one body with the palm. A trial costs the mean difference between the thing's colors and those of
 the clip where it would be seen. The end of the best is then moved and turned a little until thing
 and background, drawn together, look most like the clip.
 """
@@ -32,7 +32,7 @@ LEAST_POINTS, SOME_POINTS, LEAST_SEEN = 30, 150, 0.2
 """A thing needs so many points; about so many are compared in a trial, of which so large a share
 must be in sight."""
 CAP, UNKNOWN = 90.0, 40.0
-"""Largest difference of colours that counts, in levels, and what counts where none is predicted."""
+"""Largest difference of colors that counts, in levels, and what counts where none is predicted."""
 BETTER, LEAST_GAIN, NAMED = 0.8, 5.0, 0.9
 """A motion is believed if it costs so much less than rest, as a factor and in levels; what the
 prompt names is believed more easily, by the last factor."""
@@ -55,7 +55,7 @@ class Thing:
 
     number: int
     points_m: Float[np.ndarray, "n 3"]
-    colours: Float32[np.ndarray, "n 3"]
+    colors: Float32[np.ndarray, "n 3"]
     normal: Float[np.ndarray, " 3"]
     offset_m: float
     """The surface is where normal . x + offset = 0."""
@@ -66,8 +66,8 @@ class Thing:
         own = state.object_ids == number
         points = state.points_m[own].astype(float)
         normal, offset = _surface_under(points, state.points_m[~own])
-        colours = state.colours[own].astype(np.float32)
-        return cls(number=number, points_m=points, colours=colours, normal=normal, offset_m=offset)
+        colors = state.colors[own].astype(np.float32)
+        return cls(number=number, points_m=points, colors=colors, normal=normal, offset_m=offset)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class Carried:
     path: Float[np.ndarray, "f 4 4"]
     """Its motion from where it was before, frame by frame."""
     cost: float
-    """Mean difference of colours, in levels."""
+    """Mean difference of colors, in levels."""
 
 
 def carried(
@@ -196,12 +196,12 @@ def _cost(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
 ) -> float:
-    """Mean difference between the thing's colours and the clip's where they would be seen.
+    """Mean difference between the thing's colors and the clip's where they would be seen.
 
     Points behind a hand say nothing; infinite if too few are in sight.
     """
     every = max(1, len(thing.points_m) // SOME_POINTS)
-    points, colours = thing.points_m[::every], thing.colours[::every]
+    points, colors = thing.points_m[::every], thing.colors[::every]
     there = transform(invert(cameras.world_from_camera) @ path, points)
     row, column, inside = pixels_of(cameras, there)
     frame = np.broadcast_to(np.arange(len(path))[:, None], column.shape)
@@ -209,7 +209,7 @@ def _cost(
     seen = ~hidden[place]
     if seen.sum() < LEAST_SEEN * column.size:
         return float("inf")
-    expected = np.broadcast_to(colours, (*column.shape, 3))[inside][seen]
+    expected = np.broadcast_to(colors, (*column.shape, 3))[inside][seen]
     return float(np.minimum(_gaps(shown[place][seen], expected), CAP).mean())
 
 
@@ -222,15 +222,15 @@ def _refined(
 ) -> Carried:
     """The same with its end moved, and turned on the surface, as far as that explains more."""
     frames = np.arange(len(best.path))[min(best.released, len(best.path) - LAST) :]
-    scene = _Neighbourhood.of(best, state, frames, shown, hidden, action.cameras)
+    scene = _Neighborhood.of(best, state, frames, shown, hidden, action.cameras)
     if not scene.counted.any():
         return best  # hands cover all of it to the end
     share = np.clip(
         (np.arange(len(best.path)) - best.grasped) / (best.released - best.grasped), 0, 1
     )
     change, least = np.zeros(4), scene.cost(best.path[frames])
-    for metres, degrees in zip(STEPS_M, STEPS_DEGREES, strict=True):
-        steps = np.diag([metres, metres, metres, np.radians(degrees)])
+    for meters, degrees in zip(STEPS_M, STEPS_DEGREES, strict=True):
+        steps = np.diag([meters, meters, meters, np.radians(degrees)])
         improved = True
         while improved:
             improved = False
@@ -249,14 +249,14 @@ def _nudged(
 
     middle = transform(best.path, best.thing.points_m.mean(axis=0)[None])[:, 0]
     nudges = np.repeat(np.eye(4)[None], len(best.path), axis=0)
-    for nudge, part, centre in zip(nudges, share, middle, strict=True):
+    for nudge, part, center in zip(nudges, share, middle, strict=True):
         nudge[:3, :3] = cv2.Rodrigues(part * change[3] * best.thing.normal)[0]
-        nudge[:3, 3] = centre + part * change[:3] - nudge[:3, :3] @ centre
+        nudge[:3, 3] = center + part * change[:3] - nudge[:3, :3] @ center
     return nudges @ best.path
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Neighbourhood:
+class _Neighborhood:
     """Where a thing ends, in some frames: what the clip shows there, and what is behind it."""
 
     thing: Thing
@@ -276,13 +276,13 @@ class _Neighbourhood:
         shown: Float32[np.ndarray, "f h w 3"],
         hidden: Bool[np.ndarray, "f h w"],
         cameras: Cameras,
-    ) -> _Neighbourhood:
+    ) -> _Neighborhood:
         """What is needed to judge ends near that of the path."""
         cameras = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
         others = state.object_ids != best.thing.number
         depth, index = splat(state.points_m[others], cameras, point_px=POINT_PX)
-        colours = state.colours[others].astype(np.float32)
-        background = np.append(colours, np.full((1, 3), np.nan, np.float32), axis=0)[index]
+        colors = state.colors[others].astype(np.float32)
+        background = np.append(colors, np.full((1, 3), np.nan, np.float32), axis=0)[index]
         there = beside(cameras, best.path[frames])
         _, drawn = splat(best.thing.points_m, there, point_px=POINT_PX)
         return cls(
@@ -299,7 +299,7 @@ class _Neighbourhood:
         there = beside(self.cameras, path)
         depth, index = splat(self.thing.points_m, there, point_px=POINT_PX)
         nearer = (index >= 0) & (depth < self.background_m)
-        drawn = np.where(nearer[..., None], self.thing.colours[index], self.background)
+        drawn = np.where(nearer[..., None], self.thing.colors[index], self.background)
         gaps = _gaps(self.shown[self.counted], drawn[self.counted])
         return float(np.minimum(np.where(np.isnan(gaps), UNKNOWN, gaps), CAP).mean())
 
@@ -307,7 +307,7 @@ class _Neighbourhood:
 def _gaps(
     shown: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, " n"]:
-    """Differences of colours in the light that makes them least: a carried thing lies in shadow."""
+    """Differences of colors in the light that makes them least: a carried thing lies in shadow."""
     strength = np.maximum((expected**2).sum(axis=1), 1)
     light = np.clip((shown * expected).sum(axis=1) / strength, *LIGHT)
     return np.sqrt(np.square(shown - light[:, None] * expected).mean(axis=1))

@@ -121,9 +121,9 @@ def _tube(
     places = start + np.linspace(0, 1, DISCS)[:, None] * (end - start)
     places = places[places[:, 2] > NEAR_M]
     far = 10 * cameras.width  # farther out is out of sight, and of the range that can be drawn
-    centres = np.clip(np.stack(project(cameras.intrinsics_px, places), axis=1), -far, far)
+    centers = np.clip(np.stack(project(cameras.intrinsics_px, places), axis=1), -far, far)
     radii = cameras.intrinsics_px[0, 0] * radius_m / places[:, 2]
-    for (column, row), radius in zip(np.rint(centres).astype(int), radii, strict=True):
+    for (column, row), radius in zip(np.rint(centers).astype(int), radii, strict=True):
         cv2.circle(canvas, (int(column), int(row)), max(1, round(float(radius))), 1, -1)
 
 

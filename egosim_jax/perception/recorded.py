@@ -2,7 +2,7 @@
 
     pose/NAME.npz         data `f 4 4`, camera to world, OpenCV axes; inds `f`, the frames
     intrinsics/NAME.npz   data `f 4`, fx fy cx cy in pixels; inds `f`
-    depth/NAME.zip        00000.exr ..., half floats, channel Z, metres; 0 or NaN is unknown
+    depth/NAME.zip        00000.exr ..., half floats, channel Z, meters; 0 or NaN is unknown
     mask/NAME.zip         00000.png ..., 8 bits, the id of what each pixel shows; 0 is background
     mask/NAME.txt         a line a thing, `id: phrase`
 
@@ -68,7 +68,7 @@ class Recorded:
         )
 
     def depth(self, clip: Clip, action: Action, state: SceneState) -> Float32[np.ndarray, "f h w"]:
-        """The recorded depth in metres of the world; infinite where it is 0 or NaN."""
+        """The recorded depth in meters of the world; infinite where it is 0 or NaN."""
         there = self._frames("pose", clip, 4, 4)
         motion = align_cameras(there, action.cameras.world_from_camera, method=self.alignment)
         depth = np.cbrt(np.linalg.det(motion[:3, :3])) * self._pictures("depth", clip)

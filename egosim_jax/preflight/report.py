@@ -76,7 +76,7 @@ class Report:
 
     @property
     def most_mfu(self) -> float:
-        """Model FLOPs utilisation if a step took `least_s`."""
+        """Model FLOPs utilization if a step took `least_s`."""
         return self.model_flops / self.hardware_flops * self.compute_s / self.least_s
 
     @property
@@ -218,7 +218,7 @@ def _work(report: Report) -> str:
     done = _flops(report.hardware_flops)
     if math.isnan(report.model_flops):
         return done
-    most = f", utilisation {report.most_mfu:.1%} at most" if not math.isnan(report.least_s) else ""
+    most = f", utilization {report.most_mfu:.1%} at most" if not math.isnan(report.least_s) else ""
     return f"{done} are done, {_flops(report.model_flops)} are the model's{most}"
 
 

@@ -1,7 +1,7 @@
 """The renderer in JAX: the same pictures as `reference`, one compiled program for a whole path.
 
 All squares of a given size are the same square moved by whole pixels. So each point goes into one
-cell only, that of its first pixel, and the nearest of p x p neighbouring cells is what a pixel
+cell only, that of its first pixel, and the nearest of p x p neighboring cells is what a pixel
 sees: p^2 comparisons a pixel instead of p^2 writes a point.
 """
 
@@ -29,7 +29,7 @@ from egosim_jax.types import Cameras, Kind
 def splat(
     points_m: Float[Array | np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
 ) -> tuple[Float32[Array, "f h w"], Int32[Array, "f h w"]]:
-    """Depth in metres and number of the point that each pixel sees; infinite and -1 where none."""
+    """Depth in meters and number of the point that each pixel sees; infinite and -1 where none."""
     poses, intrinsics = _poses(cameras)
     return _splat(
         points_m, poses, intrinsics, size=(cameras.height, cameras.width), point_px=point_px
@@ -100,13 +100,13 @@ def _nearest_square(
 @partial(jax.jit, static_argnames="gamma")
 def paint(
     index: Int[Array | np.ndarray, "f h w"],
-    colours: UInt8[Array | np.ndarray, "n 3"],
+    colors: UInt8[Array | np.ndarray, "n 3"],
     *,
     gamma: bool,
 ) -> UInt8[Array, "f h w 3"]:
     """The picture of the points that are seen, black where there are none."""
-    colours = jnp.asarray(GAMMA)[colours] if gamma else jnp.asarray(colours)
-    return jnp.where(index[..., None] < 0, jnp.uint8(0), colours[index])
+    colors = jnp.asarray(GAMMA)[colors] if gamma else jnp.asarray(colors)
+    return jnp.where(index[..., None] < 0, jnp.uint8(0), colors[index])
 
 
 @partial(jax.jit, static_argnames="dilate")
@@ -139,7 +139,7 @@ def _draw(
     kind: Kind,
 ) -> tuple[UInt8[Array, "f h w 3"], Float32[Array, "f h w"]]:
     skeleton = SKELETONS[kind]
-    joint = np.arange(len(skeleton.colours))
+    joint = np.arange(len(skeleton.colors))
     starts = np.concatenate([joint, skeleton.bones[:, 0]])
     ends = np.concatenate([joint, skeleton.bones[:, 1]])
     radii = np.where(starts == ends, JOINT_RADIUS_M, BONE_RADIUS_M).astype(np.float32)
@@ -153,16 +153,16 @@ def _draw(
             local[:, starts].reshape(count, 3),
             local[:, ends].reshape(count, 3),
             jnp.tile(radii, len(joints)),
-            jnp.tile(jnp.asarray(skeleton.colours)[ends], (len(joints), 1)),
+            jnp.tile(jnp.asarray(skeleton.colors)[ends], (len(joints), 1)),
             jnp.repeat(present, len(starts)),
         )
 
         def draw(seen: tuple[Array, Array], shape: tuple[Array, ...]) -> tuple[tuple, None]:
             picture, depth = seen
-            start, end, radius, colour, here = shape
+            start, end, radius, color, here = shape
             met = _meet(rays, start, end, radius)
             nearer = here & (met < depth)
-            picture = jnp.where(nearer[..., None], colour, picture)
+            picture = jnp.where(nearer[..., None], color, picture)
             return (picture, jnp.where(nearer, met, depth)), None
 
         empty = jnp.zeros(rays.shape, jnp.uint8), jnp.full(rays.shape[:2], jnp.inf)

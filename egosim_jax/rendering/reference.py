@@ -26,7 +26,7 @@ from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
 def splat(
     points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
 ) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
-    """Depth in metres and number of the point that each pixel sees; infinite and -1 where none.
+    """Depth in meters and number of the point that each pixel sees; infinite and -1 where none.
 
     Points with a coordinate that is not finite, nearer than 1 cm or farther than 100 m are not
     drawn.
@@ -56,14 +56,14 @@ def splat(
 
 
 def paint(
-    index: Int[np.ndarray, "f h w"], colours: UInt8[np.ndarray, "n 3"], *, gamma: bool
+    index: Int[np.ndarray, "f h w"], colors: UInt8[np.ndarray, "n 3"], *, gamma: bool
 ) -> UInt8[np.ndarray, "f h w 3"]:
     """The picture of the points that are seen, black where there are none.
 
-    `gamma` applies the original renderer's colour curve, c -> c^(1/2.2).
+    `gamma` applies the original renderer's color curve, c -> c^(1/2.2).
     """
-    colours = np.concatenate([GAMMA[colours] if gamma else colours, np.zeros((1, 3), np.uint8)])
-    return colours[index]
+    colors = np.concatenate([GAMMA[colors] if gamma else colors, np.zeros((1, 3), np.uint8)])
+    return colors[index]
 
 
 def unobserved(
@@ -98,7 +98,7 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
             "the camera must look at the scene, from 1 cm to 100 m away."
         )
     return View(
-        frames=paint(index, state.colours, gamma=False),
+        frames=paint(index, state.colors, gamma=False),
         mask=unobserved(index, dilate=True),
         depth_m=depth_m,
         object_ids=np.append(state.object_ids, np.int32(0))[index],
@@ -124,18 +124,17 @@ def draw_hands(
                 continue
             joints = transform(invert(world_from_camera), hand)
             shapes = [
-                (j, j, JOINT_RADIUS_M, c) for j, c in zip(joints, skeleton.colours, strict=True)
+                (j, j, JOINT_RADIUS_M, c) for j, c in zip(joints, skeleton.colors, strict=True)
             ]
             shapes += [
-                (joints[a], joints[b], BONE_RADIUS_M, skeleton.colours[b])
-                for a, b in skeleton.bones
+                (joints[a], joints[b], BONE_RADIUS_M, skeleton.colors[b]) for a, b in skeleton.bones
             ]
-            for start, end, radius, colour in shapes:
+            for start, end, radius, color in shapes:
                 window = _window(start, end, radius, cameras)
                 met = _meet(rays[window], start, end, radius)
                 nearer = met < depth[frame][window]
                 depth[frame][window][nearer] = met[nearer]
-                picture[frame][window][nearer] = colour
+                picture[frame][window][nearer] = color
     return picture, depth
 
 

@@ -1,4 +1,4 @@
-"""Joints, bones, colours and sizes of drawn hands, and the colour curve of the original renderer.
+"""Joints, bones, colors and sizes of drawn hands, and the color curve of the original renderer.
 
 A hand has 21 joints: the wrist, then four from knuckle to tip of thumb, index, middle, ring and
 little finger. A gripper has three: the wrist and the tips of thumb and index, whose angle is the
@@ -21,7 +21,7 @@ NEAR_M, FAR_M = 0.01, 100.0
 """Nothing nearer or farther is drawn."""
 
 GAMMA = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
-"""What the original renderer makes of each colour value: it lifts without having linearised."""
+"""What the original renderer makes of each color value: it lifts without having linearized."""
 
 THUMB, INDEX, MIDDLE = (238, 130, 238), (255, 99, 71), (230, 245, 250)
 RING, LITTLE = (173, 255, 47), (0, 152, 191)
@@ -31,18 +31,18 @@ RING, LITTLE = (173, 255, 47), (0, 152, 191)
 class Skeleton:
     """What is drawn for one hand."""
 
-    colours: np.ndarray
-    """RGB of each joint, uint8 `j 3`. A bone has the colour of its outer joint."""
+    colors: np.ndarray
+    """RGB of each joint, uint8 `j 3`. A bone has the color of its outer joint."""
     bones: np.ndarray
     """Inner and outer joint of each bone, `k 2`."""
 
 
 def _human() -> Skeleton:
     fingers = [THUMB, INDEX, MIDDLE, RING, LITTLE]
-    colours = [MIDDLE, *(colour for colour in fingers for _ in range(4))]
+    colors = [MIDDLE, *(color for color in fingers for _ in range(4))]
     outer = np.arange(1, 21)
     inner = np.where(outer % 4 == 1, 0, outer - 1)
-    return Skeleton(GAMMA[np.array(colours)], np.stack([inner, outer], axis=1))
+    return Skeleton(GAMMA[np.array(colors)], np.stack([inner, outer], axis=1))
 
 
 def _robot() -> Skeleton:
@@ -50,4 +50,4 @@ def _robot() -> Skeleton:
 
 
 SKELETONS: dict[Kind, Skeleton] = {"human": _human(), "robot": _robot()}
-"""Human hands are drawn with the original's colour curve, robots without."""
+"""Human hands are drawn with the original's color curve, robots without."""

@@ -17,9 +17,9 @@ from egosim_jax.types import InputError
 
 Freedom = Literal["rigid", "similarity"]
 """Six degrees of freedom, or seven with a scale."""
-CameraMethod = Literal["centres", "orientations", "orientations and scale"]
-"""Umeyama on camera centres with a scale; or the mean rotation between the cameras, and then the
-translation between their centres, without or with a scale."""
+CameraMethod = Literal["centers", "orientations", "orientations and scale"]
+"""Umeyama on camera centers with a scale; or the mean rotation between the cameras, and then the
+translation between their centers, without or with a scale."""
 
 ROUNDS, SAMPLE = 500, 3
 """Of RANSAC: trials, and points that determine a motion."""
@@ -71,12 +71,12 @@ def align_cameras(
 ) -> Float[np.ndarray, "4 4"]:
     """`world_from_there` of a reconstruction whose cameras are known in both.
 
-    From orientations it takes one camera (two for a scale), from centres alone three that are not
-    in line. A scale that two centres at one place leave open is 1.
+    From orientations it takes one camera (two for a scale), from centers alone three that are not
+    in line. A scale that two centers at one place leave open is 1.
     """
     _check_finite(there_from_camera, world_from_camera)
     here, there = world_from_camera[:, :3, 3], there_from_camera[:, :3, 3]
-    if method == "centres":
+    if method == "centers":
         return umeyama(there, here, scaled=True)
     products = world_from_camera[:, :3, :3] @ there_from_camera[:, :3, :3].swapaxes(1, 2)
     u, _, vt = np.linalg.svd(products.sum(axis=0))

@@ -5,7 +5,7 @@
 3. Depth: the median depths of thing and hands differ by less than 0.15 m.
 4. Temporal: between two frames in which it is acted on a thing is acted on; one that is out of
    sight from then on is gone.
-5. Serialised: what was found goes into plain arrays and comes back from them.
+5. Serialized: what was found goes into plain arrays and comes back from them.
 
 Source: EgoSim, section 3.3 (interaction-aware filtering) and the released `processors.py`, in which
 stages 3 and 4 are never reached.

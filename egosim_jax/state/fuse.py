@@ -5,8 +5,8 @@
 2. What the memory knows of a tracked thing moves with it.
 3. Free space is carved: a remembered point goes if the last frames that could have seen it look
    through it. (The original does not, and a moved thing leaves a ghost.)
-4. New points replace remembered ones within 5 mm, and take over the colours of the nearest of the
-   same thing: what was seen once is not painted again from a generated clip, whose colours drift
+4. New points replace remembered ones within 5 mm, and take over the colors of the nearest of the
+   same thing: what was seen once is not painted again from a generated clip, whose colors drift
    from clip to clip. (The original paints again.)
 
 Fusing the same again changes nothing, clips that see different places may be fused in either order,
@@ -30,8 +30,8 @@ REPLACE_M = 0.005
 THROUGH_M, DOUBT = 0.02, 2
 """A point is looked through if the surface lies so far behind it; a verdict wavers between -DOUBT
 and DOUBT, down one for each frame that looks through and up one for each that sees the point."""
-NEIGHBOURS, DEVIATIONS = 20, 2.0
-"""Outliers are farther from so many neighbours than most by so many deviations."""
+NEIGHBORS, DEVIATIONS = 20, 2.0
+"""Outliers are farther from so many neighbors than most by so many deviations."""
 BORDER = 5 / 832
 """Around hands, as a share of the width: what is not trusted."""
 
@@ -41,7 +41,7 @@ class _Points:
     """Points as the state keeps them."""
 
     points_m: Float32[np.ndarray, "n 3"]
-    colours: UInt8[np.ndarray, "n 3"]
+    colors: UInt8[np.ndarray, "n 3"]
     object_ids: Int[np.ndarray, " n"]
     last_seen: Int[np.ndarray, " n"]
 
@@ -56,7 +56,7 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
     new = _observed(perceived, sure, lost, fusion or Fusion())
     old = _moved(state, perceived, lost)
     old = _carved(old, perceived, sure)
-    new = replace(new, colours=_remembered(new, old))
+    new = replace(new, colors=_remembered(new, old))
     old = old[~_near(old.points_m, new.points_m, REPLACE_M)]
     everything = _ordered(_together([old, new]))
     poses = {n: path[-1] for n, path in perceived.world_from_object.items()}
@@ -84,14 +84,14 @@ def _observed(
             seen = _last_view(seen)  # it moved, but how is not known
         cameras = perceived.cameras if path is None else beside(perceived.cameras, path)
         depth = np.where(seen, perceived.depth_m, 0).astype(np.float32)
-        points, colours = surface(depth, perceived.frames, cameras, fusion=fusion)
+        points, colors = surface(depth, perceived.frames, cameras, fusion=fusion)
         if path is not None:
             points = transform(path[-1], points.astype(np.float64)).astype(np.float32)
         ids = np.full(len(points), number, np.int32)
         pieces.append(
             _Points(
                 points_m=points,
-                colours=colours,
+                colors=colors,
                 object_ids=ids,
                 last_seen=np.full_like(ids, perceived.step),
             )
@@ -126,7 +126,7 @@ def _moved(state: SceneState, perceived: Perceived, lost: set[int]) -> _Points:
     kept = ~np.isin(state.object_ids, list(lost))
     return _Points(
         points_m=points,
-        colours=state.colours,
+        colors=state.colors,
         object_ids=state.object_ids,
         last_seen=state.last_seen,
     )[kept]
@@ -166,10 +166,10 @@ def _surface_behind(
 def _without_outliers(new: _Points) -> _Points:
     import open3d as o3d
 
-    if len(new.points_m) <= NEIGHBOURS:
+    if len(new.points_m) <= NEIGHBORS:
         return new
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(new.points_m))
-    _, kept = cloud.remove_statistical_outlier(NEIGHBOURS, DEVIATIONS)
+    _, kept = cloud.remove_statistical_outlier(NEIGHBORS, DEVIATIONS)
     return new[np.array(kept, int)]
 
 
@@ -186,10 +186,10 @@ def _near(
 
 
 def _remembered(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
-    """The colours of new points: of the nearest remembered one that they replace, or their own."""
+    """The colors of new points: of the nearest remembered one that they replace, or their own."""
     import open3d as o3d
 
-    colours = new.colours.copy()
+    colors = new.colors.copy()
     for number in np.intersect1d(new.object_ids, old.object_ids):
         here = np.flatnonzero(new.object_ids == number)
         there = np.flatnonzero(old.object_ids == number)
@@ -197,14 +197,14 @@ def _remembered(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
         index.knn_index()
         nearest, square = (x.numpy() for x in index.knn_search(new.points_m[here], 1))
         near = square[:, 0] <= REPLACE_M**2
-        colours[here[near]] = old.colours[there[nearest[near, 0]]]
-    return colours
+        colors[here[near]] = old.colors[there[nearest[near, 0]]]
+    return colors
 
 
 def _together(pieces: list[_Points]) -> _Points:
     empty = _Points(
         points_m=np.zeros((0, 3), np.float32),
-        colours=np.zeros((0, 3), np.uint8),
+        colors=np.zeros((0, 3), np.uint8),
         object_ids=np.zeros(0, np.int32),
         last_seen=np.zeros(0, np.int32),
     )
@@ -215,5 +215,5 @@ def _together(pieces: list[_Points]) -> _Points:
 
 
 def _ordered(points: _Points) -> _Points:
-    """In one order whatever the history: by thing, place and colour."""
-    return points[np.lexsort((*points.colours.T, *points.points_m.T, points.object_ids))]
+    """In one order whatever the history: by thing, place and color."""
+    return points[np.lexsort((*points.colors.T, *points.points_m.T, points.object_ids))]

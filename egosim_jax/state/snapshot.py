@@ -22,12 +22,14 @@ from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
 from egosim_jax.state.ply import read_points, write_points
 from egosim_jax.types import InputError, SceneState
 
-VERSION, UNSEALED = 2, 1
-"""The version that is written, and the one before it, whose description has no hash."""
+VERSION = 3
+"""The version that is written."""
+READABLE = (1, 2, VERSION)
+"""Versions that are read: 1 has no hash of its description; 1 and 2 spell `colours`."""
 POINTS, DESCRIPTION = "points.npz", "state.json"
-ARRAYS = ("points_m", "colours", "object_ids", "last_seen")
+ARRAYS = ("points_m", "colors", "object_ids", "last_seen")
 CHANNELS = ("red", "green", "blue")
-_DTYPES = {"points_m": "float32", "colours": "uint8", "object_ids": "int32", "last_seen": "int32"}
+_DTYPES = {"points_m": "float32", "colors": "uint8", "object_ids": "int32", "last_seen": "int32"}
 
 
 def fingerprint(state: SceneState) -> str:
@@ -68,23 +70,26 @@ def _load(folder: Path) -> SceneState:
     if not isinstance(written, dict) or "version" not in written:
         raise InputError(f"{DESCRIPTION} is not the description of a state.")
     version = written["version"]
-    if version not in (VERSION, UNSEALED) or isinstance(version, (bool, float)):
+    if version not in READABLE or isinstance(version, (bool, float)):
         raise InputError(
-            f"it is of version {quote(version)}; this program reads {UNSEALED} and {VERSION}."
+            f"it is of version {quote(version)}; this program reads versions {READABLE}."
         )
     if sha256(folder / POINTS) != written.get("sha256"):
         raise InputError(
             f"{folder / POINTS} is damaged: it is not what {DESCRIPTION} was written for "
             "(SHA-256). Take another copy."
         )
-    arrays = read_arrays(folder / POINTS, _DTYPES)
+    spelled = "colors" if version == VERSION else "colours"
+    dtypes = {spelled if name == "colors" else name: dtype for name, dtype in _DTYPES.items()}
+    arrays = read_arrays(folder / POINTS, dtypes)
+    arrays["colors"] = arrays.pop(spelled)
     try:
         description = _checked(written)
         state = SceneState(**arrays, **description)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{DESCRIPTION}: {quote_text(str(error))}.") from error
     seal = written.get("description_sha256")
-    changed = version == VERSION and seal != _sealed(_description(state))
+    changed = version > 1 and seal != _sealed(_description(state))
     if changed or written.get("points") != len(state.points_m):
         raise InputError(
             f"{folder / DESCRIPTION} was changed after it was written. Take another copy."
@@ -157,9 +162,9 @@ def _description(state: SceneState) -> dict[str, Any]:
 def write_ply(path: Path, state: SceneState) -> None:
     """Write the points as binary PLY: x y z, red green blue, object_ids, last_seen."""
     places = dict(zip("xyz", state.points_m.T, strict=True))
-    colours = dict(zip(CHANNELS, state.colours.T, strict=True))
+    colors = dict(zip(CHANNELS, state.colors.T, strict=True))
     ids = {name: getattr(state, name) for name in ("object_ids", "last_seen")}
-    write_points(path, {**places, **colours, **ids})
+    write_points(path, {**places, **colors, **ids})
 
 
 def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
@@ -179,7 +184,7 @@ def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
     try:
         arrays = {
             "points_m": np.stack([points[name] for name in "xyz"], axis=1).astype(np.float32),
-            "colours": np.stack([_channel(points[name]) for name in CHANNELS], axis=1),
+            "colors": np.stack([_channel(points[name]) for name in CHANNELS], axis=1),
             "object_ids": _ids(points, "object_ids"),
             "last_seen": _ids(points, "last_seen"),
         }

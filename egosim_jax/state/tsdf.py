@@ -65,12 +65,12 @@ def _around(padded: np.ndarray, reduce: np.ufunc | object) -> np.ndarray:
 
 def surface(
     depth_m: Float32[np.ndarray, "f h w"],
-    colours: UInt8[np.ndarray, "f h w 3"],
+    colors: UInt8[np.ndarray, "f h w 3"],
     cameras: Cameras,
     *,
     fusion: Fusion,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Points and colours of the surface that the frames see, in the coordinates of the cameras.
+    """Points and colors of the surface that the frames see, in the coordinates of the cameras.
 
     Depths that are 0, infinite or NaN are unknown; frames in which all are add nothing.
     """
@@ -99,18 +99,18 @@ def surface(
         block_count=len(_unique(np.concatenate(list(blocks.values())))),
     )
     # Open3D takes the pixel that a coordinate falls into, and pixel 0 begins at 0: with pixel
-    # centres at whole numbers the image lies half a pixel off, 2 mm on a table at 160 columns.
-    centred = cameras.intrinsics_px.astype(np.float64)
-    centred[:2, 2] += 0.5
-    intrinsics = o3d.core.Tensor(centred)
+    # centers at whole numbers the image lies half a pixel off, 2 mm on a table at 160 columns.
+    centerd = cameras.intrinsics_px.astype(np.float64)
+    centerd[:2, 2] += 0.5
+    intrinsics = o3d.core.Tensor(centerd)
     reach = fusion.truncation_m / fusion.voxel_m
     for frame in frames:
         depth = _image(np.where(known[frame], depth_m[frame], 0).astype(np.float32))
-        colour = _image(colours[frame].astype(np.float32))
+        color = _image(colors[frame].astype(np.float32))
         pose = o3d.core.Tensor(np.linalg.inv(poses[frame]))
         near = o3d.core.Tensor(blocks[frame])
         grid.integrate(
-            near, depth, colour, intrinsics, intrinsics, pose, 1.0, fusion.max_depth_m, reach
+            near, depth, color, intrinsics, intrinsics, pose, 1.0, fusion.max_depth_m, reach
         )
     # A voxel seen n times has weight n, and Open3D asks for more than the threshold.
     threshold = min(fusion.observations, len(frames)) - 0.5

@@ -31,10 +31,10 @@ Program = Literal["ours", "Open3D"]
 
 @dataclass(frozen=True)
 class Frames:
-    """What is fused: depth without hands, colours, cameras."""
+    """What is fused: depth without hands, colors, cameras."""
 
     depth_m: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
     cameras: Cameras
 
 
@@ -81,12 +81,12 @@ def measure(program: Program, frames: Frames) -> Figures:
     Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # forget the most so far
     before = _memory_mb("VmRSS")
     start = time.perf_counter()
-    points, colours = fuse(frames)
+    points, colors = fuse(frames)
     fused = time.perf_counter() - start
     memory = _memory_mb("VmHWM") - before
-    render(frames, points, colours)  # compiles, fills caches
+    render(frames, points, colors)  # compiles, fills caches
     start = time.perf_counter()
-    render(frames, points, colours)
+    render(frames, points, colors)
     rendered = (time.perf_counter() - start) / len(frames.depth_m)
     return Figures(fused, memory, len(points), 1000 * rendered)
 
@@ -102,7 +102,7 @@ def _memory_mb(name: Literal["VmHWM", "VmRSS"]) -> float:
 def _fuse(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
     from egosim_jax.state.tsdf import surface
 
-    return surface(frames.depth_m, frames.colours, frames.cameras, fusion=Fusion())
+    return surface(frames.depth_m, frames.colors, frames.cameras, fusion=Fusion())
 
 
 def _fuse_plainly(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
@@ -121,18 +121,18 @@ def _fuse_plainly(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
     intrinsics = o3d.core.Tensor(frames.cameras.intrinsics_px)
     for frame, pose in enumerate(frames.cameras.world_from_camera):
         depth = o3d.t.geometry.Image(o3d.core.Tensor(frames.depth_m[frame]))
-        colour = o3d.t.geometry.Image(o3d.core.Tensor(frames.colours[frame].astype(np.float32)))
+        color = o3d.t.geometry.Image(o3d.core.Tensor(frames.colors[frame].astype(np.float32)))
         extrinsics = o3d.core.Tensor(invert(pose))
         far = setting.max_depth_m
         blocks = grid.compute_unique_block_coordinates(
             depth, intrinsics, extrinsics, 1.0, far, reach
         )
-        grid.integrate(blocks, depth, colour, intrinsics, intrinsics, extrinsics, 1.0, far, reach)
+        grid.integrate(blocks, depth, color, intrinsics, intrinsics, extrinsics, 1.0, far, reach)
     cloud = grid.extract_point_cloud(weight_threshold=setting.observations)
     return cloud.point.positions.numpy(), cloud.point.colors.numpy().astype(np.uint8)
 
 
-def _render(frames: Frames, points: np.ndarray, colours: np.ndarray) -> None:
+def _render(frames: Frames, points: np.ndarray, colors: np.ndarray) -> None:
     import jax
 
     from egosim_jax.rendering import jitted
@@ -141,11 +141,11 @@ def _render(frames: Frames, points: np.ndarray, colours: np.ndarray) -> None:
     jax.block_until_ready(jitted.splat(on_device, frames.cameras, point_px=2))
 
 
-def _render_plainly(frames: Frames, points: np.ndarray, colours: np.ndarray) -> None:
+def _render_plainly(frames: Frames, points: np.ndarray, colors: np.ndarray) -> None:
     import open3d as o3d
 
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
-    cloud.point["colors"] = o3d.core.Tensor(colours.astype(np.float32) / 255)
+    cloud.point["colors"] = o3d.core.Tensor(colors.astype(np.float32) / 255)
     intrinsics = o3d.core.Tensor(frames.cameras.intrinsics_px)
     for pose in frames.cameras.world_from_camera:
         image = cloud.project_to_rgbd_image(

@@ -34,7 +34,7 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.generator import Generator, Inputs, ModelConfig, Networks
 from egosim_jax.models.attention import attention
-from egosim_jax.models.layers import initialise
+from egosim_jax.models.layers import initialize
 from egosim_jax.models.wan_dit import WanDiT
 from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, find, peak
@@ -159,7 +159,7 @@ def step(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                     (programs.state, programs.frozen, batch),
                     stage.task.flops(options.clips),
                     {"kernel": kernel, "remat": remat, "layers": stage.task.model.dit.layers},
-                    make=lambda programs=programs: initialise(
+                    make=lambda programs=programs: initialize(
                         programs.create, out_shardings=programs.state_sharding
                     ),
                 )

@@ -8,7 +8,7 @@ Samples a second, in batches of 8, of two kinds of shards:
 
 Theirs is a `DataLoader` over the same reader with the same transform, and with as many worker
 processes. Without any, ours prepares examples in four threads, ahead of the caller; theirs in the
-caller's own, when asked. The loaders take turns, so that a busy neighbour slows both, and each
+caller's own, when asked. The loaders take turns, so that a busy neighbor slows both, and each
 round gives one ratio, ours to theirs. What a loader had prepared while the other's turn lasted is
 thrown away first.
 
@@ -234,7 +234,7 @@ def make_latents(config: ModelConfig, folder: Path) -> Path:
         for number in range(LATENTS):
             videos = {
                 name: rng.standard_normal((*shape, config.vae.z_dim), np.float32)
-                for name in ("truth", "prior", "hands")
+                for name in ("target", "prior", "hands")
             }
             others = {
                 "mask": rng.integers(0, 2, (*shape, 4), np.uint8),

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.bench_splat [--rounds 9]
 
 Open3D's `project_to_rgbd_image` draws one pixel a point; ours draws points of one and two pixels.
-The programs take turns, so that a busy neighbour slows them alike.
+The programs take turns, so that a busy neighbor slows them alike.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def make_programs() -> dict[str, Callable[[], object]]:
 
     rng = np.random.default_rng(0)
     points = rng.uniform([-1, 0, 0], [1, 1, 0.4], (POINTS, 3)).astype(np.float32)
-    colours = rng.integers(0, 256, (POINTS, 3), dtype=np.uint8)
+    colors = rng.integers(0, 256, (POINTS, 3), dtype=np.uint8)
     pose = look_at(np.array([0, -0.4, 0.7]), np.array([0, 0.5, 0.1]), up=np.array([0, 0, 1.0]))
     cameras = Cameras(
         world_from_camera=pose[None],
@@ -62,7 +62,7 @@ def make_programs() -> dict[str, Callable[[], object]]:
     )
     on_device = jax.device_put(points)
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
-    cloud.point["colors"] = o3d.core.Tensor(colours.astype(np.float32) / 255)
+    cloud.point["colors"] = o3d.core.Tensor(colors.astype(np.float32) / 255)
     intrinsics = o3d.core.Tensor(cameras.intrinsics_px)
     extrinsics = o3d.core.Tensor(invert(pose))
 

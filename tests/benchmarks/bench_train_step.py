@@ -11,7 +11,7 @@ float32, the matrices of all layers together. So the update's share of their ste
 
 Calls alternate as in `bench_wan_dit`, which says how ratio and interval are found. On a busy
 machine torch's threads wait for one another at the end of every small product, which lengthens its
-wall and processor seconds both: with neighbours, believe `--threads 1`.
+wall and processor seconds both: with neighbors, believe `--threads 1`.
 
     python -m tests.benchmarks.bench_train_step [--pairs 9]
 """
@@ -88,7 +88,7 @@ def make_batch(config: ModelConfig) -> Batch:
     shape = (BATCH, *config.video.latent_shape)
     videos = {
         name: rng.standard_normal((*shape, config.vae.z_dim), np.float32)
-        for name in ("truth", "prior", "hands", "noise")
+        for name in ("target", "prior", "hands", "noise")
     }
     tokens, size = config.tokenizer.max_tokens, config.image.image_size
     return {
@@ -132,7 +132,7 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
             def velocity(x: jax.Array, t: jax.Array) -> jax.Array:
                 return networks.dit(assemble(x, condition), t, condition.text, condition.image)
 
-            parts = (batch[name] for name in ("truth", "noise", "sigma"))
+            parts = (batch[name] for name in ("target", "noise", "sigma"))
             return self.objective.loss_at(velocity, *parts).mean(), {}
 
     task = GivenNoise(model=config, objective=Objective(schedule=config.schedule))
@@ -256,11 +256,11 @@ class Theirs:
         text = self.text(x["ids"], x["ids_mask"]).last_hidden_state * x["ids_mask"][..., None]
         image = self.image(x["pixels"]).last_hidden_state
         sigma = x["sigma"][:, None, None, None, None]
-        noisy = (1 - sigma) * x["truth"] + sigma * x["noise"]
+        noisy = (1 - sigma) * x["target"] + sigma * x["noise"]
         seen = x["prior"] * (1 - x["mask"][:, :1])
         channels = torch.cat([noisy, x["mask"], seen, x["hands"]], dim=1)
         velocity = self.dit(channels, x["time"], text, image, return_dict=False)[0]
-        return (velocity - (x["noise"] - x["truth"])).square().mean()
+        return (velocity - (x["noise"] - x["target"])).square().mean()
 
     def _update(self) -> torch.Tensor:
         import torch

@@ -2,9 +2,9 @@
 
 A text-to-video network of 2 layers (width 1536, 12 heads, MLP 8960) on latents of 6 x 32 x 32 and
 512 text tokens; both hold the same weights and are checked to agree. Calls alternate, so that a
-busy neighbour slows both, and each pair gives one ratio of times, ours to theirs: reported is the
+busy neighbor slows both, and each pair gives one ratio of times, ours to theirs: reported is the
 median with an interval of at least 95 % by order statistics, and beside it the median ratio of
-processor seconds, which neighbours touch less.
+processor seconds, which neighbors touch less.
 
     python -m tests.benchmarks.bench_wan_dit [--pairs 11]
 """

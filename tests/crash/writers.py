@@ -87,7 +87,7 @@ def inputs(folder: Path) -> None:
         with ShardWriter(folder / f"frames{version}", kind="frames", spec=SPEC) as writer:
             for triplet in triplets:
                 about = {"video_id": triplet.video_id, "prompt": "", "extra": {}}
-                names_of = ("prior", "hands", "mask", "first_frame", "truth")
+                names_of = ("prior", "hands", "mask", "first_frame", "target")
                 writer.add({name: getattr(triplet, name) for name in names_of}, about)
 
 
@@ -110,7 +110,7 @@ def _triplet(name: str) -> Triplet:
     mask[:, :32] = 255
     return Triplet(
         video_id=name, prompt="take", prior=prior, hands=hands, mask=mask, first_frame=first,
-        truth=truth,
+        target=truth,
     )  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def state(version: int) -> SceneState:
     rng = np.random.default_rng(version)
     return SceneState(
         points_m=rng.normal(size=(500, 3)).astype(np.float32),
-        colours=rng.integers(0, 256, (500, 3), np.uint8),
+        colors=rng.integers(0, 256, (500, 3), np.uint8),
         object_ids=np.zeros(500, np.int32),
         last_seen=np.zeros(500, np.int32),
         intrinsics_px=np.eye(3),
@@ -243,7 +243,7 @@ def _encode(place: Path, inputs: Path, version: int) -> None:
             pass
 
         def __call__(self, triplets: list[Triplet]) -> list[dict[str, np.ndarray]]:
-            return [{"truth": triplet.truth[:, 0, 0].copy()} for triplet in triplets]
+            return [{"target": triplet.target[:, 0, 0].copy()} for triplet in triplets]
 
     cache.Encoding = Encoding
     cache.Encoders.load = lambda *_, **__: None

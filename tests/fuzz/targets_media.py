@@ -288,7 +288,7 @@ def read_tables(folder: Path) -> Any:
     return {
         name: [
             [clip.video_id, clip.prompt, str(clip.prior), str(clip.hands), str(clip.first_frame),
-             str(clip.mask), str(clip.truth), dict(clip.extra)]
+             str(clip.mask), str(clip.target), dict(clip.extra)]
             for clip in read_metadata(folder / name)
         ]
         for name in ("m.csv", "m.jsonl")
@@ -416,7 +416,7 @@ def make_latents(folder: Path) -> None:
             rng = np.random.default_rng(number)
             arrays = {
                 name: rng.normal(size=(2, 2, 2, 16)).astype(ml_dtypes.bfloat16)
-                for name in ("truth", "prior", "hands")
+                for name in ("target", "prior", "hands")
             }
             arrays |= {"mask": _pixels(2, 2, 2, 4), "text": np.ones((3, 8), np.float32)}
             names = {"video_id": f"clip_{number}", "prompt": "take it", "extra": {}, "start": 0}

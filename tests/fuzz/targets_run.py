@@ -28,7 +28,7 @@ def a_state() -> SceneState:
     rng = np.random.default_rng(0)
     return SceneState(
         points_m=rng.normal(size=(20, 3)).astype(np.float32),
-        colours=rng.integers(0, 256, (20, 3)).astype(np.uint8),
+        colors=rng.integers(0, 256, (20, 3)).astype(np.uint8),
         object_ids=rng.integers(0, 3, 20).astype(np.int32),
         last_seen=rng.integers(0, 5, 20).astype(np.int32),
         intrinsics_px=np.array([[100.0, 0, 49.5], [0, 100, 29.5], [0, 0, 1]]),

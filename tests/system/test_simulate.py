@@ -103,7 +103,7 @@ def test_what_is_up_is_drawn_above(up, top):
     ball = 0.05 * rng.normal(size=(500, 3))
     state = SceneState(
         points_m=np.concatenate([ball, ball + 0.4 * np.array(top)]).astype(np.float32),
-        colours=np.repeat(np.array([[0, 255, 0], [255, 0, 0]], np.uint8), 500, axis=0),
+        colors=np.repeat(np.array([[0, 255, 0], [255, 0, 0]], np.uint8), 500, axis=0),
         object_ids=np.zeros(1000, np.int32),
         last_seen=np.zeros(1000, np.int32),
         intrinsics_px=np.eye(3),

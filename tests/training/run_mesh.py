@@ -9,7 +9,7 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
-from egosim_jax.models.layers import initialise
+from egosim_jax.models.layers import initialize
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.denoiser import Denoising
@@ -41,7 +41,7 @@ def batch(seed: int) -> dict[str, np.ndarray]:
 
     shape, dit = MODEL.video.latent_shape, MODEL.dit
     return {
-        **{name: draw(*shape, 16) for name in ("truth", "prior", "hands")},
+        **{name: draw(*shape, 16) for name in ("target", "prior", "hands")},
         "mask": rng.integers(0, 2, (BATCH, *shape, 4)).astype(np.uint8),
         "text": draw(7, dit.text_dim),
         "image": draw(5, dit.image_dim),
@@ -66,7 +66,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
     graph = nnx.graphdef(nnx.eval_shape(lambda: TASK.networks(nnx.Rngs(0))))
     sharding = state_sharding(mesh, jax.eval_shape(create))
     placed = batch_sharding(mesh)
-    state = initialise(create, out_shardings=sharding)
+    state = initialize(create, out_shardings=sharding)
     keys = TASK.keys(jax.random.key(0), BATCH)
 
     def loss(params, batch):

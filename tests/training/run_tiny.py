@@ -54,7 +54,7 @@ def write_latents(folder: Path, records: int = 7) -> None:
                 "text": rng.normal(size=(7, dit.text_dim)).astype(np.float32),
                 "image": rng.normal(size=(5, dit.image_dim)).astype(np.float32),
             }
-            for name in ("truth", "prior", "hands"):
+            for name in ("target", "prior", "hands"):
                 arrays[name] = rng.normal(size=(*shape, 16)).astype(np.float32)
             writer.add(arrays, {"video_id": f"clip_{number}", "prompt": ""})
 

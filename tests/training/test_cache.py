@@ -50,7 +50,7 @@ def write_clips(folder: Path, spec: VideoSpec, count: int = 3, frames: int = 8) 
         for number in range(count):
             arrays = {
                 name: rng.integers(0, 256, (*video, 3)).astype(np.uint8)
-                for name in ("truth", "prior", "hands")
+                for name in ("target", "prior", "hands")
             }
             arrays["mask"] = np.zeros(video, np.uint8)
             arrays["first_frame"] = arrays["prior"][0]
@@ -112,7 +112,7 @@ def test_the_manifest_names_what_made_the_arrays_alone(encoded, source, weights)
 def test_latents_of_joint_encoders_come_with_their_inputs(encoded):
     arrays = ShardReader(encoded)[0].arrays
     assert {name: array.shape for name, array in arrays.items()} == {
-        "truth": (2, 2, 4, 16),
+        "target": (2, 2, 4, 16),
         "prior": (2, 2, 4, 16),
         "hands": (2, 2, 4, 16),
         "mask": (2, 2, 4, 4),
@@ -259,7 +259,7 @@ def test_weights_without_a_vae_are_refused(encoded, tmp_path):
 
 def test_shards_that_do_not_say_who_encoded_them_are_refused(tmp_path):
     with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video) as writer:
-        writer.add({"truth": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
+        writer.add({"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
     with pytest.raises(InputError, match="does not say which encoders made them"):
         check_encoders(tmp_path, CONFIG, None)
 
@@ -293,7 +293,7 @@ def test_the_decoding_of_videos_is_recorded(weights, tmp_path):
     clip = np.random.default_rng(0).integers(0, 256, (5, 16, 32, 3)).astype(np.uint8)
     videos = {
         name: np.frombuffer(encode_video(clip, 16), np.uint8)
-        for name in ("truth", "prior", "hands", "mask")
+        for name in ("target", "prior", "hands", "mask")
     }
     png = io.BytesIO()
     Image.fromarray(clip[0]).save(png, "PNG")
@@ -305,5 +305,5 @@ def test_the_decoding_of_videos_is_recorded(weights, tmp_path):
         out = tmp_path / decoding
         encode(ShardReader(tmp_path / "videos"), weights, out, decoding=decoding, batch_size=1)
         assert read_manifest(out).provenance["decoding"] == decoding
-        truths[decoding] = ShardReader(out)[0].arrays["truth"]
+        truths[decoding] = ShardReader(out)[0].arrays["target"]
     assert (truths["accurate"] != truths["official"]).any()

@@ -35,7 +35,7 @@ def test_a_motion_and_its_inverse_leave_points_where_they_were():
     np.testing.assert_allclose(there, (homogeneous @ pose().T)[:, :3])
 
 
-def test_a_pixels_ray_projects_to_its_centre():
+def test_a_pixels_ray_projects_to_its_center():
     rays = 2.5 * pixel_rays(INTRINSICS, height=4, width=6).reshape(-1, 3)
     columns, rows = project(INTRINSICS, rays)
     np.testing.assert_allclose(columns, np.tile(np.arange(6), 4), atol=1e-12)
@@ -43,7 +43,7 @@ def test_a_pixels_ray_projects_to_its_centre():
 
 
 @pytest.mark.parametrize("times", [2, 3])
-def test_the_parts_of_a_pixel_surround_its_centre(times):
+def test_the_parts_of_a_pixel_surround_its_center(times):
     coarse = pixel_rays(INTRINSICS, height=4, width=6)
     parts = pixel_rays(finer(INTRINSICS, times), height=4 * times, width=6 * times)
     means = parts.reshape(4, times, 6, times, 3).mean(axis=(1, 3))

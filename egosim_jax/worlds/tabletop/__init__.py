@@ -127,7 +127,7 @@ def _clip(
                 for k, part in enumerate(parts)
             ]
         joints.append(here)
-        paints |= {item.number: item.part.paint.colour for item in placed}
+        paints |= {item.number: item.part.paint.color for item in placed}
         if bare:
             target = moment.scene.number(intent.name)
             placed = [x for x in placed if x.number < FIRST_HAND and x.number != target]
@@ -142,7 +142,7 @@ def _clip(
         target=intent.name,
         caption=f"{who} {intent.caption}",
         cameras=cameras,
-        frames=np.stack([picture.colours for picture in pictures]),
+        frames=np.stack([picture.colors for picture in pictures]),
         depth_m=np.stack([picture.depth_m for picture in pictures]),
         ids=np.stack([picture.ids for picture in pictures]),
         joints_m=np.array(joints),
@@ -184,7 +184,7 @@ def _first_look(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
     ids = fine.ids[seen].astype(np.int32)
     return first, SceneState(
         points_m=points.astype(np.float32),
-        colours=fine.colours[seen],
+        colors=fine.colors[seen],
         object_ids=np.where(ids < FIRST_BODY, 0, ids).astype(np.int32),
         last_seen=np.zeros(len(points), np.int32),
         intrinsics_px=cameras.intrinsics_px,
@@ -219,8 +219,8 @@ def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
         prior=view.frames,
         mask=view.mask,
         hands=hands,
-        first_frame=clip.first.colours if state is None else view.frames[0],
-        truth=clip.frames,
+        first_frame=clip.first.colors if state is None else view.frames[0],
+        target=clip.frames,
         extra={"verb": clip.verb, "target": clip.target, "kind": clip.kind},
     )
 

@@ -1,6 +1,6 @@
 """What stands in the tabletop world: shapes, their paint, and where they are put at the start.
 
-The world's axes: x right, y away from the wearer, z up, in metres; the table top is z = 0 and its
+The world's axes: x right, y away from the wearer, z up, in meters; the table top is z = 0 and its
 near edge y = 0. A body's own origin lies in the middle of its underside.
 """
 
@@ -18,7 +18,7 @@ from egosim_jax.types import InputError
 Shape = Literal["box", "cylinder", "ball", "cone", "ring", "cup", "lidded box", "drawer"]
 LOOSE: tuple[Shape, ...] = ("box", "cylinder", "ball", "cone", "ring", "cup")
 """Shapes that can be picked up."""
-COLOURS = {
+COLORS = {
     "red": (196, 48, 43),
     "orange": (226, 126, 38),
     "yellow": (230, 197, 56),
@@ -29,8 +29,8 @@ COLOURS = {
     "black": (16, 16, 17),
 }
 STAYS = "black"
-"""Colour of things that are never acted on. In a prior they look like what was never seen, so that
-the mask has to tell; and a black thing could not be found in a picture by its colour."""
+"""Color of things that are never acted on. In a prior they look like what was never seen, so that
+the mask has to tell; and a black thing could not be found in a picture by its color."""
 TABLE_SIZE_M = (1.3, 0.62, 0.03)
 REACH_M = (-0.20, 0.20, 0.15, 0.37)
 """Least and greatest x and y at which things are put: within sight and reach."""
@@ -41,9 +41,9 @@ Pattern = Literal["plain", "stripes", "checks", "grain"]
 
 @dataclass(frozen=True, kw_only=True)
 class Paint:
-    """A solid texture: a colour at every point of a body's own space."""
+    """A solid texture: a color at every point of a body's own space."""
 
-    colour: tuple[int, int, int]
+    color: tuple[int, int, int]
     """RGB."""
     second: tuple[int, int, int]
     """RGB of the pattern."""
@@ -54,7 +54,7 @@ class Paint:
 
     def at(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """RGB in [0, 1] at points of the body's space."""
-        first, second = np.array([self.colour, self.second], points_m.dtype) / 255
+        first, second = np.array([self.color, self.second], points_m.dtype) / 255
         if self.pattern == "plain":
             return np.broadcast_to(first, points_m.shape)
         x, y, z = (points_m / self.scale_m).T
@@ -216,13 +216,13 @@ def _tube(outer: float, inner: float, height: float) -> tuple[np.ndarray, np.nda
     return vertices, np.concatenate(faces)
 
 
-def darker(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    """The same colour in shade."""
-    red, green, blue = (int(0.58 * value) for value in colour)
+def darker(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """The same color in shade."""
+    red, green, blue = (int(0.58 * value) for value in color)
     return red, green, blue
 
 
-def make_loose(shape: Shape, colour: str, rng: np.random.Generator) -> Body:
+def make_loose(shape: Shape, color: str, rng: np.random.Generator) -> Body:
     """A thing to pick up, of random size, at the origin."""
     width = float(rng.uniform(0.066, 0.08))
     height = float(rng.uniform(0.065, 0.09))
@@ -238,13 +238,13 @@ def make_loose(shape: Shape, colour: str, rng: np.random.Generator) -> Body:
     if shape in ("cylinder", "cup"):
         choices = ("plain", "stripes")
     pattern = choices[int(rng.integers(len(choices)))]
-    second = darker(COLOURS[colour])
-    paint = Paint(colour=COLOURS[colour], second=second, pattern=pattern, scale_m=0.03)
+    second = darker(COLORS[color])
+    paint = Paint(color=COLORS[color], second=second, pattern=pattern, scale_m=0.03)
     part = Part(
         name=shape, vertices_m=vertices, triangles=triangles, paint=paint, smooth=shape != "box"
     )
     return Body(
-        name=f"{colour} {shape}",
+        name=f"{color} {shape}",
         shape=shape,
         size_m=size,
         parts=(part,),
@@ -252,7 +252,7 @@ def make_loose(shape: Shape, colour: str, rng: np.random.Generator) -> Body:
     )
 
 
-def make_drawer(colour: str) -> Body:
+def make_drawer(color: str) -> Body:
     """A cabinet whose drawer slides out towards the wearer (-y)."""
     width, depth, height, wall = 0.16, 0.12, 0.08, 0.008
     x, y = width / 2, depth / 2
@@ -271,11 +271,11 @@ def make_drawer(colour: str) -> Body:
         box((right - 0.004, -y + 0.002, low), (right, y - 0.012, high - 0.02)),
         box((-0.02, -y - 0.026, height / 2 - 0.006), (0.02, -y - 0.006, height / 2 + 0.006)),
     )
-    body, second = COLOURS[colour], darker(COLOURS[colour])
-    plain = Paint(colour=body, second=second, pattern="plain", scale_m=0.05)
-    light = replace(plain, colour=(205, 190, 165))
+    body, second = COLORS[color], darker(COLORS[color])
+    plain = Paint(color=body, second=second, pattern="plain", scale_m=0.05)
+    light = replace(plain, color=(205, 190, 165))
     return Body(
-        name=f"{colour} cabinet",
+        name=f"{color} cabinet",
         shape="drawer",
         size_m=(width, depth, height),
         parts=(
@@ -286,7 +286,7 @@ def make_drawer(colour: str) -> Body:
     )
 
 
-def make_lidded_box(colour: str) -> Body:
+def make_lidded_box(color: str) -> Body:
     """A box whose lid turns about its far upper edge; the lid's own origin lies on that hinge."""
     width, depth, height, wall, lid = 0.13, 0.10, 0.06, 0.007, 0.012
     x, y = width / 2, depth / 2
@@ -301,10 +301,10 @@ def make_lidded_box(colour: str) -> Body:
         box((-x, -y, height + 0.001), (x, y, height + lid)),
         box((-0.018, -y - 0.014, height + 0.002), (0.018, -y, height + lid - 0.001)),
     )
-    body, second = COLOURS[colour], darker(COLOURS[colour])
-    plain = Paint(colour=second, second=body, pattern="plain", scale_m=0.05)
+    body, second = COLORS[color], darker(COLORS[color])
+    plain = Paint(color=second, second=body, pattern="plain", scale_m=0.05)
     return Body(
-        name=f"{colour} chest",
+        name=f"{color} chest",
         shape="lidded box",
         size_m=(width, depth, height + lid),
         parts=(
@@ -312,7 +312,7 @@ def make_lidded_box(colour: str) -> Body:
                 name="lid",
                 vertices_m=cover[0],
                 triangles=cover[1],
-                paint=replace(plain, colour=body),
+                paint=replace(plain, color=body),
             ),
             Part(name="case", vertices_m=case[0], triangles=case[1], paint=plain),
         ),

@@ -111,8 +111,8 @@ def flesh(
         arm = join(
             _limb(wrist - 0.02 * along, knuckle, 0.026, 0.026), _limb(wrist, elbow_m, 0.027, 0.034)
         )
-        enamel = Paint(colour=ENAMEL, second=ENAMEL, pattern="plain", scale_m=0.1)
-        rubber = Paint(colour=RUBBER, second=RUBBER, pattern="plain", scale_m=0.1)
+        enamel = Paint(color=ENAMEL, second=ENAMEL, pattern="plain", scale_m=0.1)
+        rubber = Paint(color=RUBBER, second=RUBBER, pattern="plain", scale_m=0.1)
         return (
             _part("gripper", join(*fingers), rubber),
             _part("wrist", join(palm, arm), enamel),
@@ -133,8 +133,8 @@ def flesh(
     towards = (elbow_m - wrist) / np.linalg.norm(elbow_m - wrist)
     cuff = wrist + 0.07 * towards
     pieces += [_limb(wrist, cuff, 0.023, 0.025)]
-    skin = Paint(colour=SKIN, second=SKIN, pattern="plain", scale_m=0.1)
-    sleeve = Paint(colour=SLEEVE, second=(58, 72, 92), pattern="plain", scale_m=0.1)
+    skin = Paint(color=SKIN, second=SKIN, pattern="plain", scale_m=0.1)
+    sleeve = Paint(color=SLEEVE, second=(58, 72, 92), pattern="plain", scale_m=0.1)
     return (
         _part("hand", join(*pieces), skin),
         _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), sleeve),

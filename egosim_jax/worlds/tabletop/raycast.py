@@ -1,8 +1,8 @@
-"""Pictures of the world by ray casting: colour, depth and ids, exact at every pixel centre.
+"""Pictures of the world by ray casting: color, depth and ids, exact at every pixel center.
 
-A surface of colour c and normal n shows c * (ambient + sun * max(0, n . l)), where the sun's part
-falls away in shadow. Colours are means over s x s rays a pixel; depth and ids are of the ray
-through the pixel's centre.
+A surface of color c and normal n shows c * (ambient + sun * max(0, n . l)), where the sun's part
+falls away in shadow. Colors are means over s x s rays a pixel; depth and ids are of the ray
+through the pixel's center.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SUN = np.array([-0.25, -0.50, 0.83])
 AMBIENT, SUNLIGHT = 0.62, 0.48
 SKY = np.array([0.0, 0.0, 0.0])
 RAYS = 2
-"""Rays along each side of a pixel, of which the colour is the mean."""
+"""Rays along each side of a pixel, of which the color is the mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class Placed:
 class Picture:
     """One frame."""
 
-    colours: UInt8[np.ndarray, "h w 3"]
+    colors: UInt8[np.ndarray, "h w 3"]
     depth_m: Float32[np.ndarray, "h w"]
     """Along the camera's axis; infinite where there is nothing."""
     ids: Int[np.ndarray, "h w"]
@@ -77,7 +77,7 @@ class Stage:
         numbers = np.array([*(item.number for item in self.placed), 0])
         ids = numbers[np.where(np.isfinite(depth), geometry, len(self.placed)).astype(int)]
         return Picture(
-            colours=self._colours(world_from_camera, intrinsics_px, height, width),
+            colors=self._colors(world_from_camera, intrinsics_px, height, width),
             depth_m=rearrange(depth, "(h w) -> h w", h=height),
             ids=rearrange(ids, "(h w) -> h w", h=height),
         )
@@ -94,7 +94,7 @@ class Stage:
                 "the camera or the thing."
             )
 
-    def _colours(
+    def _colors(
         self, pose: np.ndarray, intrinsics_px: np.ndarray, height: int, width: int
     ) -> UInt8[np.ndarray, "h w 3"]:
         split = finer(intrinsics_px, RAYS)
@@ -116,7 +116,7 @@ class Stage:
     def _surface(
         self, points: Float32[np.ndarray, "n 3"], hits: dict[str, np.ndarray]
     ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-        """Colour and normal at points that rays have met; arbitrary where they met nothing."""
+        """Color and normal at points that rays have met; arbitrary where they met nothing."""
         albedo, normals = np.zeros_like(points), hits["primitive_normals"]
         for number, item in enumerate(self.placed):
             (here,) = np.nonzero(hits["geometry_ids"] == number)

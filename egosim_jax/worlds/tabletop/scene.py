@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from egosim_jax.geometry import turned
 from egosim_jax.worlds.tabletop.bodies import (
-    COLOURS,
+    COLORS,
     LOOSE,
     REACH_M,
     TABLE_SIZE_M,
@@ -116,7 +116,7 @@ class Scene:
 
 
 def footprint(body: Body) -> float:
-    """Radius in metres of the circle on the table that a body needs; open drawers included."""
+    """Radius in meters of the circle on the table that a body needs; open drawers included."""
     reach = DRAWER_M + 0.03 if body.shape == "drawer" else 0.0
     return float(np.hypot(body.size_m[0], body.size_m[1]) / 2 + reach / 2)
 
@@ -136,7 +136,7 @@ def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
 
 
 def make_scene(rng: np.random.Generator) -> Scene:
-    """A random scene of three to six things of different colours, at most one to be opened."""
+    """A random scene of three to six things of different colors, at most one to be opened."""
     while len((scene := _scatter(rng)).bodies) < LEAST:
         pass  # the table was full before the least number stood on it
     return scene
@@ -145,7 +145,7 @@ def make_scene(rng: np.random.Generator) -> Scene:
 def _scatter(rng: np.random.Generator) -> Scene:
     """Things put down one after another, as long as there is room."""
     scene = Scene(bodies=(), room=_room(rng), openings={})
-    names = list(rng.permutation(list(COLOURS)))
+    names = list(rng.permutation(list(COLORS)))
     count = int(rng.integers(LEAST, MOST + 1))
     candidates: list[Body] = []
     if rng.random() < 0.5:
@@ -183,14 +183,14 @@ def _room(rng: np.random.Generator) -> tuple[Placed, ...]:
         ("right wall", box((1.98, -1.5, -0.75), (2.0, 1.6, 1.8)), walls, "plain", 0.24, WALL),
     ]
     placed = []
-    for name, (vertices, triangles), colour, pattern, scale, number in pieces:
-        first, second = np.clip(colour, 0, 255), np.clip(colour * 0.86, 0, 255)
-        paint = Paint(colour=_rgb(first), second=_rgb(second), pattern=pattern, scale_m=scale)
+    for name, (vertices, triangles), color, pattern, scale, number in pieces:
+        first, second = np.clip(color, 0, 255), np.clip(color * 0.86, 0, 255)
+        paint = Paint(color=_rgb(first), second=_rgb(second), pattern=pattern, scale_m=scale)
         part = Part(name=name, vertices_m=vertices, triangles=triangles, paint=paint)
         placed.append(Placed(part=part, world_from_part=np.eye(4), number=number))
     return tuple(placed)
 
 
-def _rgb(colour: np.ndarray) -> tuple[int, int, int]:
-    red, green, blue = (int(value) for value in colour)
+def _rgb(color: np.ndarray) -> tuple[int, int, int]:
+    red, green, blue = (int(value) for value in color)
     return red, green, blue

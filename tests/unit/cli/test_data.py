@@ -37,7 +37,7 @@ def test_pack_with_a_size_stores_decoded_frames(clips, out):
     reader = ShardReader(out)
     assert reader.manifest.spec == VideoSpec(frames=5, height=16, width=32)
     assert {name: array.shape for name, array in reader[0].arrays.items()} == {
-        "truth": (5, 16, 32, 3),
+        "target": (5, 16, 32, 3),
         "prior": (5, 16, 32, 3),
         "hands": (5, 16, 32, 3),
         "mask": (5, 16, 32),
@@ -114,7 +114,7 @@ def test_a_shard_of_no_size_is_refused(clips, out):
 def test_look_draws_the_first_clip_of_each_value_of_a_column(make_clips, out, tmp_path):
     Pack(metadata=make_clips(count=5), out=out, size=(16, 32), num_frames=5).run()
     sheet = tmp_path / "sheet.png"
-    look = Look(shards=out, out=sheet, by=("split",), streams=("truth", "prior"), moments=3)
+    look = Look(shards=out, out=sheet, by=("split",), streams=("target", "prior"), moments=3)
     assert look.run() == DONE
     with Image.open(sheet) as picture:
         assert picture.size == (3 * 240, 2 * (16 + 2 * 120))
@@ -132,7 +132,9 @@ def test_look_refuses_unknown_columns_and_latents(clips, out, tmp_path):
     spec = VideoSpec(frames=5, height=16, width=32)
     latents = tmp_path / "latents"
     with ShardWriter(latents, kind="latents", spec=spec) as writer:
-        writer.add({"truth": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a", "prompt": "b"})
+        writer.add(
+            {"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a", "prompt": "b"}
+        )
     with pytest.raises(InputError, match="holds latents"):
         Look(shards=latents, out=tmp_path / "sheet.png").run()
 

@@ -9,7 +9,7 @@ from egosim_jax.types import InputError
 
 @pytest.fixture(scope="module")
 def frames():
-    """A grey video in which no two selected pixels are told apart by chance alone."""
+    """A gray video in which no two selected pixels are told apart by chance alone."""
     return np.random.default_rng(0).integers(0, 256, (13, 32, 48), np.uint8)
 
 
@@ -49,9 +49,9 @@ def test_the_first_frame_is_observed_whatever_the_video_says():
     assert packed[1:].min() == 1
 
 
-@pytest.mark.parametrize(("grey", "generate"), [(0, 0), (127, 0), (128, 1), (255, 1)])
-def test_the_threshold_is_one_half_of_white(grey, generate):
-    packed = pack_mask(np.full((5, 16, 16), grey, np.uint8))
+@pytest.mark.parametrize(("gray", "generate"), [(0, 0), (127, 0), (128, 1), (255, 1)])
+def test_the_threshold_is_one_half_of_white(gray, generate):
+    packed = pack_mask(np.full((5, 16, 16), gray, np.uint8))
     assert (packed[1] == generate).all()
 
 

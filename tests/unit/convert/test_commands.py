@@ -25,7 +25,7 @@ from safetensors.torch import save_file
 from egosim_jax import configs
 from egosim_jax.convert import commands
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.layouts import recognize
 from egosim_jax.convert.plan import TABLES
 from egosim_jax.convert.rules import translate_back
 from egosim_jax.convert.tables import wan_dit
@@ -150,7 +150,7 @@ def test_inspect_says_what_is_there_and_which_config_fits(checkpoint, capsys):
 
 
 def of_any(checkpoint, network):
-    return recognise(checkpoint).network(network).tensors.values()
+    return recognize(checkpoint).network(network).tensors.values()
 
 
 def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
@@ -279,7 +279,7 @@ def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
     only = ["--layout", "diffusers", "--only", "text", "image"]
     assert back(tmp_path / "ours", tmp_path / "back", *only) == 0
     for network in ("text", "image"):
-        tensors = recognise(tmp_path / "back").network(network).tensors
+        tensors = recognize(tmp_path / "back").network(network).tensors
         expected = foreign(network, "transformers")
         assert tensors.keys() == expected.keys()
         assert all(np.array_equal(t.array(), expected[n].numpy()) for n, t in tensors.items())
@@ -291,12 +291,12 @@ def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, m
     assert convert(checkpoint, tmp_path / "ours") == 0
     assert back(tmp_path / "ours", tmp_path / "theirs", "--layout", layout) == 0
     for network in NETWORKS:
-        found = recognise(tmp_path / "theirs").network(network)
+        found = recognize(tmp_path / "theirs").network(network)
         expected = foreign(network, found.naming)
         assert found.tensors.keys() == expected.keys()
         for name, tensor in found.tensors.items():
             np.testing.assert_array_equal(tensor.array(), expected[name].numpy())
-    dit = recognise(tmp_path / "theirs").network("dit").source.files
+    dit = recognize(tmp_path / "theirs").network("dit").source.files
     assert len(dit) > 1
     assert all(file.stat().st_size < 250_000 for file in dit)
     assert convert(tmp_path / "theirs", tmp_path / "again") == 0

@@ -15,7 +15,7 @@ import torch
 from safetensors.numpy import save_file
 
 from egosim_jax.convert import pth
-from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.layouts import recognize
 from egosim_jax.convert.pth import read_pth
 from egosim_jax.convert.rules import Rule, assign
 from egosim_jax.convert.source import sources
@@ -170,7 +170,7 @@ def test_a_file_of_many_networks_is_refused(tmp_path):
     empty = np.zeros(0, np.float32)
     tensors = {f"{number}.visual.cls_embedding": empty for number in range(1000)}
     save_file(tensors, tmp_path / "x.safetensors")
-    assert "1000 networks" in refused(recognise, tmp_path)
+    assert "1000 networks" in refused(recognize, tmp_path)
 
 
 # Pickles.

@@ -236,7 +236,7 @@ def test_a_lora_of_another_base_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("root", [False, True])
-def test_pefts_settings_are_honoured(tmp_path, root):
+def test_pefts_settings_are_honored(tmp_path, root):
     save(tmp_path / "adapter_model.safetensors", pair(rank=4))
     settings = {"lora_alpha": 6, "use_rslora": root}
     (tmp_path / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
@@ -244,7 +244,7 @@ def test_pefts_settings_are_honoured(tmp_path, root):
     np.testing.assert_allclose(summand(read_lora(tmp_path, CONFIG.dit)), expected, rtol=1e-4)
 
 
-def test_diffusers_settings_in_the_header_are_honoured(tmp_path):
+def test_diffusers_settings_in_the_header_are_honored(tmp_path):
     said = {"lora_adapter_metadata": json.dumps({"transformer.lora_alpha": 6, "transformer.r": 2})}
     file = save(tmp_path / "x.safetensors", pair(), said)
     np.testing.assert_allclose(summand(read_lora(file, CONFIG.dit)), product(pair(), 3), rtol=1e-4)

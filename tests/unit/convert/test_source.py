@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from egosim_jax.convert.layouts import recognise
+from egosim_jax.convert.layouts import recognize
 from egosim_jax.convert.source import sources
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.types import InputError
@@ -119,7 +119,7 @@ def test_networks_are_told_by_their_names_under_any_prefix(tmp_path):
     (tmp_path / "google" / "umt5-xxl" / "tokenizer.json").touch()
     (tmp_path / ".cache").mkdir()
     save_file({"x": torch.rand(1)}, tmp_path / ".cache" / "x.safetensors")
-    folder = recognise(tmp_path)
+    folder = recognize(tmp_path)
     assert {(f.network, f.naming, f.prefix) for f in folder.found} == names.keys()
     assert [source.name for source in folder.unknown] == ["z.safetensors"]
     assert folder.tokenizer == tmp_path / "google" / "umt5-xxl"
@@ -128,15 +128,15 @@ def test_networks_are_told_by_their_names_under_any_prefix(tmp_path):
 
 def test_what_is_not_there_or_not_one_is_said(tmp_path):
     with pytest.raises(InputError, match="holds no checkpoint"):
-        recognise(tmp_path)
+        recognize(tmp_path)
     with pytest.raises(InputError, match="No such file"):
-        recognise(tmp_path / "none")
+        recognize(tmp_path / "none")
     for name in "ab":
         save_file({"visual.cls_embedding": torch.rand(1)}, tmp_path / f"{name}.safetensors")
     with pytest.raises(InputError, match=r"2 checkpoints of the network image \(a\.s.*b\.s"):
-        recognise(tmp_path).network("image")
+        recognize(tmp_path).network("image")
     with pytest.raises(InputError, match="0 checkpoints of the network dit"):
-        recognise(tmp_path).network("dit")
+        recognize(tmp_path).network("dit")
 
 
 def test_bfloat16_is_read_as_such(tmp_path):

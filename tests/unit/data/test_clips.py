@@ -34,7 +34,7 @@ def test_a_clip_of_the_models_size_passes_unchanged(files):
     triplet = load_triplet(files, NATIVE)
     np.testing.assert_array_equal(triplet.prior, read_video(files.prior).frames)
     np.testing.assert_array_equal(triplet.hands, read_video(files.hands).frames)
-    np.testing.assert_array_equal(triplet.truth, read_video(files.truth).frames)
+    np.testing.assert_array_equal(triplet.target, read_video(files.target).frames)
     np.testing.assert_array_equal(triplet.mask, read_video(files.mask).frames[..., 0])
     np.testing.assert_array_equal(triplet.first_frame, read_image(files.first_frame))
 
@@ -45,7 +45,7 @@ def test_id_prompt_and_further_columns_come_from_the_metadata(files):
     assert triplet.extra == {"split": "train"}
 
 
-def test_colours_are_stretched_with_lanczos(files):
+def test_colors_are_stretched_with_lanczos(files):
     triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=64))
     frame = Image.fromarray(read_video(files.prior).frames[3])
     expected = frame.resize((64, 16), Image.Resampling.LANCZOS)
@@ -70,21 +70,21 @@ def test_the_image_is_the_clips_own_wherever_the_window_begins(files):
 
 
 def test_the_first_frame_may_be_a_video(files):
-    files = dataclasses.replace(files, first_frame=files.truth)
+    files = dataclasses.replace(files, first_frame=files.target)
     np.testing.assert_array_equal(
-        load_triplet(files, NATIVE).first_frame, read_video(files.truth).frames[0]
+        load_triplet(files, NATIVE).first_frame, read_video(files.target).frames[0]
     )
 
 
 def test_a_clip_without_truth_has_none(files):
-    assert load_triplet(dataclasses.replace(files, truth=None), NATIVE).truth is None
+    assert load_triplet(dataclasses.replace(files, target=None), NATIVE).target is None
 
 
 def test_a_sound_clip_has_no_problems(files):
     assert check_clip(files, NATIVE) == []
 
 
-@pytest.mark.parametrize("name", ["prior", "hands", "mask", "first_frame", "truth"])
+@pytest.mark.parametrize("name", ["prior", "hands", "mask", "first_frame", "target"])
 def test_strict_refuses_a_missing_file_by_row_and_path(files, name):
     path = getattr(files, name)
     path.unlink()
@@ -101,7 +101,7 @@ def test_every_missing_file_is_listed(files):
 
 def test_strict_refuses_frame_counts_that_disagree(files):
     shorten(files.hands, 5)
-    with pytest.raises(InputError, match="disagree: prior 9, hands 5, mask 9, truth 9"):
+    with pytest.raises(InputError, match="disagree: prior 9, hands 5, mask 9, target 9"):
         load_triplet(files, NATIVE)
 
 
@@ -163,8 +163,8 @@ def test_lenient_takes_a_missing_mask_for_all_observed(files):
 
 
 def test_lenient_does_without_a_missing_truth(files):
-    files.truth.unlink()
-    assert load_triplet(files, NATIVE, policy="lenient").truth is None
+    files.target.unlink()
+    assert load_triplet(files, NATIVE, policy="lenient").target is None
 
 
 def test_lenient_still_refuses_a_missing_prior(files):
@@ -174,7 +174,7 @@ def test_lenient_still_refuses_a_missing_prior(files):
 
 
 def test_clips_that_were_written_are_read_back(tmp_path):
-    """Within what 4:2:0 colour and near-lossless H.264 leave of smooth pictures."""
+    """Within what 4:2:0 color and near-lossless H.264 leave of smooth pictures."""
     spec = VideoSpec(frames=9, height=32, width=48)
     frame, row, column = np.mgrid[:9, :32, :48]
     smooth = [
@@ -193,7 +193,7 @@ def test_clips_that_were_written_are_read_back(tmp_path):
             hands=smooth[2],
             mask=mask,
             first_frame=smooth[0][0],
-            truth=smooth[1 + number],
+            target=smooth[1 + number],
             extra={"split": "train"},
         )
         for number in (0, 1)
@@ -206,7 +206,7 @@ def test_clips_that_were_written_are_read_back(tmp_path):
         assert back.extra == {"split": "train"}
         np.testing.assert_array_equal(back.first_frame, triplet.first_frame)
         assert ((back.mask > 127) == (triplet.mask > 127)).mean() > 0.99
-        for name in ("prior", "hands", "truth"):
+        for name in ("prior", "hands", "target"):
             gap = getattr(back, name).astype(float) - getattr(triplet, name)
             assert np.abs(gap).mean() < 6
 

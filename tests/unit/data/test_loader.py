@@ -180,7 +180,7 @@ def test_a_record_with_nan_or_latents_of_another_length_is_skipped_and_named(tmp
     nan[0, 0, 0, 0] = np.nan
     with ShardWriter(tmp_path, kind="latents", spec=spec) as writer:
         for number, truth in enumerate((latents, nan, longer, latents)):
-            writer.add({"truth": truth}, {"video_id": f"clip{number}"})
+            writer.add({"target": truth}, {"video_id": f"clip{number}"})
     loader = make_loader(ShardReader(tmp_path), batch_size=2, seed=0, shuffle=False)
     assert numbers(loader, 1) == [[0, 3]]
     reasons = sorted(loader.skipped)
@@ -208,7 +208,7 @@ def test_a_single_pass_over_less_than_a_batch_is_refused(source):
 def test_a_window_is_cut_from_all_videos_alike(tmp_path):
     frames = np.arange(9, dtype=np.uint8)[:, None, None, None]
     video = np.broadcast_to(frames, (9, 16, 16, 3))
-    arrays = {"truth": video, "prior": video + 20, "hands": video + 40, "mask": video[..., 0] + 60}
+    arrays = {"target": video, "prior": video + 20, "hands": video + 40, "mask": video[..., 0] + 60}
     with ShardWriter(tmp_path, kind="frames") as writer:
         writer.add({**arrays, "first_frame": video[0] + 99}, {"video_id": "a"})
     spec = VideoSpec(frames=5, height=16, width=16)
@@ -216,9 +216,9 @@ def test_a_window_is_cut_from_all_videos_alike(tmp_path):
     starts = set()
     for _ in range(40):
         batch = next(loader)
-        start = int(batch["truth"][0, 0, 0, 0, 0])
+        start = int(batch["target"][0, 0, 0, 0, 0])
         starts.add(start)
-        for name, offset in (("truth", 0), ("prior", 20), ("hands", 40), ("mask", 60)):
+        for name, offset in (("target", 0), ("prior", 20), ("hands", 40), ("mask", 60)):
             window = batch[name][0, :, 0, 0].reshape(5, -1)[:, 0]
             np.testing.assert_array_equal(window, np.arange(start, start + 5) + offset)
         assert (batch["first_frame"] == 99).all()

@@ -29,7 +29,7 @@ def test_paths_are_relative_to_the_metadata(write, tmp_path):
     assert item.prior == tmp_path / "a/prior.mp4"
     assert item.hands == tmp_path / "a/hands.mp4"
     assert item.first_frame == tmp_path / "a/first.png"
-    assert item.truth == tmp_path / "a/video.mp4"
+    assert item.target == tmp_path / "a/video.mp4"
 
 
 def test_the_mask_lies_beside_the_prior(write, tmp_path):
@@ -49,7 +49,7 @@ def test_a_further_column_may_be_empty(write):
 
 def test_a_file_without_the_column_video_has_no_truth(write):
     lines = [line.split(",", 1)[1] for line in (HEADER, ROW)]
-    assert read_metadata(write(*lines))[0].truth is None
+    assert read_metadata(write(*lines))[0].target is None
 
 
 def test_json_lines_say_the_same_as_csv(write):
@@ -68,7 +68,7 @@ def test_a_prompt_may_hold_commas_and_line_breaks(write):
 
 
 def test_a_byte_order_mark_is_no_part_of_the_first_column(write):
-    assert read_metadata(write("\ufeff" + HEADER, ROW))[0].truth is not None
+    assert read_metadata(write("\ufeff" + HEADER, ROW))[0].target is not None
 
 
 def test_all_missing_columns_are_listed(write):
@@ -185,7 +185,7 @@ def test_the_minimal_columns_of_egosim_are_enough(write, tmp_path):
     assert item.hands == tmp_path / "renders/7/hand_kp_video.mp4"
     assert item.first_frame == tmp_path / "renders/7/hand_inpaint.png"
     assert item.mask == tmp_path / "renders/7/pc_mask_video.mp4"
-    assert item.truth == tmp_path / "part1/pour/7.mp4"
+    assert item.target == tmp_path / "part1/pour/7.mp4"
     assert item.extra == {}
 
 

@@ -30,7 +30,7 @@ SPEC = VideoSpec(frames=9, height=32, width=48)
 def latents(index, shape=(3, 4, 6, 16)):
     rng = np.random.default_rng(index)
     return {
-        "truth": rng.standard_normal(shape).astype(ml_dtypes.bfloat16),
+        "target": rng.standard_normal(shape).astype(ml_dtypes.bfloat16),
         "mask": rng.integers(0, 2, (3, 4, 6, 4)).astype(np.uint8),
         "text": rng.standard_normal((5, 8)).astype(np.float32),
     }
@@ -129,8 +129,8 @@ def test_a_full_shard_is_followed_by_another(folder):
 def test_the_manifest_describes_the_records(folder):
     manifest = read_manifest(folder)
     assert (manifest.kind, manifest.spec, manifest.provenance) == ("latents", SPEC, {"vae": "abc"})
-    assert manifest.arrays["truth"].dtype == "bfloat16"
-    assert manifest.arrays["truth"].shape == (3, 4, 6, 16)
+    assert manifest.arrays["target"].dtype == "bfloat16"
+    assert manifest.arrays["target"].shape == (3, 4, 6, 16)
 
 
 def test_axes_on_which_records_differ_are_left_open(tmp_path):
@@ -316,7 +316,7 @@ def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
     def change(fields):
         fields["arrays"]["text"]["shape"] = [5, 9]
         fields["arrays"]["mask"]["dtype"] = "int32"
-        fields["arrays"]["hands"] = fields["arrays"].pop("truth")
+        fields["arrays"]["hands"] = fields["arrays"].pop("target")
 
     rewrite_manifest(folder, change)
     found = "\n".join(problems(folder))
@@ -328,7 +328,7 @@ def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
 
 def test_check_names_numbers_that_are_not_finite(tmp_path):
     arrays = latents(0)
-    arrays["truth"][0, 0, 0, 0] = np.nan
+    arrays["target"][0, 0, 0, 0] = np.nan
     with ShardWriter(tmp_path, kind="latents") as writer:
         writer.add(arrays, {"video_id": "a"})
     assert problems(tmp_path) == [
@@ -418,7 +418,7 @@ def test_every_file_reaches_the_disk_once(tmp_path, monkeypatch):
         lambda fields: fields["provenance"].update(vae="abd"),
         lambda fields: fields["shards"][0].update(sha256="0" * 64),
         lambda fields: fields["spec"].update(frames=13),
-        lambda fields: fields["arrays"]["truth"].update(shape=[None]),
+        lambda fields: fields["arrays"]["target"].update(shape=[None]),
         lambda fields: fields["shards"].reverse(),
     ],
 )
@@ -436,8 +436,8 @@ def test_a_changed_manifest_is_named(folder, change):
         lambda fields: fields["shards"][0].update(records="4"),
         lambda fields: fields["shards"][0].update(size=1e300),
         lambda fields: fields["shards"].append(fields["shards"][0]),
-        lambda fields: fields["arrays"]["truth"].update(shape=["x"]),
-        lambda fields: fields["arrays"]["truth"].update(dtype=["x"]),
+        lambda fields: fields["arrays"]["target"].update(shape=["x"]),
+        lambda fields: fields["arrays"]["target"].update(dtype=["x"]),
         lambda fields: fields["spec"].update(frames="9"),
         lambda fields: fields.update(provenance=[]),
         lambda fields: fields.update(kind=["latents"]),

@@ -16,7 +16,7 @@ from egosim_jax.data.transforms import (
 from egosim_jax.types import InputError, VideoSpec
 
 SPEC = VideoSpec(frames=5, height=16, width=32)
-NAMES = ("truth", "prior", "hands", "mask", "first_frame")
+NAMES = ("target", "prior", "hands", "mask", "first_frame")
 
 
 @pytest.fixture

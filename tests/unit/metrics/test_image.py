@@ -1,10 +1,10 @@
-"""PSNR and SSIM against scikit-image, and the colour fit against a known map."""
+"""PSNR and SSIM against scikit-image, and the color fit against a known map."""
 
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from egosim_jax.metrics.image import MAX_PSNR, fit_colours, psnr, ssim
+from egosim_jax.metrics.image import MAX_PSNR, fit_colors, psnr, ssim
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_psnr_of_equal_frames_is_the_cap(pair):
 
 def test_ssim_is_that_of_scikit_image(pair):
     expected = [reference_ssim(a, b) for a, b in zip(*pair, strict=True)]
-    # float32 moments of centred values, against scikit-image's float64.
+    # float32 moments of centerd values, against scikit-image's float64.
     np.testing.assert_allclose(ssim(*pair), expected, atol=1e-6)
 
 
@@ -60,27 +60,27 @@ def test_ssim_of_equal_frames_is_one(pair):
     np.testing.assert_allclose(ssim(pair[0], pair[0]), 1, atol=1e-6)
 
 
-def test_the_colour_fit_undoes_an_affine_change(pair):
+def test_the_color_fit_undoes_an_affine_change(pair):
     video = pair[0]
     matrix = np.array([[0.6, 0.1, 0.0], [0.1, 0.5, 0.1], [0.0, 0.1, 0.6]])
     changed = np.clip(np.rint(video @ matrix + 20), 0, 255).astype(np.uint8)
     # Both videos are rounded to whole levels, and the inverse matrix magnifies that.
-    assert np.abs(fit_colours(changed, video).astype(int) - video).max() <= 3
+    assert np.abs(fit_colors(changed, video).astype(int) - video).max() <= 3
 
 
-def test_the_colour_fit_is_least_squares(pair):
+def test_the_color_fit_is_least_squares(pair):
     video, reference = pair[1], pair[0]
-    colours = np.concatenate([video.reshape(-1, 3), np.ones((video.size // 3, 1))], axis=1)
-    solution = np.linalg.lstsq(colours, reference.reshape(-1, 3).astype(float))[0]
-    expected = np.clip(np.rint(colours @ solution), 0, 255).reshape(video.shape)
-    difference = np.abs(fit_colours(video, reference) - expected)
+    colors = np.concatenate([video.reshape(-1, 3), np.ones((video.size // 3, 1))], axis=1)
+    solution = np.linalg.lstsq(colors, reference.reshape(-1, 3).astype(float))[0]
+    expected = np.clip(np.rint(colors @ solution), 0, 255).reshape(video.shape)
+    difference = np.abs(fit_colors(video, reference) - expected)
     # float32 sums may round a level the other way, rarely.
     assert difference.max() <= 1
     assert (difference > 0).mean() < 1e-3
 
 
-def test_the_colour_fit_of_a_black_video_is_the_mean_colour(pair):
+def test_the_color_fit_of_a_black_video_is_the_mean_color(pair):
     reference = pair[0]
-    fitted = fit_colours(np.zeros_like(reference), reference)
+    fitted = fit_colors(np.zeros_like(reference), reference)
     mean = reference.reshape(-1, 3).mean(axis=0)
     assert np.abs(fitted - mean).max() <= 0.51

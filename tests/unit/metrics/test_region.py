@@ -1,4 +1,4 @@
-"""Silhouettes and places by colour, against what is known."""
+"""Silhouettes and places by color, against what is known."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,12 @@ from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 
-def discs(*centres, radius=4):
+def discs(*centers, radius=4):
     rows, columns = np.mgrid[:32, :48]
-    return np.stack([np.hypot(rows - y, columns - x) <= radius for y, x in centres])
+    return np.stack([np.hypot(rows - y, columns - x) <= radius for y, x in centers])
 
 
-def test_a_pixel_shows_what_comes_nearest_to_its_colour_in_some_light():
+def test_a_pixel_shows_what_comes_nearest_to_its_color_in_some_light():
     paints = {3: (200, 40, 40), 7: (40, 40, 200)}
     rng = np.random.default_rng(0)
     video, background = rng.integers(0, 256, (2, 1, 8, 8, 3), dtype=np.uint8)
@@ -23,10 +23,10 @@ def test_a_pixel_shows_what_comes_nearest_to_its_colour_in_some_light():
     for row, column in np.ndindex(8, 8):
         pixel = video[0, row, column].astype(float)
         distances = {}
-        for number, colour in {0: background[0, row, column], **paints}.items():
-            colour = np.array(colour, float)
-            shade = min(max(pixel @ colour / (colour @ colour), 0.45), 1.15)
-            distances[number] = np.linalg.norm(pixel - shade * colour)
+        for number, color in {0: background[0, row, column], **paints}.items():
+            color = np.array(color, float)
+            shade = min(max(pixel @ color / (color @ color), 0.45), 1.15)
+            distances[number] = np.linalg.norm(pixel - shade * color)
         assert got[0, row, column] == min(distances, key=distances.get)
 
 
@@ -69,7 +69,7 @@ def test_the_distance_of_centroids_leaves_stray_pixels_out():
 
 @pytest.mark.parametrize(("kind", "least"), [("human", 0.85), ("robot", 0.75)])
 def test_the_measures_find_hands_and_things_in_the_truth_itself(kind, least):
-    """Less well those of a grey gripper over a table of slate."""
+    """Less well those of a gray gripper over a table of slate."""
     spec = VideoSpec(frames=5, height=96, width=160)
     for seed in (100, 101, 102):
         clip, bare = (

@@ -18,8 +18,8 @@ def path(count=5):
 def test_position_and_rotation_errors_are_root_mean_squares():
     found = path()
     found[2, :3, 3] += found[2, :3, :3] @ [0, 0, 0.06]
-    metres, degrees = camera_errors(found, path())
-    assert metres == pytest.approx(0.06 / np.sqrt(5))
+    meters, degrees = camera_errors(found, path())
+    assert meters == pytest.approx(0.06 / np.sqrt(5))
     assert degrees == pytest.approx(0, abs=1e-5)
     found = path()
     turn = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
@@ -45,8 +45,8 @@ def still(clip):
 
 def test_the_true_video_was_seen_from_the_true_cameras(clip):
     found = seen_from(clip.frames, clip.frames, clip.depth_m, still(clip), clip.cameras)
-    metres, degrees = camera_errors(found, clip.cameras.world_from_camera)
-    assert metres < 1e-6
+    meters, degrees = camera_errors(found, clip.cameras.world_from_camera)
+    assert meters < 1e-6
     assert degrees < 1e-4
 
 
@@ -62,6 +62,6 @@ def test_a_video_from_elsewhere_was_seen_from_there(clip):
 
 
 def test_a_video_without_features_was_seen_from_nowhere(clip):
-    grey = np.full_like(clip.frames, 128)
-    found = seen_from(clip.frames, grey, clip.depth_m, np.zeros_like(still(clip)), clip.cameras)
+    gray = np.full_like(clip.frames, 128)
+    found = seen_from(clip.frames, gray, clip.depth_m, np.zeros_like(still(clip)), clip.cameras)
     assert np.isnan(found).all()

@@ -46,11 +46,11 @@ def test_half_a_thing_is_half_complete():
     points = top() + AT
     found = judged(points[points[:, 0] < AT[0]])
     assert found.accurate == 100
-    assert found.complete == pytest.approx(60, abs=3)  # one more centimetre counts as known
+    assert found.complete == pytest.approx(60, abs=3)  # one more centimeter counts as known
 
 
 @pytest.mark.parametrize("off", [0.009, 0.011])
-def test_a_centimetre_is_the_limit(off):
+def test_a_centimeter_is_the_limit(off):
     assert judged(top() + AT + [0, 0, off]).accurate == (100 if off < 0.01 else 0)
 
 

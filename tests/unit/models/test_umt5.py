@@ -20,7 +20,7 @@ encode = jax.jit(lambda model, ids, mask: model(ids, mask))
 
 
 def make(dtype="float32"):
-    """An encoder with random weights drawn by NumPy, which spares compiling the initialisers."""
+    """An encoder with random weights drawn by NumPy, which spares compiling the initializers."""
     model = nnx.eval_shape(lambda: UMT5(UMT5Config(**SIZES, dtype=dtype), rngs=nnx.Rngs(0)))
     draw = np.random.default_rng(0).normal
     fill(

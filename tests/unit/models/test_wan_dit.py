@@ -31,7 +31,7 @@ def new_weights():
 
 @cache
 def weights():
-    """Weights whose head, zero at initialisation, is drawn too."""
+    """Weights whose head, zero at initialization, is drawn too."""
     state = jax.tree.map(lambda x: x, new_weights())
     head = state["head"]["linear"]["kernel"]
     head.set_value(jnp.cos(jnp.arange(head.size, dtype=jnp.float32)).reshape(head.shape))
@@ -86,7 +86,7 @@ def test_a_new_network_answers_zero():
     assert not np.any(velocity)
 
 
-def test_blocks_are_initialised_differently():
+def test_blocks_are_initialized_differently():
     kernel = new_weights()["blocks"]["mlp"]["up"]["kernel"][...]
     assert not np.allclose(kernel[0], kernel[1])
 

@@ -76,7 +76,7 @@ def test_encoding_in_groups_of_frames_is_encoding_the_whole_clip(vae):
 
 def test_decoding_frame_by_frame_is_decoding_the_whole_clip_clipped(vae):
     have = call(vae, "decode", latents_of())
-    whole = call(vae, "decode_whole", vae.denormalise(latents_of()))
+    whole = call(vae, "decode_whole", vae.denormalize(latents_of()))
     assert have.shape == (2, FRAMES, 16, 24, 3)
     assert (jnp.abs(whole) > 1).any()
     assert relative(have, jnp.clip(whole, -1, 1)) <= REORDERED
@@ -179,15 +179,15 @@ def test_an_untrained_vae_already_tells_dark_from_bright_everywhere_in_the_clip(
     config = WanVAEConfig(
         dim=8, z_dim=4, res_blocks=1, latent_mean=(0.0,) * 4, latent_std=(1.0,) * 4
     )
-    grey = jnp.linspace(-1, 1, 9)
-    videos = jnp.broadcast_to(grey[:, None, None, None, None], (9, 5, 16, 16, 3))
+    gray = jnp.linspace(-1, 1, 9)
+    videos = jnp.broadcast_to(gray[:, None, None, None, None], (9, 5, 16, 16, 3))
     decoded = jax.jit(
         lambda rngs: (vae := WanVAE(config, rngs=rngs)).decode_whole(vae.moments(videos)[0]),
         compiler_options=QUICK,
     )
     for seed in range(3):
         values = np.asarray(decoded(nnx.Rngs(seed))).reshape(9, -1)
-        correlation = np.corrcoef(np.concatenate([grey[None], values.T]))[0, 1:]
+        correlation = np.corrcoef(np.concatenate([gray[None], values.T]))[0, 1:]
         assert np.median(correlation) > 0.8
 
 

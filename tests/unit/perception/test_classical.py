@@ -31,7 +31,7 @@ def test_the_thing_that_was_carried_is_found(clip, found):
     assert set(found.world_from_object) == {clip.body_ids[clip.target]}
 
 
-def test_its_points_end_within_a_centimetre_of_where_it_is(clip, found):
+def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
     target = clip.body_ids[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float)
     true = oracle(to_truth(clip))(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
@@ -61,7 +61,7 @@ def test_flesh_covers_the_hands(clip):
 
 
 def test_a_clip_in_which_nothing_moves_changes_nothing(clip):
-    still = np.repeat(clip.first.colours[None], SPEC.frames, axis=0)
+    still = np.repeat(clip.first.colors[None], SPEC.frames, axis=0)
     cameras = clip.cameras
     action = to_action(clip)
     poses = np.repeat(cameras.world_from_camera[:1], SPEC.frames, axis=0)

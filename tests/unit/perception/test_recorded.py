@@ -1,4 +1,4 @@
-"""Artefacts in the official layout, written here by hand, come back as what they say."""
+"""Artifacts in the official layout, written here by hand, come back as what they say."""
 
 import zipfile
 from pathlib import Path
@@ -38,7 +38,7 @@ def asked(step=0):
     )
     state = SceneState(
         points_m=np.zeros((1, 3), np.float32),
-        colours=np.zeros((1, 3), np.uint8),
+        colors=np.zeros((1, 3), np.uint8),
         object_ids=np.zeros(1, np.int32),
         last_seen=np.zeros(1, np.int32),
         intrinsics_px=INTRINSICS,

@@ -38,8 +38,8 @@ def scene():
     points[50:90] = points[:40]
     points[100] = np.nan
     points[101] = np.inf
-    colours = rng.integers(0, 256, (600, 3), dtype=np.uint8)
-    return points.astype(np.float32), colours
+    colors = rng.integers(0, 256, (600, 3), dtype=np.uint8)
+    return points.astype(np.float32), colors
 
 
 def splat_by_hand(points, cameras, size):
@@ -100,25 +100,25 @@ def test_a_square_that_begins_outside_the_picture_still_shows(renderer):
 
 @pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_scene_behind_the_camera_is_black_and_not_observed(renderer, scene):
-    points, colours = scene
+    points, colors = scene
     behind = points - np.array([0, 10, 0], np.float32)
     cameras = make_cameras()
     _, index = renderer.splat(behind, cameras, point_px=2)
-    assert not np.asarray(renderer.paint(index, colours, gamma=True)).any()
+    assert not np.asarray(renderer.paint(index, colors, gamma=True)).any()
     assert (np.asarray(renderer.unobserved(index)) == 255).all()
 
 
 @pytest.mark.parametrize("renderer", [reference, jitted])
-def test_gamma_lifts_the_colours_of_points(renderer, scene):
-    points, colours = scene
+def test_gamma_lifts_the_colors_of_points(renderer, scene):
+    points, colors = scene
     _, index = renderer.splat(points, make_cameras(), point_px=2)
     index = np.asarray(index)
     lifted, plain = (
-        np.asarray(renderer.paint(index, colours, gamma=g)).astype(float) for g in (True, False)
+        np.asarray(renderer.paint(index, colors, gamma=g)).astype(float) for g in (True, False)
     )
     assert np.abs(lifted - 255 * (plain / 255) ** (1 / 2.2)).max() <= 0.5 + 1e-9
     seen = index >= 0
-    assert (plain[seen] == colours[index[seen]]).all()
+    assert (plain[seen] == colors[index[seen]]).all()
     assert not plain[~seen].any()
 
 
@@ -152,11 +152,11 @@ def hands_by_hand(joints, cameras, kind):
     if kind == "human":
         bones = [(0, 4 * f + 1) for f in range(5)]
         bones += [(4 * f + k, 4 * f + k + 1) for f in range(5) for k in range(1, 4)]
-        lifted = [[round(255 * (c / 255) ** (1 / 2.2)) for c in colour] for colour in RAW]
+        lifted = [[round(255 * (c / 255) ** (1 / 2.2)) for c in color] for color in RAW]
         assert np.abs(np.array(lifted) - MEASURED).max() <= 1
-        colours = [lifted[2], *(colour for colour in lifted for _ in range(4))]
+        colors = [lifted[2], *(color for color in lifted for _ in range(4))]
     else:
-        bones, colours = [(0, 1), (0, 2)], [RAW[2], RAW[0], RAW[1]]
+        bones, colors = [(0, 1), (0, 2)], [RAW[2], RAW[0], RAW[1]]
     fx, fy = cameras.intrinsics_px[0, 0], cameras.intrinsics_px[1, 1]
     cx, cy = cameras.intrinsics_px[:2, 2]
     picture = np.zeros((len(joints), HEIGHT, WIDTH, 3), np.uint8)
@@ -166,15 +166,15 @@ def hands_by_hand(joints, cameras, kind):
         for hand in joints[f]:
             if np.isfinite(hand).all():
                 local = [pose[:3, :3].T @ (joint - pose[:3, 3]) for joint in hand.astype(float)]
-                shapes += [(p, p, 0.0055, c) for p, c in zip(local, colours, strict=True)]
-                shapes += [(local[a], local[b], 0.00275, colours[b]) for a, b in bones]
+                shapes += [(p, p, 0.0055, c) for p, c in zip(local, colors, strict=True)]
+                shapes += [(local[a], local[b], 0.00275, colors[b]) for a, b in bones]
         for j in range(HEIGHT):
             for i in range(WIDTH):
                 ray = np.array([(i - cx) / fx, (j - cy) / fy, 1.0])
-                for start, end, radius, colour in shapes:
+                for start, end, radius, color in shapes:
                     t = first_inside(ray, start, end, radius)
                     if 0.01 <= t < depth[f, j, i]:
-                        depth[f, j, i], picture[f, j, i] = t, colour
+                        depth[f, j, i], picture[f, j, i] = t, color
     return picture, depth
 
 

@@ -90,7 +90,7 @@ def cameras(count=6):
 
 
 @pytest.mark.parametrize(
-    ("method", "scale"), [("centres", 0.4), ("orientations", 1.0), ("orientations and scale", 0.4)]
+    ("method", "scale"), [("centers", 0.4), ("orientations", 1.0), ("orientations and scale", 0.4)]
 )
 def test_cameras_known_in_both_give_the_motion_between(method, scale):
     truth = motion(scale)

@@ -18,7 +18,7 @@ INTRINSICS = np.array([[100.0, 0, (WIDTH - 1) / 2], [0, 100, (HEIGHT - 1) / 2], 
 
 
 def cameras(x=0.0):
-    """Straight down the z axis, `x` metres aside."""
+    """Straight down the z axis, `x` meters aside."""
     pose = np.eye(4)
     pose[0, 3] = x
     return Cameras(
@@ -44,10 +44,10 @@ def picture(plates, x=0.0):
 
 def perceived(plates, *, x=0.0, step=1, **changes):
     depth, ids = picture(plates, x)
-    colours = np.where(ids[..., None] == 1, [200, 30, 30], [120, 110, 90]).astype(np.uint8)
+    colors = np.where(ids[..., None] == 1, [200, 30, 30], [120, 110, 90]).astype(np.uint8)
     whole = {
         "step": step,
-        "frames": colours,
+        "frames": colors,
         "cameras": cameras(x),
         "depth_m": depth,
         "object_ids": ids,
@@ -62,7 +62,7 @@ def start(x=0.0):
     """A state with a far away point alone, then what the first picture shows."""
     seed = SceneState(
         points_m=np.array([[50.0, 50, 50]], np.float32),
-        colours=np.zeros((1, 3), np.uint8),
+        colors=np.zeros((1, 3), np.uint8),
         object_ids=np.zeros(1, np.int32),
         last_seen=np.zeros(1, np.int32),
         intrinsics_px=INTRINSICS,
@@ -121,19 +121,19 @@ def test_fusing_the_same_again_changes_nothing():
     assert fingerprint(twice) == fingerprint(once)
 
 
-def test_what_was_seen_keeps_its_colours_and_what_is_new_has_those_of_the_clip():
+def test_what_was_seen_keeps_its_colors_and_what_is_new_has_those_of_the_clip():
     clip = tracked()
     drifted = replace(clip, frames=255 - clip.frames)
     state = fuse(start(), drifted, fusion=COARSE)
     plate, table = state.object_ids == 1, state.object_ids == 0
-    np.testing.assert_array_equal(state.colours[plate], np.tile([200, 30, 30], (plate.sum(), 1)))
+    np.testing.assert_array_equal(state.colors[plate], np.tile([200, 30, 30], (plate.sum(), 1)))
     # The table where the plate lay had not been seen before.
     places = state.points_m[:, :2] - HERE
     bared = table & ((places > 0.02) & (places < 0.06)).all(axis=1)
-    np.testing.assert_array_equal(state.colours[bared], np.tile([135, 145, 165], (bared.sum(), 1)))
+    np.testing.assert_array_equal(state.colors[bared], np.tile([135, 145, 165], (bared.sum(), 1)))
     assert bared.sum() > 30
     far = table & (state.points_m[:, 2] < 1) & ((places < -0.03) | (places > 0.11)).any(axis=1)
-    painted = (state.colours[far] == [120, 110, 90]).all(axis=1)
+    painted = (state.colors[far] == [120, 110, 90]).all(axis=1)
     assert painted.mean() > 0.95
 
 
@@ -153,12 +153,12 @@ def test_its_back_that_no_frame_shows_moves_with_it():
     before = replace(
         before,
         points_m=np.concatenate([before.points_m, back]),
-        colours=np.concatenate([before.colours, [[1, 2, 3]]]).astype(np.uint8),
+        colors=np.concatenate([before.colors, [[1, 2, 3]]]).astype(np.uint8),
         object_ids=np.append(before.object_ids, np.int32(1)),
         last_seen=np.append(before.last_seen, np.int32(0)),
     )
     state = fuse(before, tracked(), fusion=COARSE)
-    (row,) = np.flatnonzero((state.colours == (1, 2, 3)).all(axis=1))
+    (row,) = np.flatnonzero((state.colors == (1, 2, 3)).all(axis=1))
     expected = back[0] + [*(THERE - HERE), 0]
     np.testing.assert_allclose(state.points_m[row], expected, atol=1e-6)
     assert state.last_seen[row] == 0

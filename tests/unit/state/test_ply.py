@@ -45,7 +45,7 @@ def binary(order="<", count=2, **options):
 def test_every_byte_order_is_read(read, data):
     state = read(data)
     np.testing.assert_array_equal(state.points_m, [[0, 1, 2], [3, 4, 5]])
-    np.testing.assert_array_equal(state.colours, [[10, 20, 30], [40, 50, 60]])
+    np.testing.assert_array_equal(state.colors, [[10, 20, 30], [40, 50, 60]])
 
 
 @pytest.mark.parametrize("text", [True, False])
@@ -56,11 +56,11 @@ def test_open3d_writes_what_is_read_and_reads_what_is_written(tmp_path, text):
     o3d.t.io.write_point_cloud(str(tmp_path / "a.ply"), cloud, write_ascii=text)
     state = read_ply(tmp_path / "a.ply")
     np.testing.assert_allclose(state.points_m, cloud.point.positions.numpy(), rtol=1e-5)
-    np.testing.assert_array_equal(state.colours, cloud.point.colors.numpy())
+    np.testing.assert_array_equal(state.colors, cloud.point.colors.numpy())
     write_ply(tmp_path / "b.ply", state)
     again = o3d.t.io.read_point_cloud(str(tmp_path / "b.ply"))
     np.testing.assert_array_equal(again.point.positions.numpy(), state.points_m)
-    np.testing.assert_array_equal(again.point.colors.numpy(), state.colours)
+    np.testing.assert_array_equal(again.point.colors.numpy(), state.colors)
     assert "object_ids" in again.point
 
 
@@ -142,7 +142,7 @@ def test_faces_behind_the_points_are_passed_over(read):
 def test_floats_are_colors_from_0_to_1(read):
     data = TEXT.replace(b"uchar", b"float").replace(b"10 20 30", b"0 0.5 1")
     data = data.replace(b"40 50 60", b"1 1 0")
-    np.testing.assert_array_equal(read(data).colours, [[0, 128, 255], [255, 255, 0]])
+    np.testing.assert_array_equal(read(data).colors, [[0, 128, 255], [255, 255, 0]])
     with pytest.raises(InputError, match="from 0 to 1"):
         read(data.replace(b"0.5", b"1.5"))
 
@@ -163,7 +163,7 @@ def test_a_pipe_is_refused_without_waiting_for_it(tmp_path):
 def test_colors_of_a_state_survive(tmp_path):
     state = SceneState(
         points_m=np.ones((1, 3), np.float32),
-        colours=np.array([[1, 2, 3]], np.uint8),
+        colors=np.array([[1, 2, 3]], np.uint8),
         object_ids=np.array([7], np.int32),
         last_seen=np.array([9], np.int32),
         intrinsics_px=np.eye(3),

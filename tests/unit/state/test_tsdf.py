@@ -36,11 +36,11 @@ def plane(origin, directions):
         return np.where(directions[..., 2] < 0, (0.004 - origin[2]) / directions[..., 2], np.inf)
 
 
-CENTRE, RADIUS = np.array([0.02, 0.3, 0.06]), 0.11
+CENTER, RADIUS = np.array([0.02, 0.3, 0.06]), 0.11
 
 
 def sphere(origin, directions):
-    offset = origin - CENTRE
+    offset = origin - CENTER
     a, b = (directions**2).sum(axis=-1), directions @ offset
     inside = b**2 - a * (offset @ offset - RADIUS**2)
     return np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
@@ -63,7 +63,7 @@ def to_plane(points):
 
 
 def to_sphere(points):
-    return np.abs(np.linalg.norm(points - CENTRE, axis=1) - RADIUS)
+    return np.abs(np.linalg.norm(points - CENTER, axis=1) - RADIUS)
 
 
 def to_box(points):
@@ -79,8 +79,8 @@ def test_points_lie_within_half_a_voxel_of_the_true_surface(depth, distance):
     path = cameras()
     depths = np.stack([depth(*rays(path, k)) for k in range(9)]).astype(np.float32)
     depths = np.where(steady(depths), depths, 0)
-    colours = np.full((9, HEIGHT, WIDTH, 3), (10, 200, 77), np.uint8)
-    points, shades = surface(depths, colours, path, fusion=Fusion())
+    colors = np.full((9, HEIGHT, WIDTH, 3), (10, 200, 77), np.uint8)
+    points, shades = surface(depths, colors, path, fusion=Fusion())
     assert len(points) > 5000
     errors = distance(points.astype(np.float64))
     assert np.mean(errors <= Fusion().voxel_m / 2) >= 0.95, np.percentile(errors, [50, 90, 95])
@@ -90,8 +90,8 @@ def test_points_lie_within_half_a_voxel_of_the_true_surface(depth, distance):
 def test_the_whole_surface_that_is_seen_has_points():
     path = cameras()
     depths = np.stack([plane(*rays(path, k)) for k in range(9)]).astype(np.float32)
-    colours = np.zeros((9, HEIGHT, WIDTH, 3), np.uint8)
-    points, _ = surface(depths, colours, path, fusion=Fusion())
+    colors = np.zeros((9, HEIGHT, WIDTH, 3), np.uint8)
+    points, _ = surface(depths, colors, path, fusion=Fusion())
     grid = np.stack(np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(0.15, 0.4, 0.01)), axis=-1)
     gaps = np.linalg.norm(grid.reshape(-1, 1, 2) - points[None, :, :2], axis=-1).min(axis=1)
     assert gaps.max() <= 0.003

@@ -78,8 +78,8 @@ def test_a_ball_is_seen_where_its_pose_projects():
     intrinsics = np.array([[160.0, 0, 79.5], [0, 160.0, 47.5], [0, 0, 1]])
     picture = stage.look(camera, intrinsics, height=96, width=160)
     rows, columns = np.nonzero(picture.ids == FIRST_BODY)
-    centre = pose @ [0, 0, body.size_m[2] / 2, 1]
-    u, v = project(intrinsics, transform(invert(camera), centre[None, :3]))
+    center = pose @ [0, 0, body.size_m[2] / 2, 1]
+    u, v = project(intrinsics, transform(invert(camera), center[None, :3]))
     assert abs(columns.mean() - u[0]) < 0.5
     assert abs(rows.mean() - v[0]) < 0.5
 
@@ -142,7 +142,7 @@ def test_a_prior_shows_the_first_frame_where_it_is_observed():
     triplet = to_triplet(clip)
     seen = triplet.mask[0] == 0
     assert seen.mean() > 0.95
-    difference = triplet.prior[0][seen].astype(float) - clip.first.colours[seen]
+    difference = triplet.prior[0][seen].astype(float) - clip.first.colors[seen]
     assert np.abs(difference).mean() < 5  # of 255: the points of half a pixel round to whole ones
     assert not triplet.prior[-1][triplet.mask[-1] == 255].any()
 
