@@ -184,8 +184,8 @@ def test_a_record_with_nan_or_latents_of_another_length_is_skipped_and_named(tmp
     loader = make_loader(ShardReader(tmp_path), batch_size=2, seed=0, shuffle=False)
     assert numbers(loader, 1) == [[0, 3]]
     reasons = sorted(loader.skipped)
-    assert "record 1: truth has values that are not finite" in reasons[0]
-    assert "record 2: truth has (4, 2, 4) latent frames, rows and columns" in reasons[1]
+    assert "record 1: target has values that are not finite" in reasons[0]
+    assert "record 2: target has (4, 2, 4) latent frames, rows and columns" in reasons[1]
     assert "the manifest says (2, 2, 4)" in reasons[1]
 
 

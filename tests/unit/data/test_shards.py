@@ -307,6 +307,16 @@ def test_a_manifest_that_is_not_json_is_refused(folder):
         read_manifest(folder)
 
 
+def test_a_dataset_that_calls_the_target_truth_is_read(tmp_path):
+    arrays = {("truth" if name == "target" else name): a for name, a in latents(0).items()}
+    with ShardWriter(tmp_path / "old", kind="latents", spec=SPEC) as writer:
+        writer.add(arrays, {"video_id": "a", "prompt": ""})
+    reader = ShardReader(tmp_path / "old")
+    assert sorted(reader.manifest.arrays) == sorted(reader[0].arrays) == ["mask", "target", "text"]
+    np.testing.assert_array_equal(reader[0].arrays["target"], arrays["truth"])
+    assert problems(tmp_path / "old") == []
+
+
 def test_check_names_a_wrong_record_count(folder):
     rewrite_manifest(folder, lambda fields: fields["shards"][0].update(records=3))
     assert problems(folder) == [f"{first_shard(folder)}: 4 records, the manifest says 3"]
@@ -322,7 +332,7 @@ def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
     found = "\n".join(problems(folder))
     assert "text is float32 (5, 8), the manifest says float32 (5, 9)" in found
     assert "mask is uint8 (3, 4, 6, 4), the manifest says int32" in found
-    assert "truth is not in the manifest" in found
+    assert "target is not in the manifest" in found
     assert "hands is not in the record" in found
 
 
@@ -332,7 +342,7 @@ def test_check_names_numbers_that_are_not_finite(tmp_path):
     with ShardWriter(tmp_path, kind="latents") as writer:
         writer.add(arrays, {"video_id": "a"})
     assert problems(tmp_path) == [
-        f"{first_shard(tmp_path)}, record 0: truth holds numbers that are not finite"
+        f"{first_shard(tmp_path)}, record 0: target holds numbers that are not finite"
     ]
 
 

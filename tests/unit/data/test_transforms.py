@@ -51,7 +51,7 @@ def test_a_record_knows_its_length_encoded_and_decoded(files):
 
 
 def test_a_window_beyond_the_end_is_refused(files):
-    with pytest.raises(InputError, match="truth ends before frame 11"):
+    with pytest.raises(InputError, match="target ends before frame 11"):
         decode_record(encoded_record(files).arrays, SPEC, start=6)
 
 
