@@ -14,18 +14,19 @@ from typing import Annotated
 import tyro
 
 from egosim_jax import command
-from egosim_jax.cli.ablation import Tabletop
-from egosim_jax.cli.accuracy import Update
-from egosim_jax.cli.continuous import Continuous
 from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
 from egosim_jax.cli.doctor import Doctor
-from egosim_jax.cli.embodiment import Embodiment
 from egosim_jax.cli.evaluate import Evaluate
-from egosim_jax.cli.experiment import Debug, RealTiny
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.plan import Plan
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.view import View
+from egosim_jax.experiments.continuous import Continuous
+from egosim_jax.experiments.debug import Debug
+from egosim_jax.experiments.embodiment import Embodiment
+from egosim_jax.experiments.real_tiny import RealTiny
+from egosim_jax.experiments.tabletop import Tabletop
+from egosim_jax.experiments.update import Update
 
 
 @dataclass(frozen=True, kw_only=True)

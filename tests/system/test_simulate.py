@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egosim_jax.cli import accuracy, view
+from egosim_jax.cli import view
 from egosim_jax.cli.__main__ import main
 from egosim_jax.io.video import probe_video
 from egosim_jax.state.snapshot import load, read_ply
@@ -145,7 +145,7 @@ def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(
 def test_the_state_after_a_thing_was_carried_is_compared_with_the_truth(
     weights, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(accuracy, "LARGE", VideoSpec(frames=9, height=96, width=160))
+    monkeypatch.setattr(update, "LARGE", VideoSpec(frames=9, height=96, width=160))
     out = tmp_path / "out"
     fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
     assert main(["experiment", "update", *fixed, "--scenes", "1"]) == 0

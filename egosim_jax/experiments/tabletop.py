@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.cli.held_out import (
+from egosim_jax.command import DONE
+from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
     SHEET_MOMENTS,
@@ -19,9 +21,7 @@ from egosim_jax.cli.held_out import (
     judge,
     reconstruct,
 )
-from egosim_jax.cli.spread import mean_and_spread
-from egosim_jax.command import DONE
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.experiments.tables import mean_and_spread
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
-from egosim_jax.cli.spread import Line, print_table, summarize
 from egosim_jax.command import DONE
+from egosim_jax.experiments.tables import Line, print_table, summarize
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.progress import track
 from egosim_jax.types import check_counts

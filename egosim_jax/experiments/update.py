@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.cli.simulate import Backend, backend
-from egosim_jax.cli.spread import print_table, summarize
 from egosim_jax.command import DONE
+from egosim_jax.experiments.tables import print_table, summarize
 from egosim_jax.progress import track
 from egosim_jax.types import VideoSpec, check_counts
 

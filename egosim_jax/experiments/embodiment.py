@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from egosim_jax.cli.held_out import (
+from egosim_jax.command import DONE
+from egosim_jax.data.sheet import draw_sheet
+from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
     SHEET_MOMENTS,
@@ -19,9 +21,7 @@ from egosim_jax.cli.held_out import (
     judge,
     reconstruct,
 )
-from egosim_jax.cli.spread import Line, print_table, summarize
-from egosim_jax.command import DONE
-from egosim_jax.data.sheet import draw_sheet
+from egosim_jax.experiments.tables import Line, print_table, summarize
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.untrusted import read_lines
 from egosim_jax.progress import track

@@ -1,8 +1,7 @@
-"""`egosim experiment`: documented experiments, each by one command that resumes."""
+"""`egosim experiment real_tiny`: train a small model on recorded clips and compare its clips."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,38 +47,6 @@ class RealTiny:
             start=self.start,
             seed=self.seed,
             batch_size=self.batch_size,
-        ).run()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Debug:
-    """The same with `debug` on sample clips, in a few minutes: to see that everything runs."""
-
-    out: Path
-    """Folder of the run."""
-    steps: int = 20
-    """Updates of the autoencoder, and as many of the denoiser."""
-    seed: int = 0
-    """Seed of the generated clips."""
-
-    def run(self) -> int:
-        """Train, generate, compare, draw."""
-        from egosim_jax.train.recipes import Debug as Recipe
-
-        plan = Recipe(out=self.out)
-        recipe = dataclasses.replace(
-            plan,
-            vae=dataclasses.replace(plan.vae, steps=self.steps),
-            denoiser=dataclasses.replace(plan.denoiser, steps=self.steps),
-        )
-        recipe.run()
-        return Comparison(
-            config="debug",
-            metadata=recipe.metadata,
-            out=self.out,
-            start=(0,),
-            seed=self.seed,
-            batch_size=2,
         ).run()
 
 

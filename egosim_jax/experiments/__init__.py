@@ -1,0 +1,1 @@
+"""Documented experiments: one module per experiment, named as its `egosim experiment` command."""
