@@ -16,7 +16,7 @@ import tyro
 
 from egosim_jax import command
 from egosim_jax.train import recipes
-from egosim_jax.train.recipe import Recipe
+from egosim_jax.train.config import Recipe
 
 Recipes = (
     Annotated[recipes.Debug, tyro.conf.subcommand("debug")]

@@ -11,12 +11,12 @@ from egosim_jax.command import DONE
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.models.wan_layers import Remat
-from egosim_jax.train.recipe import Recipe
-from egosim_jax.train.settings import Stage, Training
+from egosim_jax.train.config import Recipe, Training
+from egosim_jax.train.update import Stage
 
 if TYPE_CHECKING:
     from egosim_jax.generator import ModelConfig
-    from egosim_jax.train.denoiser import Denoiser
+    from egosim_jax.train.tasks.denoising import Denoiser
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class FineTuning(Recipe):
     def stages(self) -> Mapping[str, Stage]:
         """The denoiser's only."""
         from egosim_jax.diffusion.objective import Objective
-        from egosim_jax.train.denoiser import Denoising
+        from egosim_jax.train.tasks.denoising import Denoising
 
         model = self._model()
         task = Denoising(
@@ -70,9 +70,9 @@ class FineTuning(Recipe):
 
     def train(self) -> int:
         """Check the latents, train, write the weights."""
-        from egosim_jax.train.cache import check_encoders
-        from egosim_jax.train.samples import Samples
-        from egosim_jax.train.script import train
+        from egosim_jax.train.encode import check_encoders
+        from egosim_jax.train.loop import train
+        from egosim_jax.train.monitor import Samples
 
         model = self._model()
         for shards in (self.latents, self.validation):

@@ -19,11 +19,12 @@ from egosim_jax.diffusion.objective import Objective
 from egosim_jax.generator import ModelConfig, Networks
 from egosim_jax.io import weights
 from egosim_jax.models.wan_vae import WanVAE, standardise_latents
-from egosim_jax.train.autoencoder import Autoencoding, latent_statistics
-from egosim_jax.train.cache import cache
-from egosim_jax.train.denoiser import Denoising
-from egosim_jax.train.script import train
-from egosim_jax.train.settings import Stage, Training
+from egosim_jax.train.config import Training
+from egosim_jax.train.encode import cache
+from egosim_jax.train.loop import train
+from egosim_jax.train.tasks.autoencoding import Autoencoding, latent_statistics
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.update import Stage
 
 BATCH = 8
 """Clips that are encoded together."""

@@ -23,9 +23,8 @@ from egosim_jax.preflight.report import Report, TooLarge, compile_for, plain, si
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.progress import track
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
-from egosim_jax.train.denoiser import Denoising
-from egosim_jax.train.programs import Programs
-from egosim_jax.train.settings import Stage
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.update import Programs, Stage
 from egosim_jax.types import MeshConfig
 
 KEEPING: tuple[Remat, ...] = ("offload", "full", "attention", "projections", "products", "none")

@@ -126,7 +126,7 @@ class Encode:
         from egosim_jax import configs
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.sharding import make_mesh
-        from egosim_jax.train.cache import cache
+        from egosim_jax.train.encode import cache
 
         mesh = make_mesh(MeshConfig(data=-1, fsdp=1), jax.local_devices())
         cache(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from egosim_jax.generator import Generator, ModelConfig
-    from egosim_jax.train.settings import Training
+    from egosim_jax.train.config import Training
     from egosim_jax.types import Kind
 
 Videos = Mapping[str, Sequence["np.ndarray"]]
@@ -76,8 +76,7 @@ class Stage:
 
     def training(self) -> Training:
         """The same for the training script, with eight validations and checkpoints."""
-        from egosim_jax.train.optimizer import OptimizerConfig
-        from egosim_jax.train.settings import Training
+        from egosim_jax.train.config import OptimizerConfig, Training
 
         every = max(1, self.steps // 8)
         return Training(
@@ -209,7 +208,7 @@ class Embodiment:
     def _encode(self, split: str, seeds: range, kind: Kind) -> Path:
         """Make the clips of a split, and cache their latents."""
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.train.cache import cache
+        from egosim_jax.train.encode import cache
         from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
 
         model = self._model
@@ -241,9 +240,9 @@ class Embodiment:
         """Train one model, from a weights folder or from random weights, unless that was done."""
         from egosim_jax.conditioning.dropout import ConditionDropout
         from egosim_jax.diffusion.objective import Objective
-        from egosim_jax.train.denoiser import Denoising
         from egosim_jax.train.fine_tuning import write_trained
-        from egosim_jax.train.script import train
+        from egosim_jax.train.loop import train
+        from egosim_jax.train.tasks.denoising import Denoising
 
         out, model, share = self.out / name, self._model, self.hidden
         done = out / ("weights" if rank is None else "lora.safetensors")

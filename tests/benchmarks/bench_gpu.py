@@ -41,8 +41,7 @@ from egosim_jax.preflight.targets import GIB, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train import recipes
 from egosim_jax.train.flops import count_forward
-from egosim_jax.train.programs import Programs
-from egosim_jax.train.settings import Stage
+from egosim_jax.train.update import Programs, Stage
 from egosim_jax.types import MeshConfig
 
 BFLOAT16 = 4e-3

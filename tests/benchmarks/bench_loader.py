@@ -177,10 +177,9 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
     from flax import nnx
 
     from egosim_jax.diffusion.objective import Objective
-    from egosim_jax.train.denoiser import Denoising
-    from egosim_jax.train.optimizer import OptimizerConfig
-    from egosim_jax.train.state import TrainState
-    from egosim_jax.train.step import make_update
+    from egosim_jax.train.config import OptimizerConfig
+    from egosim_jax.train.tasks.denoising import Denoising
+    from egosim_jax.train.update import TrainState, make_update
 
     task = Denoising(model=config, objective=Objective(schedule=config.schedule))
     graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)

@@ -118,10 +118,9 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
     from egosim_jax.diffusion.objective import Objective
     from egosim_jax.io.weights import fill
-    from egosim_jax.train.denoiser import Denoiser, Denoising
-    from egosim_jax.train.optimizer import OptimizerConfig
-    from egosim_jax.train.state import TrainState
-    from egosim_jax.train.step import make_update
+    from egosim_jax.train.config import OptimizerConfig
+    from egosim_jax.train.tasks.denoising import Denoiser, Denoising
+    from egosim_jax.train.update import TrainState, make_update
 
     class GivenNoise(Denoising):
         """The task, but for noise and noise levels, which are the batch's."""

@@ -26,8 +26,8 @@ from egosim_jax.preflight.report import Report, plain
 from egosim_jax.preflight.targets import find
 from egosim_jax.sharding import make_mesh, parts
 from egosim_jax.train import recipes
+from egosim_jax.train.config import Recipe
 from egosim_jax.train.preflight import compile_step
-from egosim_jax.train.recipe import Recipe
 from egosim_jax.types import MeshConfig
 
 BEGIN, END = "<!-- python -m tests.benchmarks.fits --write -->", "<!-- end -->"

@@ -44,7 +44,7 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import read_lines
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.state import snapshot
-from egosim_jax.train import cache
+from egosim_jax.train import encode
 from egosim_jax.types import SceneState, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import dataset
 
@@ -245,9 +245,9 @@ def _encode(place: Path, inputs: Path, version: int) -> None:
         def __call__(self, triplets: list[Triplet]) -> list[dict[str, np.ndarray]]:
             return [{"target": triplet.target[:, 0, 0].copy()} for triplet in triplets]
 
-    cache.Encoding = Encoding
-    cache.Encoders.load = lambda *_, **__: None
-    cache.cache(
+    encode.Encoding = Encoding
+    encode.Encoders.load = lambda *_, **__: None
+    encode.cache(
         configs.get("debug"), inputs / "weights", source=ShardReader(inputs / "frames0"),
         out=place / "shards", stride=1, batch_size=1, shard_windows=1,
     )  # fmt: skip

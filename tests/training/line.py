@@ -19,10 +19,9 @@ from egosim_jax.command import DONE, guarded
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
 from egosim_jax.sharding import MeshConfig
+from egosim_jax.train.config import OptimizerConfig, Training
 from egosim_jax.train.distributed import joined
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import train
-from egosim_jax.train.settings import Training
+from egosim_jax.train.loop import train
 
 WIDTH, POINTS = 8, 40
 

@@ -15,8 +15,8 @@ import numpy as np
 from egosim_jax.preflight.targets import find
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train.preflight import compile_step
-from egosim_jax.train.programs import Programs
 from egosim_jax.train.recipes import Tabletop
+from egosim_jax.train.update import Programs
 
 
 def resident(name: str) -> int:

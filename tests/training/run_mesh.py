@@ -12,10 +12,9 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import initialize
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
-from egosim_jax.train.denoiser import Denoising
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.state import TrainState
-from egosim_jax.train.step import make_update
+from egosim_jax.train.config import OptimizerConfig
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.update import TrainState, make_update
 from egosim_jax.types import VideoSpec
 
 STEPS, BATCH = 20, 8

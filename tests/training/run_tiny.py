@@ -12,11 +12,10 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io import weights
 from egosim_jax.models.wan_dit import WanDiTConfig
-from egosim_jax.train.denoiser import Denoising
+from egosim_jax.train.config import OptimizerConfig, Training
 from egosim_jax.train.distributed import joined
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import train
-from egosim_jax.train.settings import Training
+from egosim_jax.train.loop import train
+from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import VideoSpec
 
 DEBUG = configs.get("debug")

@@ -11,9 +11,9 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
 from egosim_jax.preflight.targets import peak
-from egosim_jax.train.clock import Clock
-from egosim_jax.train.denoiser import Denoising
 from egosim_jax.train.flops import count_forward
+from egosim_jax.train.monitor import Clock
+from egosim_jax.train.tasks.denoising import Denoising
 
 
 def test_a_forward_of_the_14b_takes_1126_tflop():

@@ -87,7 +87,7 @@ def test_a_run_that_hangs_prints_its_stacks_and_ends_with_70(points, tmp_path):
     said = process.communicate(timeout=300)[1]
     assert process.returncode == HUNG, said
     assert "no step was finished" in said
-    assert "train/script.py" in said
+    assert "train/loop.py" in said
 
 
 def test_a_run_goes_on_with_other_numbers_of_devices(points, tmp_path):

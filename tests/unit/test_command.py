@@ -15,7 +15,7 @@ from egosim_jax import command
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as convert
 from egosim_jax.train.__main__ import main as train
-from egosim_jax.train.settings import Training
+from egosim_jax.train.config import Training
 from egosim_jax.types import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -71,7 +71,7 @@ def test_seeds_out_of_range_are_refused(seed, tmp_path, capsys):
 
 @pytest.mark.parametrize("extra", ["tensorboard", "wandb"])
 def test_a_missing_extra_is_found_before_anything_starts(extra, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("egosim_jax.logging.find_spec", lambda name: None)
+    monkeypatch.setattr("egosim_jax.metric_writers.find_spec", lambda name: None)
     monkeypatch.delitem(sys.modules, "tensorboardX", raising=False)
     option = [f"--denoiser.{extra}", *(["clips"] if extra == "wandb" else [])]
     assert train(["debug", "--out", str(tmp_path / "run"), *option]) == command.USAGE

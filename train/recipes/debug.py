@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from egosim_jax.train.config import OptimizerConfig, Recipe, Training
 from egosim_jax.train.distributed import check_alone
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.recipes.real_tiny import RealTiny
-from egosim_jax.train.settings import Stage, Training
+from egosim_jax.train.update import Stage
 
 CLIP_FRAMES, STRIDE = 25, 8
 """Of a clip, three windows of 9 frames to train on and two to test on."""

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from egosim_jax.train.config import OptimizerConfig, Training
 from egosim_jax.train.fine_tuning import FineTuning
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.settings import Training
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.command import DONE
+from egosim_jax.train.config import OptimizerConfig, Recipe, Training, may_differ
 from egosim_jax.train.distributed import check_alone
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.recipe import Recipe
-from egosim_jax.train.settings import Stage, Training, may_differ
+from egosim_jax.train.update import Stage
 
 if TYPE_CHECKING:
     from egosim_jax.train.from_scratch import FromScratch

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from egosim_jax.train.denoiser import Denoising, changed_places
+from egosim_jax.train.tasks.denoising import Denoising, changed_places
 from tests.training.run_tiny import MODEL
 
 

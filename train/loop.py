@@ -31,21 +31,16 @@ from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
-from egosim_jax.logging import Console, JsonLines, TensorBoard, WandB, Writers
+from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writers
 from egosim_jax.models.layers import initialize
 from egosim_jax.sharding import (
     batch_sharding,
     make_mesh,
     parts,
 )
-from egosim_jax.train.clock import Clock
-from egosim_jax.train.optimizer import learning_rate
-from egosim_jax.train.programs import Programs
-from egosim_jax.train.samples import Samples
-from egosim_jax.train.settings import HOW_COMPUTED, Training, may_differ
-from egosim_jax.train.state import TrainState
-from egosim_jax.train.step import Task
-from egosim_jax.train.watchdog import Watchdog
+from egosim_jax.train.config import HOW_COMPUTED, Training, learning_rate, may_differ
+from egosim_jax.train.monitor import Clock, Samples, Watchdog
+from egosim_jax.train.update import Programs, Task, TrainState
 from egosim_jax.types import InputError
 
 MOST_LEFT_OUT = 3

@@ -12,8 +12,8 @@ from flax import nnx
 
 from egosim_jax.command import FAILED, Stop
 from egosim_jax.sharding import MeshConfig
-from egosim_jax.train.optimizer import OptimizerConfig
-from egosim_jax.train.script import train
+from egosim_jax.train.config import OptimizerConfig
+from egosim_jax.train.loop import train
 from egosim_jax.types import InputError
 from tests.training.killing import logged
 from tests.training.line import POINTS, Line, training, write_points

@@ -23,8 +23,8 @@ from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, read_mani
 from egosim_jax.generator import Networks
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
-from egosim_jax.train import cache as caching
-from egosim_jax.train.cache import cache, check_encoders
+from egosim_jax.train import encode as caching
+from egosim_jax.train.encode import cache, check_encoders
 from egosim_jax.types import InputError, VideoSpec
 
 pytestmark = pytest.mark.slow

@@ -25,9 +25,9 @@ from egosim_jax.models.clip_vision import CLIPVision
 from egosim_jax.models.layers import LowRankParam
 from egosim_jax.models.umt5 import UMT5
 from egosim_jax.models.wan_dit import WanDiT
-from egosim_jax.train.cache import example_shapes
+from egosim_jax.train.encode import example_shapes
 from egosim_jax.train.flops import count_forward
-from egosim_jax.train.step import Batch, Metrics
+from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import Condition
 
 VALIDATION_TIMES = (0.2, 0.5, 0.8, 0.97)

@@ -1,0 +1,1 @@
+"""Training tasks: each says what is trained, on which examples and by which loss."""
