@@ -65,6 +65,7 @@ class Simulate:
         from egosim_jax.io.digest import sha256
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
+        from egosim_jax.rollout import Rollout
         from egosim_jax.simulator import Simulator
         from egosim_jax.worlds.tabletop import make_sequence, to_action
 
@@ -87,10 +88,9 @@ class Simulate:
             perception=None if self.update == "none" else backend(self.perception, truth),
             fps=config.video.fps,
         )
-        steps = simulator.run(
+        steps = Rollout(simulator, folder).run(
             truth[0].state,
             [to_action(clip) for clip in truth],
-            out=folder,
             seed=self.seed,
             first_frame=self._image(truth[0]),
         )

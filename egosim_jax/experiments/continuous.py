@@ -82,6 +82,7 @@ class Continuous:
         """The scores of one sequence, which are kept beside it."""
         from egosim_jax.io.run import write_json
         from egosim_jax.io.untrusted import read_json
+        from egosim_jax.rollout import Rollout
         from egosim_jax.simulator import Simulator
         from egosim_jax.worlds.tabletop import make_sequence, to_action
 
@@ -97,8 +98,8 @@ class Continuous:
             fps=generator.config.video.fps,
         )
         actions = [to_action(clip) for clip in truth]
-        steps = simulator.run(
-            truth[0].state, actions, out=folder, seed=seed, first_frame=truth[0].first.colors
+        steps = Rollout(simulator, folder).run(
+            truth[0].state, actions, seed=seed, first_frame=truth[0].first.colors
         )
         scores = [score(step, clip) for step, clip in zip(steps, truth, strict=True)]
         write_json(path, scores)

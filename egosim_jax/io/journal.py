@@ -1,12 +1,12 @@
-"""The phases of a run that are done, one line each: what was written and its hash.
+"""The journal of a run: one line per finished phase, with the file it wrote and its hash.
 
     {"phase": "run", "made_of": {"state": "3f...", "seed": "0", ...}, "chain": "..."}
     {"phase": "1 action", "made_of": {"action": "9a..."}, "chain": "..."}
     {"phase": "1 generate", "file": "clip_1/frames.npz", "sha256": "...", "seconds": 2.1, ...}
 
-A line is appended when its file is complete and on disk, so a run that is killed resumes at the
-phase that was under way. `made_of` records the values a run is made of: another run is refused.
-`chain` is the hash of the line before and of this line: a changed, lost or reordered line is found.
+A line is appended when its file is complete and on disk, so a killed run resumes at the phase that
+was interrupted. `made_of` records the hashes of a run's inputs: another run is refused. `chain` is
+the hash of the previous line and this one: a changed, missing or reordered line is detected.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ MAX_BYTES = 64 << 20
 
 
 class Journal:
-    """The journal of a run's folder.
+    """Journal of the finished phases of a run, in the run's folder.
 
-    Raises `InputError` if it is damaged, of an earlier version, or missing although one of
-    `outputs`, globs of what only a journaled run writes, is there.
+    Raises `InputError` if it is damaged, of an earlier version, or missing although a file matches
+    one of `outputs`, globs of files that only a journaled run writes.
     """
 
     def __init__(self, folder: Path, *, outputs: tuple[str, ...] = ()):
@@ -45,26 +45,26 @@ class Journal:
                 self._read(number, entry)
         elif left := [path.name for glob in outputs for path in folder.glob(glob)]:
             raise InputError(
-                f"{self._path} is missing, although {sorted(left)[0]} is there: without it the run "
+                f"{self._path} is missing, although {sorted(left)[0]} exists: without it the run "
                 f"cannot be resumed. Restore it, or remove {folder} to start over."
             )
 
     def _read(self, number: int, entry: Any) -> None:
-        way_out = f"Restore it, or remove {self._folder} to start over."
+        fix = f"Restore it, or remove {self._folder} to start over."
         if isinstance(entry, dict) and "phase" in entry and "chain" not in entry:
             raise InputError(
-                f"{self._path} is of an earlier version, which did not record what its run was "
-                f"made of: it cannot be resumed. Choose another folder, or remove {self._folder}."
+                f"{self._path} is of an earlier version, which did not record the inputs of its "
+                f"run: it cannot be resumed. Choose another folder, or remove {self._folder}."
             )
         chain = entry.pop("chain", None) if isinstance(entry, dict) else None
         if chain is None or chain != _chained(self._chain, entry):
-            raise InputError(f"{self._path}, line {number} was changed or is lost. {way_out}")
+            raise InputError(f"{self._path}, line {number} was changed or is missing. {fix}")
         self._chain, self.done[entry["phase"]] = chain, entry
 
     def require(self, phase: str, made_of: Mapping[str, str]) -> None:
-        """Record the values that a run, or one of its phases, is made of.
+        """Record the inputs of a run, or of one of its phases, as hashes or short values.
 
-        Raises `InputError` showing both values where a value differs from the recorded one.
+        Raises `InputError` showing both values where an input differs from the recorded one.
         """
         if phase not in self.done:
             self._append({"phase": phase, "made_of": dict(made_of)})
@@ -78,7 +78,7 @@ class Journal:
         if differing:
             raise InputError(
                 f"{self._folder} holds another run (phase {phase} in {NAME}). Choose another "
-                f"folder, or give it what it was made of: {listing(differing)}."
+                f"folder, or pass the recorded inputs: {listing(differing)}."
             )
 
     def phase(
@@ -90,16 +90,16 @@ class Journal:
         save: Callable[[Path, T], None],
         load: Callable[[Path], T],
     ) -> T:
-        """Return the phase's result: read if it is done, else made, written and recorded.
+        """Run a phase, or load its recorded result.
 
-        What is made is read back from what was written, so that a run that was interrupted and one
-        that was not continue from the same. Raises `InputError` if a file of a finished phase is
-        missing or changed.
+        A new result is saved, recorded and loaded back, so that an interrupted and an
+        uninterrupted run continue from the same bytes. Raises `InputError` if the file of a
+        finished phase is missing or changed.
         """
         if name in self.done:
             if not output.exists() or digest(output) != self.done[name].get("sha256"):
                 raise InputError(
-                    f"{output} is not what the run wrote in phase {name}: it is missing or was "
+                    f"{output} is not the file that phase {name} wrote: it is missing or was "
                     f"changed. Restore it, or remove {self._folder} to start over."
                 )
             return load(output)

@@ -1,280 +1,48 @@
-"""The loop around a generator of thirty lines, in a world whose truth is known."""
+"""One pure step of the loop."""
 
-import os
-import signal
-import subprocess
-import sys
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
-from egosim_jax.io.journal import Journal
-from egosim_jax.perception.oracle import oracle
-from egosim_jax.rendering.reference import draw_hands
 from egosim_jax.simulator import Simulator
-from egosim_jax.state.snapshot import fingerprint
-from egosim_jax.state.tsdf import Fusion
-from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_action, to_truth
+from egosim_jax.types import Clip, VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_action
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
 
 
-def paint_the_hands(view, action, first_frame, seed):
-    """The prior copied, the skeletons painted over it, and a little noise."""
-    hands, depth = draw_hands(action.joints_m, action.cameras, kind=action.kind)
-    frames = np.where((depth < view.depth_m)[..., None], hands, view.frames).astype(float)
-    frames[0] = np.where(np.isfinite(depth[0])[..., None], hands[0], first_frame)
-    noise = np.random.default_rng(seed).normal(0, 2, frames.shape)
-    return np.clip(np.rint(frames + noise), 0, 255).astype(np.uint8)
+def copy_the_view(view, action, first_frame, seed):
+    return view.frames
 
 
-@cache
-def clips():
-    return tuple(make_sequence(3, spec=SPEC, clips=2))
+@pytest.fixture(scope="module")
+def clip():
+    return next(make_sequence(3, spec=SPEC))
 
 
-@dataclass
-class Told:
-    """The oracle of each clip in turn."""
+def test_step_does_not_change_the_state_it_is_given(clip):
+    from egosim_jax.perception.oracle import oracle
+    from egosim_jax.worlds.tabletop import to_truth
 
-    truths: list = field(default_factory=lambda: [to_truth(clip) for clip in clips()])
-
-    def __call__(self, clip, action, state):
-        return oracle(self.truths[state.step])(clip, action, state)
-
-
-def simulator(**changes):
-    parts = {
-        "generator": paint_the_hands,
-        "perception": Told(),
-        "fps": SPEC.fps,
-        "fusion": Fusion(voxel_m=0.006),
-    }
-    return Simulator(**{**parts, **changes})
+    before = {f.name: np.array(getattr(clip.state, f.name)) for f in fields(clip.state)}
+    simulator = Simulator(generator=copy_the_view, perception=oracle(to_truth(clip)), fps=8)
+    step = simulator.step(clip.state, to_action(clip), seed=0)
+    assert step.state.step == clip.state.step + 1
+    for name, value in before.items():
+        np.testing.assert_array_equal(value, np.array(getattr(clip.state, name)))
 
 
-def run(out, **changes):
-    actions = [to_action(clip) for clip in clips()]
-    return list(simulator(**changes).run(clips()[0].state, actions, out=out, seed=0))
-
-
-def test_each_clip_starts_from_the_state_that_the_last_one_left(tmp_path):
-    first, second = run(tmp_path)
-    assert (first.state.step, second.state.step) == (1, 2)
-    expected = simulator().step(first.state, to_action(clips()[1]), seed=2)
-    np.testing.assert_array_equal(second.view.frames, expected.view.frames)
-    np.testing.assert_array_equal(second.clip.frames, expected.clip.frames)
-    assert fingerprint(second.state) == fingerprint(expected.state)
-    target = clips()[0].body_ids[clips()[0].target]
-    moved = clips()[0].world_from_body[clips()[0].target]
-    np.testing.assert_allclose(
-        first.state.world_from_object[target], moved[-1] @ np.linalg.inv(moved[0]), atol=1e-12
-    )
-
-
-def test_a_state_that_no_camera_looks_at_is_refused(tmp_path):
-    state = clips()[0].state
-    behind = replace(state, points_m=state.points_m + np.float32([0, -50, 0]))
-    with pytest.raises(InputError, match=r"None of the .* points of the scene is seen"):
-        list(simulator().run(behind, [to_action(clips()[0])], out=tmp_path, seed=0))
-    assert not any(tmp_path.rglob("*.npz"))
-
-
-def test_without_perception_the_state_stays(tmp_path):
-    for step in run(tmp_path, perception=None):
-        assert fingerprint(step.state) == fingerprint(clips()[0].state)
-
-
-def test_a_replay_gives_the_same_states(tmp_path):
-    states = [[fingerprint(s.state) for s in run(tmp_path / name)] for name in "ab"]
-    assert states[0] == states[1]
-
-
-@pytest.mark.parametrize("phase", range(9))
-def test_a_run_killed_after_any_phase_ends_the_same(tmp_path, phase):
-    """A child dies by SIGKILL when the journal has so many lines; the run goes on from there."""
-    code = (
-        "import os, signal, sys; sys.path.insert(0, sys.argv[1])\n"
-        "import test_simulator as t; from pathlib import Path\n"
-        "from egosim_jax.io.journal import Journal\n"
-        "append = Journal._append\n"
-        "def die(self, *args):\n"
-        "    if len(self.done) == int(sys.argv[3]): os.kill(os.getpid(), signal.SIGKILL)\n"
-        "    append(self, *args)\n"
-        "Journal._append = die\n"
-        "t.run(Path(sys.argv[2]))\n"
-    )
-    here = os.path.dirname(__file__)
-    command = [sys.executable, "-c", code, here, str(tmp_path / "killed"), str(phase)]
-    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
-    lines = (tmp_path / "killed" / "journal.jsonl").exists()
-    assert lines == (phase > 0)
-    resumed, straight = run(tmp_path / "killed"), run(tmp_path / "straight")
-    for a, b in zip(resumed, straight, strict=True):
-        np.testing.assert_array_equal(a.clip.frames, b.clip.frames)
-        assert fingerprint(a.state) == fingerprint(b.state)
-
-
-@dataclass
-class Named:
-    """A part of the loop that says itself what it is made of, and may be broken."""
-
-    part: object
-    broken: bool = False
-
-    def fingerprint(self):
-        return "v1"
-
-    def __call__(self, *args):
-        assert not self.broken, "made again"
-        return self.part(*args)
-
-
-def test_finished_phases_are_not_made_again(tmp_path):
-    for broken in (False, True):
-        parts = {"generator": Named(paint_the_hands, broken), "perception": Named(Told(), broken)}
-        assert len(run(tmp_path, **parts)) == 2
-
-
-def noisier(view, action, first_frame, seed):
-    return 255 - paint_the_hands(view, action, first_frame, seed)
-
-
-def with_action(**changes):
-    first, *rest = [to_action(clip) for clip in clips()]
-    return [replace(first, **changes), *rest]
-
-
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"state": clips()[1].state}, "state"),
-        ({"seed": 1}, "seed"),
-        ({"first_frame": np.zeros((48, 80, 3), np.uint8)}, "first_frame"),
-        ({"actions": with_action(prompt="another caption")}, "action"),
-        ({"actions": with_action(joints_m=to_action(clips()[0]).joints_m + 1e-6)}, "action"),
-        ({"generator": noisier}, "generator"),
-        ({"perception": Told(list(reversed(Told().truths)))}, "perception"),
-        ({"perception": None}, "perception"),
-        ({"fusion": Fusion(voxel_m=0.007)}, "fusion"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_another_run_in_the_same_folder_is_refused_with_both_values(tmp_path, changes, field):
-    list(run_with(tmp_path))
-    with pytest.raises(InputError, match=rf"{field}: recorded '.*', given '.*'"):
-        list(run_with(tmp_path, **changes))
-
-
-def run_with(out, *, state=None, actions=None, seed=0, first_frame=None, **parts):
-    return simulator(**parts).run(
-        state or clips()[0].state,
-        actions or with_action(),
-        out=str(out),
-        seed=seed,
-        first_frame=first_frame,
-    )
-
-
-def test_a_missing_journal_is_named_with_the_way_out(tmp_path):
-    run(tmp_path)
-    (tmp_path / "journal.jsonl").unlink()
-    with pytest.raises(InputError, match=r"journal\.jsonl is missing, although .* to start over"):
-        run(tmp_path)
-
-
-def test_a_journal_of_the_first_release_is_refused_with_the_way_out(tmp_path):
-    line = '{"phase": "1 generate", "file": "clip_1/frames.npz", "sha256": "0", "seconds": 1}\n'
-    (tmp_path / "journal.jsonl").write_text(line)
-    with pytest.raises(InputError, match=r"of an earlier version.* Choose another folder"):
-        run(tmp_path)
-
-
-def test_any_changed_byte_of_the_journal_is_noticed(tmp_path):
-    run(tmp_path)
-    path = tmp_path / "journal.jsonl"
-    data = path.read_bytes()
-    for place in range(0, len(data) - 1, 37):
-        changed = bytearray(data)
-        changed[place] ^= 4
-        path.write_bytes(bytes(changed))
-        with pytest.raises(InputError, match="journal"):
-            Journal(tmp_path)
-    lines = data.splitlines(keepends=True)
-    path.write_bytes(b"".join([lines[0], *lines[2:]]))
-    with pytest.raises(InputError, match="line 2 was changed or is lost"):
-        Journal(tmp_path)
-
-
-def test_a_folder_in_use_by_another_process_is_refused(tmp_path):
-    code = (
-        "import pathlib, sys, time; from egosim_jax.io.atomic import hold_folder\n"
-        "hold_folder(pathlib.Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
-        assert other.stdout.readline() == b"held\n"
-        with pytest.raises(InputError, match=f"in use by another process .PID {other.pid}"):
-            run(tmp_path)
-        other.kill()
-
-
-@pytest.mark.parametrize("seed", [-1, 2**63])
-def test_a_seed_that_is_none_is_refused(tmp_path, seed):
-    with pytest.raises(InputError, match="seed must be a whole number"):
-        list(run_with(tmp_path, seed=seed))
-
-
-def test_a_torn_line_of_the_journal_is_forgotten(tmp_path):
-    straight = run(tmp_path / "straight")
-    run(tmp_path / "torn")
-    path = tmp_path / "torn" / "journal.jsonl"
-    path.write_bytes(path.read_bytes()[:-20])
-    assert fingerprint(run(tmp_path / "torn")[1].state) == fingerprint(straight[1].state)
-
-
-def test_a_changed_file_of_a_finished_phase_is_named(tmp_path):
-    run(tmp_path)
-    path = tmp_path / "clip_1" / "frames.npz"
-    data = bytearray(path.read_bytes())
-    data[-100] ^= 1
-    path.write_bytes(bytes(data))
-    with pytest.raises(InputError, match=r"frames\.npz is not what the run wrote in phase 1 gener"):
-        run(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "bad", [lambda *a: np.zeros((4, 48, 80, 3), np.uint8), lambda *a: np.zeros((5, 48, 80, 3))]
-)
-def test_a_generator_that_gives_other_frames_is_refused(tmp_path, bad):
-    with pytest.raises(InputError, match="must give as many frames of the same size"):
-        run(tmp_path, generator=bad)
-
-
-def test_the_first_frame_may_be_given(tmp_path):
-    image = np.full((48, 80, 3), 9, np.uint8)
+def test_without_a_first_frame_the_generator_gets_that_of_the_view(clip):
     seen = []
 
     def generator(view, action, first_frame, seed):
-        seen.append(first_frame)
+        seen.append((first_frame.copy(), seed))
         return view.frames
 
-    actions = [to_action(clip) for clip in clips()]
-    loop = simulator(generator=generator)
-    steps = list(loop.run(clips()[0].state, actions, out=tmp_path, seed=0, first_frame=image))
-    np.testing.assert_array_equal(seen[0], image)
-    np.testing.assert_array_equal(seen[1], steps[1].view.frames[0])
-
-
-def test_the_loop_needs_no_jax(tmp_path):
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "import test_simulator as t; from pathlib import Path\n"
-        "t.run(Path(sys.argv[2]))\n"
-        "assert 'jax' not in sys.modules, 'jax was imported'\n"
-    )
-    command = [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path)]
-    subprocess.run(command, check=True)
+    simulator = Simulator(generator=generator, perception=None, fps=8)
+    step = simulator.step(clip.state, to_action(clip), seed=5)
+    assert isinstance(step.clip, Clip)
+    assert step.state is clip.state
+    np.testing.assert_array_equal(seen[0][0], step.view.frames[0])
+    assert seen[0][1] == 5
