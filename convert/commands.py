@@ -123,7 +123,7 @@ class Weights:
             for found, weights in planned:
                 target = self.out / f"{found.network}.safetensors"
                 about = {"format": OURS, "config": self.config, "source": found.source.name}
-                _write(target, weights, origin=found.source.files, about=about)
+                _write(target, weights, origin=found.source.files, metadata=about)
             if kept:
                 with atomic_folder(self.out / config.tokenizer.kind) as temporary:
                     for name, data in kept.items():
@@ -252,13 +252,13 @@ class Lora:
                 for name, tensor in exported(changes, config).items()
             ]
             with lock_folder(self.out.parent):
-                _write(self.out, weights, origin=origin, about=said)
+                _write(self.out, weights, origin=origin, metadata=said)
             return command.DONE
         file = self.merge / "dit.safetensors"
         weights = merged(read_safetensors(file), changes, config, scale=self.scale)
         about = {"format": OURS, "config": self.config, "lora": quote_path(self.source.name)}
         with lock_folder(self.out):
-            _write(self.out / file.name, weights, origin=[file, *origin], about=about)
+            _write(self.out / file.name, weights, origin=[file, *origin], metadata=about)
             link_others(self.out, self.merge)
         return command.DONE
 
@@ -382,10 +382,10 @@ def _same(weight: Weight, tensor: Tensor) -> bool:
 
 
 def _write(
-    target: Path, weights: Sequence[Weight], *, origin: Sequence[Path], about: Mapping[str, str]
+    target: Path, weights: Sequence[Weight], *, origin: Sequence[Path], metadata: Mapping[str, str]
 ) -> None:
     total = sum(weight.bytes for weight in weights)
-    pieces = write(target, weights, origin=origin, about=about)
+    pieces = write(target, weights, origin=origin, metadata=metadata)
     for _ in track_bytes(pieces, f"writing {target.name}", total=total):
         pass
     print(quote_path(target))
@@ -402,7 +402,7 @@ def _write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Pa
     for number, shard in enumerate(shards, start=1):
         end = f"-{number:05d}-of-{len(shards):05d}" if len(shards) > 1 else ""
         target = stem.with_name(f"{stem.name}{end}.safetensors")
-        _write(target, shard, origin=origin, about={"format": "pt"})
+        _write(target, shard, origin=origin, metadata={"format": "pt"})
         places |= {weight.name: target.name for weight in shard}
     if len(shards) > 1:
         total = sum(weight.bytes for weight in weights)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from einops import EinopsError
 
-from egosim_jax.convert.rules import Rule, outline
+from egosim_jax.convert.rules import Rule, shape_only
 from egosim_jax.convert.skeleton import shapes
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import wan_dit
@@ -228,7 +228,7 @@ def _translated(
     for place, tensor in whole.items():
         shape = want[place.target][place.layer is not None :]
         try:
-            have = place.rule.ours(outline(tensor)).shape
+            have = place.rule.to_jax(shape_only(tensor)).shape
         except (EinopsError, ValueError):
             have = tensor.shape
         if have != shape:
@@ -244,7 +244,7 @@ def _translated(
         values = np.zeros(want[target], np.float32)
         for place in (place for place in whole if place.target == target):
             layer = ... if place.layer is None else place.layer
-            values[layer] = place.rule.ours(whole[place].array())
+            values[layer] = place.rule.to_jax(whole[place].array())
         changes[target] = values
     return changes
 
@@ -310,7 +310,7 @@ def exported(changes: Mapping[str, Change], config: WanDiTConfig) -> dict[str, n
             tensors[f"{EXPORTED}{name}.lora_B.weight"] = np.ascontiguousarray(up.T)
             tensors[f"{EXPORTED}{name}.alpha"] = np.array(down.shape[-1], np.float32)
         if isinstance(whole, np.ndarray) and whole[layer].any():
-            values = place.rule.theirs(whole[layer])
+            values = place.rule.to_torch(whole[layer])
             tensors[f"{EXPORTED}{name}.{ends[kind]}"] = np.ascontiguousarray(values)
     return tensors
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from egosim_jax.convert.layouts import Found, Naming, Network
-from egosim_jax.convert.rules import Leaf, Rule, assign, outline
+from egosim_jax.convert.rules import Leaf, Rule, assign, shape_only
 from egosim_jax.convert.skeleton import shapes
 from egosim_jax.convert.stream import Weight, stored_as
 from egosim_jax.io.mapped import Tensor
@@ -159,16 +159,16 @@ class _Part:
     def array(self) -> np.ndarray:
         """Its values."""
         ours = self.tensor.array()
-        return self.rule.theirs(ours if self.layer is None else ours[self.layer])
+        return self.rule.to_torch(ours if self.layer is None else ours[self.layer])
 
     def shape(self) -> np.ndarray:
         """An array of its shape that takes no memory."""
-        ours = outline(self.tensor)
-        return self.rule.theirs(ours if self.layer is None else ours[self.layer])
+        ours = shape_only(self.tensor)
+        return self.rule.to_torch(ours if self.layer is None else ours[self.layer])
 
 
 def _ours(rule: Rule, tensor: Tensor) -> np.ndarray:
-    return rule.ours(tensor.array())
+    return rule.to_jax(tensor.array())
 
 
 def _theirs(parts: Sequence[_Part]) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Name tables: foreign tensors to our weights and back.
+"""Rules that map the tensors of a foreign checkpoint to weights and back.
 
-A table is a list of `Rule`s, each one pattern of a foreign name, the path that it fills, and the
-transform between the two. The same table is used in both directions, and every difference is
-reported in one list.
+A conversion table is a list of `Rule`s, each with a pattern of a foreign name, the path of the
+weight that it fills, and the transform between the two. The same rules serve both directions, and
+all mismatches are reported in one list.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from egosim_jax.io.weights import WeightsError, mismatches
 
 @dataclass(frozen=True)
 class Rule:
-    """One line of a name table.
+    """Correspondence between one foreign tensor, or one per layer, and one weight.
 
-    `*` in `source` stands for the index of a stacked block; such a rule gathers all layers into
-    the leading axis of `target`. `transform` names an entry of `TRANSFORMS`, or is an einops
-    pattern itself. `part` (i, n) takes the i-th of n equal parts of the source's first axis: n
-    rules share a fused projection.
+    `*` in `source` stands for the layer index of a stacked block; such a rule stacks all layers
+    along the leading axis of `target`. `transform` is a key of `TRANSFORMS` or an einops pattern.
+    `part` (i, n) takes the i-th of n equal parts of the source's first axis: n rules share a fused
+    projection.
     """
 
     source: str
@@ -36,17 +36,17 @@ class Rule:
 
     @property
     def stacked(self) -> bool:
-        """Whether it gathers the layers of a stack."""
+        """True if the rule stacks one tensor per layer."""
         return "*" in self.source
 
-    def ours(self, tensor: np.ndarray) -> np.ndarray:
-        """One foreign tensor as ours; raises `ValueError` or `EinopsError` if it does not fit."""
+    def to_jax(self, tensor: np.ndarray) -> np.ndarray:
+        """Convert one foreign tensor. Raises `ValueError` or `EinopsError` if it does not fit."""
         index, parts = self.part
-        return self._transform.ours(np.split(tensor, parts)[index] if parts > 1 else tensor)
+        return self._transform.to_jax(np.split(tensor, parts)[index] if parts > 1 else tensor)
 
-    def theirs(self, tensor: np.ndarray) -> np.ndarray:
-        """One of our tensors, or one layer, as theirs; one part of it, if they fuse several."""
-        return self._transform.theirs(tensor)
+    def to_torch(self, weight: np.ndarray) -> np.ndarray:
+        """Convert one weight, or one layer of it, to the foreign tensor or its part."""
+        return self._transform.to_torch(weight)
 
     @property
     def _transform(self) -> Transform:
@@ -55,17 +55,17 @@ class Rule:
 
 @dataclass(frozen=True)
 class Transform:
-    """A change of layout between a foreign tensor and ours, and its inverse."""
+    """Change of axis layout between a foreign tensor and a weight, with its inverse."""
 
-    ours: Callable[[np.ndarray], np.ndarray]
-    theirs: Callable[[np.ndarray], np.ndarray]
+    to_jax: Callable[[np.ndarray], np.ndarray]
+    to_torch: Callable[[np.ndarray], np.ndarray]
 
 
-def _layout(ours: str) -> Transform:
-    """The transform of an einops pattern, theirs to ours, that names every axis by itself."""
-    left, right = ours.split("->")
+def _layout(pattern: str) -> Transform:
+    """Return the transform of an einops pattern without composed axes, foreign to JAX."""
+    left, right = pattern.split("->")
     return Transform(
-        lambda x: rearrange(x, ours),
+        lambda x: rearrange(x, pattern),
         lambda x: rearrange(x, f"{right} -> {left}"),
     )
 
@@ -76,20 +76,20 @@ TRANSFORMS: dict[str, Transform] = {
     "conv2d": _layout("o i h w -> h w i o"),
     "conv3d": _layout("o i t h w -> t h w i o"),
 }
-"""Layout changes by name."""
+"""Common changes of axis layout by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Leaf:
-    """One of our weights, and the foreign tensors that fill it."""
+    """Weight and the foreign tensors that fill it."""
 
     rule: Rule
     names: tuple[str, ...]
-    """One tensor or, for a stack of blocks, one a layer."""
+    """Foreign tensor names: one or, for stacked blocks, one per layer."""
     shape: tuple[int, ...]
-    """Of ours."""
+    """Shape of the weight."""
     dtype: np.dtype
-    """Theirs."""
+    """Dtype of the foreign tensors."""
 
 
 def assign(
@@ -100,13 +100,12 @@ def assign(
     want: Mapping[str, tuple[int, ...]] | None = None,
     source: str = "the checkpoint",
 ) -> dict[str, Leaf]:
-    """What fills each of our paths, from names, shapes and dtypes alone.
+    """Match foreign tensors to weights by name, shape and dtype, without reading values.
 
-    Tensors whose name matches a pattern of `ignore` (`*` stands for anything) are left out, even
-    if a rule would read them. Raises `WeightsError` naming every other tensor that no rule reads
-    or whose shape does not fit its rule, every rule that found no tensor, every gap in a stack of
-    layers, layers that differ in shape or dtype and, where the shapes `want` of our paths are
-    given, every path that would be of another.
+    Tensors that match a pattern of `ignore` (`*` matches anything) are skipped. Raises
+    `WeightsError` listing every other tensor that no rule reads or whose shape does not fit its
+    rule, every rule without a tensor, every missing layer, layers that differ in shape or dtype
+    and, given the shapes `want` of the weights by path, every weight of another shape.
     """
     found: dict[Rule, dict[int, str]] = {}
     shapes: dict[Rule, set[tuple[tuple[int, ...], np.dtype]]] = {}
@@ -117,15 +116,15 @@ def assign(
             continue
         matches = [(rule, hit) for rule, pattern in patterns if (hit := pattern.fullmatch(name))]
         if not matches:
-            problems.append(f"{name}: not known to this network's name table")
+            problems.append(f"{name}: not in the conversion table of this network")
         for rule, hit in matches:
             layer = int(hit.group(1)) if hit.groups() else 0
             found.setdefault(rule, {})[layer] = name
             try:
-                shape = rule.ours(outline(tensor)).shape
+                shape = rule.to_jax(shape_only(tensor)).shape
             except (EinopsError, ValueError):
-                aim = f"a shape that {rule.transform!r} can bring to {rule.target}"
-                problems.append(f"{name}: have {tuple(tensor.shape)}, want {aim}")
+                aim = f"a shape that {rule.transform!r} maps to {rule.target}"
+                problems.append(f"{name}: has shape {tuple(tensor.shape)}; expected {aim}")
             else:
                 shapes.setdefault(rule, set()).add((shape, np.dtype(tensor.dtype)))
     leaves = {}
@@ -152,40 +151,11 @@ def assign(
     return leaves
 
 
-def translate(
-    tensors: Mapping[str, np.ndarray],
-    rules: Sequence[Rule],
-    *,
-    ignore: Sequence[str] = (),
-    source: str = "the checkpoint",
-) -> dict[str, np.ndarray]:
-    """Foreign tensors under our paths; raises what `assign` raises."""
-    ours = {}
-    for path, leaf in assign(tensors, rules, ignore=ignore, source=source).items():
-        layers = [leaf.rule.ours(tensors[name]) for name in leaf.names]
-        ours[path] = np.stack(layers) if leaf.rule.stacked else layers[0]
-    return ours
-
-
-def translate_back(ours: Mapping[str, np.ndarray], rules: Sequence[Rule]) -> dict[str, np.ndarray]:
-    """Our tensors under the foreign names: the inverse of `translate`."""
-    parts: dict[str, dict[int, np.ndarray]] = {}
-    for rule in rules:
-        tensor = ours[rule.target]
-        for layer, piece in enumerate(tensor if rule.stacked else [tensor]):
-            name = rule.source.replace("*", str(layer))
-            parts.setdefault(name, {})[rule.part[0]] = rule.theirs(piece)
-    return {
-        name: np.concatenate([found[i] for i in sorted(found)]) if len(found) > 1 else found[0]
-        for name, found in parts.items()
-    }
-
-
-def outline(tensor: Any) -> np.ndarray:
-    """An array of the tensor's shape that takes no memory."""
+def shape_only(tensor: Any) -> np.ndarray:
+    """Return an array of the tensor's shape that takes no memory."""
     return np.broadcast_to(np.zeros((), np.uint8), tuple(tensor.shape))
 
 
 def _regex(pattern: str) -> re.Pattern[str]:
-    """A layer has up to four digits, so that a list of all before it is short."""
+    """Compile a pattern; layer indices have at most four digits, which bounds the gaps."""
     return re.compile(re.escape(pattern).replace(r"\*", "(0|[1-9][0-9]{0,3})"))

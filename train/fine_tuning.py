@@ -113,7 +113,7 @@ def write_trained(trained: Denoiser, out: Path, *, model: ModelConfig, start: Pa
     if deltas := lora.deltas_of(trained.dit):
         path, base = out / "lora.safetensors", weights.hashes(start)["dit"]
         if jax.process_index() == 0:
-            weights.write(path, lora.tensors(deltas), about=lora.about(model.name, base=base))
+            weights.write(path, lora.tensors(deltas), metadata=lora.about(model.name, base=base))
         return path
     folder = out / "weights"
     for name, network in trained.parts().items():

@@ -28,7 +28,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, get_args
 
-import ml_dtypes
 import numpy as np
 import safetensors
 import safetensors.numpy
@@ -37,6 +36,7 @@ from array_record.python.array_record_module import ArrayRecordWriter
 
 from egosim_jax.io.atomic import LOCK, atomic_folder
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.mapped import CODES
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.io.untrusted import listing, parse_json, quote, quote_path, quote_text, read_json
 from egosim_jax.types import InputError, VideoSpec
@@ -49,17 +49,7 @@ SEAL = "manifest_sha256"
 """In the manifest: the hash of all the rest of it."""
 SHARD_NAME = re.compile(r"shard-\d{5}\.array_record")
 _OPTIONS = "group_size:1,uncompressed"
-_DTYPES = {
-    "BOOL": np.dtype(np.bool_),
-    "U8": np.dtype(np.uint8),
-    "I32": np.dtype(np.int32),
-    "I64": np.dtype(np.int64),
-    "F16": np.dtype(np.float16),
-    "BF16": np.dtype(ml_dtypes.bfloat16),
-    "F32": np.dtype(np.float32),
-}
-
-
+_DTYPES = {code: CODES[code] for code in ("BOOL", "U8", "I32", "I64", "F16", "BF16", "F32")}
 _DTYPE_NAMES = {dtype.name for dtype in _DTYPES.values()}
 
 

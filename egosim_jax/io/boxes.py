@@ -1,7 +1,7 @@
-"""The tables of MP4 files, held against what their samples could be before FFmpeg builds them.
+"""Limit the sample tables of MP4 files before FFmpeg allocates memory for them.
 
-A few bytes of a sample table may declare billions of samples, for each of which FFmpeg takes 24
-bytes and more. Boxes nest: 4 bytes of size, 4 of type, then what the type says.
+A few bytes of a sample table can declare billions of samples, for each of which FFmpeg allocates
+24 bytes or more. MP4 boxes nest: 4 bytes of size, 4 bytes of type, then the content.
 """
 
 from __future__ import annotations
@@ -11,19 +11,20 @@ import io
 from egosim_jax.types import InputError
 
 MAX_SAMPLES = 2**22
-"""Most samples of all tracks: a minute and a half of uncompressed sound at 48 kHz, beside video."""
+"""Samples of all tracks: video and, for example, 90 s of uncompressed audio at 48 kHz."""
 MAX_BOXES = 100_000
-_INNER = {
+"""Boxes of a file."""
+_CONTAINERS = {
     b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"dinf", b"udta", b"tref", b"mvex",
     b"moof", b"traf", b"mfra", b"wave",
 }  # fmt: skip
 _COUNTS = {b"stsz": 8, b"stz2": 8, b"trun": 4, b"stts": 4, b"ctts": 4, b"stsc": 4, b"stco": 4,
            b"co64": 4, b"stss": 4, b"sbgp": 8, b"elst": 4}  # fmt: skip
-"""Where each table says its number of entries."""
+"""Byte offset of the entry count in each kind of table."""
 
 
 def check_boxes(file: io.BufferedReader | io.BytesIO, name: str) -> None:
-    """Raise `InputError` if an MP4 declares more samples than are read; other files pass."""
+    """Raise `InputError` if an MP4 declares too many samples; other formats pass."""
     size = file.seek(0, 2)
     rest, seen, samples = [(0, size)], 0, 0
     while rest:
@@ -38,17 +39,17 @@ def check_boxes(file: io.BufferedReader | io.BytesIO, name: str) -> None:
         stop = min(start + length, end) if length else end
         if stop + 8 <= end:
             rest.append((stop, end))
-        if kind in _INNER:
+        if kind in _CONTAINERS:
             rest.append((content, stop))
         elif kind in _COUNTS:
             file.seek(content)
             table = file.read(16)
-            place = _COUNTS[kind] + 4 * (kind == b"sbgp" and table[:1] == b"\1")
-            samples += int.from_bytes(table[place : place + 4], "big")
+            offset = _COUNTS[kind] + 4 * (kind == b"sbgp" and table[:1] == b"\1")
+            samples += int.from_bytes(table[offset : offset + 4], "big")
         seen += 1
         if samples > MAX_SAMPLES or seen > MAX_BOXES or kind == b"cmov":
             raise InputError(
-                f"{name} is not read: its header is compressed or declares more than "
-                f"{MAX_SAMPLES:,} samples."
+                f"{name} cannot be read: its header is compressed, or declares more than "
+                f"{MAX_SAMPLES:,} samples or {MAX_BOXES:,} boxes."
             )
     file.seek(0)

@@ -1,10 +1,11 @@
-"""Tensors in safetensors files: what each is, and its values where they lie.
+"""Memory-mapped tensors of safetensors files.
 
-Nothing is read but the header until a tensor is asked for its values, and then no more than is
-looked at. safetensors' own reader for NumPy knows neither bfloat16 nor float8.
+Opening a file reads its header only; values are paged in when they are accessed. The NumPy reader
+of the safetensors library supports neither bfloat16 nor float8, hence this one.
 
-Files that we write are sealed: the header has the SHA-256 of each piece of each tensor, and one of
-itself. The header is checked when it is read, a tensor when its values are first asked for.
+Files written by egosim_jax are sealed: the header holds the SHA-256 of each piece of each tensor
+and one of the header itself. The header is verified when it is read, a tensor when its values are
+first accessed.
 """
 
 from __future__ import annotations
@@ -35,40 +36,34 @@ from egosim_jax.io.untrusted import (
 )
 from egosim_jax.types import InputError
 
-DTYPES = {
-    "float64": np.float64, "float32": np.float32, "float16": np.float16,
-    "bfloat16": ml_dtypes.bfloat16, "float8_e4m3fn": ml_dtypes.float8_e4m3fn,
-    "float8_e5m2": ml_dtypes.float8_e5m2, "float8_e4m3fnuz": ml_dtypes.float8_e4m3fnuz,
-    "float8_e5m2fnuz": ml_dtypes.float8_e5m2fnuz, "int64": np.int64, "int32": np.int32,
-    "int16": np.int16, "int8": np.int8, "uint8": np.uint8, "uint16": np.uint16,
-    "uint32": np.uint32, "uint64": np.uint64, "bool": np.bool_,
-}  # fmt: skip
-"""By their names in torch."""
 CODES = {
-    "F64": "float64", "F32": "float32", "F16": "float16", "BF16": "bfloat16",
-    "F8_E4M3": "float8_e4m3fn", "F8_E5M2": "float8_e5m2", "I64": "int64", "I32": "int32",
-    "I16": "int16", "I8": "int8", "U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8",
-    "BOOL": "bool",
+    code: np.dtype(kind)
+    for code, kind in {
+        "F64": np.float64, "F32": np.float32, "F16": np.float16, "BF16": ml_dtypes.bfloat16,
+        "F8_E4M3": ml_dtypes.float8_e4m3fn, "F8_E5M2": ml_dtypes.float8_e5m2, "I64": np.int64,
+        "I32": np.int32, "I16": np.int16, "I8": np.int8, "U64": np.uint64, "U32": np.uint32,
+        "U16": np.uint16, "U8": np.uint8, "BOOL": np.bool_,
+    }.items()
 }  # fmt: skip
-"""What safetensors calls torch's dtypes."""
+"""NumPy dtypes by their code in safetensors headers."""
 MOST_TENSORS, LONGEST_NAME, LARGEST, MOST_AXES = 1 << 17, 512, 1 << 48, 32
-"""Tensors in a file, characters of a name, bytes of a tensor whose axes of 0 count as 1, axes."""
+"""Limits: tensors per file, characters per name, bytes and axes per tensor."""
 POINTER = b"version https://git-lfs.github.com/spec/"
-"""How a file begins that Git LFS left in the place of the real one."""
-ABOUT, OURS = "__metadata__", "egosim_jax"
-"""Entry of a header for text, and the `format` that files of ours say there."""
+"""First bytes of a Git LFS pointer file."""
+METADATA, OURS = "__metadata__", "egosim_jax"
+"""Header entry for text metadata, and the `format` in it that marks files of egosim_jax."""
 HASH, CHECKSUMS, SEAL = "sha256", "checksums", "seal"
-"""Of a sealed header: the hash over all pieces, those of each tensor, and the header's own."""
+"""Metadata of a sealed header: hash over all pieces, hashes per tensor, hash of the header."""
 BLANK = "0" * hashlib.sha256().digest_size * 2
-"""Stands in a header where a hash will be."""
+"""Placeholder of a hash, of equal length."""
 
 
 class RefusedError(ValueError):
-    """What in a file cannot be read, and why."""
+    """Reason why a file cannot be read, without the file's name."""
 
 
-class Named(NamedTuple):
-    """What is said of a tensor before it has values."""
+class TensorInfo(NamedTuple):
+    """Name, shape and dtype of a tensor to write."""
 
     name: str
     shape: tuple[int, ...]
@@ -77,34 +72,34 @@ class Named(NamedTuple):
 
 @dataclass(frozen=True)
 class Tensor:
-    """A tensor in a file: what it is, and how to look at it."""
+    """Tensor in a memory-mapped file."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
     data: memoryview
-    """From its first element on."""
+    """Bytes of the file, starting at the first element."""
     strides: tuple[int, ...]
-    """In bytes."""
+    """Byte strides per axis."""
     checksums: tuple[str, ...] = ()
-    """SHA-256 of equal parts of it, if the file has them."""
+    """SHA-256 of equal pieces, empty if the file has none."""
     origin: str = ""
-    """Name and file, for a message."""
+    """Tensor name and file, for error messages."""
 
     def array(self) -> np.ndarray:
-        """Its values, read-only, as they lie in the file.
+        """Return the values as a read-only view of the file.
 
-        Raises `InputError` if they are not those of its checksums; only the first call looks.
+        Raises `InputError` if they do not match the checksums, which the first call verifies.
         """
         if not self.intact:
             raise InputError(
-                f"{self.origin} is damaged: its values are not those that were written (SHA-256). "
+                f"{self.origin} is damaged: its values do not match their SHA-256 checksums. "
                 "Copy or convert the file again."
             )
         return np.ndarray(self.shape, self.dtype, buffer=self.data, strides=self.strides)
 
     @cached_property
     def intact(self) -> bool:
-        """Whether the values are those of the checksums, or there are none."""
+        """True if the values match the checksums or there are none."""
         if not self.checksums:
             return True
         step = len(self.data) // len(self.checksums)
@@ -119,64 +114,65 @@ def digest(data: bytes | memoryview) -> str:
 
 
 def map_file(path: Path) -> memoryview:
-    """Map a regular file. Raises `InputError` if it is none, empty, or a pointer of Git LFS."""
+    """Memory-map a regular file. Raises `InputError` if it is empty or a Git LFS pointer."""
     with open_regular(path) as file:
         if not os.fstat(file.fileno()).st_size:
             raise InputError(f"{quote_path(path)} is empty.")
         data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     if bytes(data[: len(POINTER)]) == POINTER:
         raise InputError(
-            f"{quote_path(path)} is only a pointer of Git LFS, not the file itself. Get that with "
-            "`git lfs pull` in its repository, or download it from the website."
+            f"{quote_path(path)} is a Git LFS pointer, not the file itself. Run `git lfs pull` in "
+            "its repository, or download the file from the website."
         )
     return data
 
 
 def read_safetensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a safetensors file by name, mapped.
+    """Return the memory-mapped tensors of a safetensors file by name.
 
-    Raises `InputError` if it is damaged: every byte after the header is of exactly one tensor, and
-    a sealed header is what was written.
+    Raises `InputError` if the file is damaged: every byte after the header must belong to exactly
+    one tensor, and a sealed header must match its hash.
     """
     with _refusing(path):
         header, body = _parts(path)
-        about = header.pop(ABOUT, {})
-        checksums = _checksums(about)
+        checksums = _checksums(header.pop(METADATA, {}))
         if checksums and checksums.keys() != header.keys():
-            raise RefusedError("its checksums are not of its tensors")
+            raise RefusedError("its checksums do not cover its tensors")
         tensors = {
             name: _tensor(name, entry, body, checksums.get(name, ""), path)
             for name, entry in header.items()
         }
-        _check_places(header, len(body))
+        _check_offsets(header, len(body))
         return tensors
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """The text that a safetensors file carries about itself."""
+    """Return the text metadata in the header of a safetensors file."""
     with _refusing(path):
-        return _parts(path)[0].get(ABOUT, {})
+        return _parts(path)[0].get(METADATA, {})
 
 
 def header(
-    tensors: Sequence[Named], about: Mapping[str, str], checksums: Mapping[str, Sequence[str]]
+    tensors: Sequence[TensorInfo],
+    metadata: Mapping[str, str],
+    checksums: Mapping[str, Sequence[str]],
 ) -> bytes:
-    """The header of a safetensors file of these tensors, in this order; sealed if of our format.
+    """Return the safetensors header of these tensors in this order; sealed if its format is ours.
 
-    Its length does not depend on the values of the checksums.
+    The length does not depend on the values of the checksums.
     """
-    codes = {name: code for code, name in CODES.items()}
-    said = dict(about)
-    if about.get("format") == OURS:
+    codes = {dtype: code for code, dtype in CODES.items()}
+    written = dict(metadata)
+    if metadata.get("format") == OURS:
         text = {tensor.name: "".join(checksums[tensor.name]) for tensor in tensors}
         joint = hashlib.sha256("".join(text.values()).encode()).hexdigest()
-        said |= {HASH: joint, CHECKSUMS: json.dumps(text), SEAL: BLANK}
-    listed: dict[str, Any] = {ABOUT: said}
+        written |= {HASH: joint, CHECKSUMS: json.dumps(text), SEAL: BLANK}
+    listed: dict[str, Any] = {METADATA: written}
     end = 0
     for tensor in tensors:
         begin, end = end, end + math.prod(tensor.shape) * tensor.dtype.itemsize
-        places, code = [begin, end], codes[tensor.dtype.name]
-        listed[tensor.name] = {"dtype": code, "shape": tensor.shape, "data_offsets": places}
+        offsets, code = [begin, end], codes[tensor.dtype]
+        listed[tensor.name] = {"dtype": code, "shape": tensor.shape, "data_offsets": offsets}
     text = json.dumps(listed).encode()
     text += b" " * (-len(text) % 8)
     text = text.replace(_seal(BLANK), _seal(digest(text)))
@@ -189,68 +185,68 @@ def _seal(value: str) -> bytes:
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
-    """Say which file it is that cannot be read."""
+    """Turn a `RefusedError` into an `InputError` that names the file."""
     try:
         yield
     except RefusedError as error:
-        message = f"{quote_path(path)} is no readable safetensors file: {error}."
+        message = f"{quote_path(path)} is not a readable safetensors file: {error}."
         raise InputError(message) from error
 
 
 def _parts(path: Path) -> tuple[dict[str, Any], memoryview]:
-    """The header, which is what was written if it is sealed, and what follows it."""
+    """Return the verified header and the bytes after it."""
     data = map_file(path)
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > len(data) - 8:
-        raise RefusedError(f"its header would have {length:,} bytes, more than the file")
+        raise RefusedError(f"its header size, {length:,} bytes, exceeds the file")
     if length > MAX_JSON_BYTES:
-        raise RefusedError(f"its header has {length:,} bytes, more than {MAX_JSON_BYTES:,}")
+        raise RefusedError(f"its header has {length:,} bytes; the limit is {MAX_JSON_BYTES:,}")
     text = bytes(data[8 : 8 + length])
     header = parse_json(text, source=f"The header of {quote_path(path)}")
     if not isinstance(header, dict) or len(header) > MOST_TENSORS:
-        raise RefusedError("its header is no list of tensors")
-    about = header.get(ABOUT, {})
-    if not isinstance(about, dict) or not all(isinstance(text, str) for text in about.values()):
-        raise RefusedError(f"its {ABOUT} is not text by name")
-    seal = about.get(SEAL)
+        raise RefusedError(f"its header is not a JSON object of at most {MOST_TENSORS:,} tensors")
+    metadata = header.get(METADATA, {})
+    if not isinstance(metadata, dict) or not all(isinstance(v, str) for v in metadata.values()):
+        raise RefusedError(f"its {METADATA} is not a JSON object of strings")
+    seal = metadata.get(SEAL)
     if seal is not None:
         blank = text.replace(_seal(seal), _seal(BLANK))
         if digest(blank) != seal:
-            raise RefusedError("its header is not what was written (SHA-256). Copy it again")
+            raise RefusedError("its header does not match its SHA-256 seal. Copy the file again")
     return header, data[8 + length :]
 
 
-def _checksums(about: Mapping[str, str]) -> dict[str, str]:
-    if (CHECKSUMS in about) != (SEAL in about):
+def _checksums(metadata: Mapping[str, str]) -> dict[str, str]:
+    if (CHECKSUMS in metadata) != (SEAL in metadata):
         raise RefusedError(f"its header has only one of {CHECKSUMS} and {SEAL}")
-    found = parse_json(about.get(CHECKSUMS, "{}").encode(), source=f"its {CHECKSUMS}")
+    found = parse_json(metadata.get(CHECKSUMS, "{}").encode(), source=f"its {CHECKSUMS}")
     if not isinstance(found, dict) or not all(
         isinstance(text, str) and text and len(text) % len(BLANK) == 0 for text in found.values()
     ):
-        raise RefusedError(f"its {CHECKSUMS} are not text by name")
+        raise RefusedError(f"its {CHECKSUMS} are not a JSON object of SHA-256 hashes")
     return found
 
 
-def _tensor(name: str, about: Any, body: memoryview, checksums: str, path: Path) -> Tensor:
+def _tensor(name: str, entry: Any, body: memoryview, checksums: str, path: Path) -> Tensor:
     check_name(name)
-    match about:
+    match entry:
         case {
             "dtype": str(code), "shape": [*shape], "data_offsets": [begin, end], **others
         } if not others:  # fmt: skip
             pass
         case _:
-            raise RefusedError(f"{quote(name)} is not described by dtype, shape and data_offsets")
+            raise RefusedError(f"{quote(name)} must have exactly dtype, shape and data_offsets")
     if code not in CODES:
-        raise RefusedError(f"{quote(name)} is of {quote_text(code)}, which is not read")
-    dtype = np.dtype(DTYPES[CODES[code]])
+        raise RefusedError(f"{quote(name)} has the unsupported dtype {quote_text(code)}")
+    dtype = CODES[code]
     if len(shape) > MOST_AXES:
-        raise RefusedError(f"{quote(name)} has {len(shape)} axes, more than {MOST_AXES}")
+        raise RefusedError(f"{quote(name)} has {len(shape)} axes; the limit is {MOST_AXES}")
     check_sizes(quote(name), (begin, end, *shape))
     strides = strides_of(quote(name), tuple(shape), dtype)
     if not begin <= end <= len(body) or end - begin != math.prod(shape) * dtype.itemsize:
         raise RefusedError(
-            f"{quote(name)} of {code} {quote_text(str(shape))} lies at {begin} to {end} of "
-            f"{len(body)} bytes, which is not its size or not in the file"
+            f"{quote(name)}, {code} of shape {quote_text(str(shape))}, has data_offsets "
+            f"{begin} to {end} of {len(body)} bytes: not its size, or outside the file"
         )
     return Tensor(
         shape=tuple(shape),
@@ -265,23 +261,22 @@ def _tensor(name: str, about: Any, body: memoryview, checksums: str, path: Path)
 
 
 def check_name(name: str) -> None:
-    """Raise `RefusedError` for the name of a tensor that no message could show."""
+    """Raise `RefusedError` if the name of a tensor is too long or not printable."""
     if len(name) > LONGEST_NAME or not name.isprintable():
         raise RefusedError(
-            f"the name {quote(name)} has more than {LONGEST_NAME} characters, or some that cannot "
-            "be printed"
+            f"the name {quote(name)} has more than {LONGEST_NAME} characters or unprintable ones"
         )
 
 
 def check_sizes(what: str, numbers: Sequence[Any]) -> None:
-    """Raise `RefusedError` unless all numbers of a tensor are sizes."""
+    """Raise `RefusedError` unless all numbers are valid sizes, 0 to `LARGEST` - 1."""
     for number in numbers:
         if type(number) is not int or not 0 <= number < LARGEST:
-            raise RefusedError(f"{what} has {quote(number)} where a size has to be")
+            raise RefusedError(f"{what} has {quote(number)} where a size is expected")
 
 
 def strides_of(what: str, shape: tuple[int, ...], dtype: np.dtype) -> tuple[int, ...]:
-    """Return the strides of a tensor in row order. Raises `RefusedError` if it is too large."""
+    """Return the byte strides of a C-contiguous tensor. Raises `RefusedError` if too large."""
     strides, step = [], dtype.itemsize
     for size in reversed(shape):
         strides.append(step)
@@ -291,14 +286,14 @@ def strides_of(what: str, shape: tuple[int, ...], dtype: np.dtype) -> tuple[int,
     return tuple(reversed(strides))
 
 
-def _check_places(header: Mapping[str, Any], size: int) -> None:
-    """Raise `RefusedError` unless the tensors lie one after the other up to the file's end."""
-    places = sorted((*entry["data_offsets"], name) for name, entry in header.items())
+def _check_offsets(header: Mapping[str, Any], size: int) -> None:
+    """Raise `RefusedError` unless the tensors are contiguous up to the end of the file."""
+    offsets = sorted((*entry["data_offsets"], name) for name, entry in header.items())
     end = 0
-    for begin, following, name in (*places, (size, size, "the file's end")):
+    for begin, following, name in (*offsets, (size, size, "end of file")):
         if begin != end:
             raise RefusedError(
-                f"{quote(name)} is at {begin}, and what lies before it ends at {end}: tensors may "
+                f"{quote(name)} begins at byte {begin} where {end} is expected: tensors may "
                 "neither overlap nor leave holes"
             )
         end = following

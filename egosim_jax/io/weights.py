@@ -1,8 +1,9 @@
-"""Weights in and out of safetensors, in our own names.
+"""Save and load network weights as safetensors.
 
-A network's own format is one safetensors file whose keys are the dotted paths of its nnx state
-(`blocks.self_attn.q.kernel`); stacked blocks keep their leading `layers` axis. Every difference
-between a file and a network is reported in one list. Foreign formats are `convert`'s.
+A network is one file whose keys are the dotted paths of its nnx state, such as
+`blocks.self_attn.q.kernel`; stacked blocks keep their leading `layers` axis. All differences
+between a file and a network are reported in one list. `egosim_jax.convert` reads the checkpoints
+of other projects.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import (
     HASH,
     OURS,
-    Named,
     Tensor,
+    TensorInfo,
     digest,
     header,
     read_metadata,
@@ -34,11 +35,11 @@ if TYPE_CHECKING:
     from jax.sharding import Mesh
 
 LISTED = 12
-"""Differences that a message names."""
+"""Mismatches that an error message lists."""
 
 
 class WeightsError(InputError):
-    """Weights do not match the network; the message lists every differing path, have and want."""
+    """Mismatch between weights and a network; `problems` has one line per differing path."""
 
     def __init__(self, problems: Sequence[str], *, source: str):
         what = f"{len(problems)} weights of {quote_path(source)} do not match"
@@ -47,7 +48,7 @@ class WeightsError(InputError):
 
 
 def flat_shapes(module: nnx.Module) -> dict[str, tuple[int, ...]]:
-    """Dotted path to shape for every parameter and buffer of a module, abstract or real."""
+    """Return the shape of every parameter and buffer of a module by its dotted path."""
     return {path: tuple(leaf.shape) for path, leaf in _leaves(module).items()}
 
 
@@ -59,15 +60,15 @@ def _leaves(module: nnx.Module) -> dict[str, nnx.Variable]:
 
 
 def mismatches(have: Mapping[str, Any], want: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """Every path that is missing, unknown or of another shape; `have` holds what has a shape."""
+    """List every path that is missing, unexpected or has another shape than `want`."""
     problems = []
     for path in sorted(want.keys() | have.keys()):
         if path not in have:
-            problems.append(f"{path}: have nothing, want {want[path]}")
+            problems.append(f"{path}: missing; expected {want[path]}")
         elif path not in want:
-            problems.append(f"{path}: have {tuple(have[path].shape)}, want nothing")
+            problems.append(f"{path}: unexpected, with shape {tuple(have[path].shape)}")
         elif tuple(have[path].shape) != want[path]:
-            problems.append(f"{path}: have {tuple(have[path].shape)}, want {want[path]}")
+            problems.append(f"{path}: has shape {tuple(have[path].shape)}; expected {want[path]}")
     return problems
 
 
@@ -79,11 +80,10 @@ def fill(
     source: str = "the checkpoint",
     mesh: Mesh | None = None,
 ) -> None:
-    """Put tensors, keyed by our dotted paths, into a module made for real or by `nnx.eval_shape`.
+    """Set the parameters of a module, concrete or abstract, from tensors by dotted path.
 
-    `dtype` casts floating tensors; by default they keep their own. On a mesh each device gets its
-    own part. Raises `WeightsError` naming every path that is missing, unknown or of another shape,
-    before anything is changed.
+    `dtype` casts the tensors; by default they keep their own. On a mesh each device reads its own
+    shard. Raises `WeightsError` listing every mismatch, before anything is changed.
     """
     problems = mismatches(tensors, flat_shapes(module))
     if problems:
@@ -110,25 +110,25 @@ def fill(
 
 
 def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, str]:
-    """What tells the files of a weights folder from others, by network, or `only` of some.
+    """Return the hash of each network's file in a weights folder, or of the networks in `only`.
 
-    The hash in a file's header, if it was converted; else the SHA-256 of the file.
+    It is the hash in the file's header or, without one, the SHA-256 of the file.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder of weights. (--weights)")
+        raise InputError(f"{folder} is not a weights folder. (--weights)")
     files = [
         path
-        for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden ones are half written
+        for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden files are incomplete
         if only is None or path.stem in only
     ]
     return {path.stem: read_metadata(path).get(HASH) or sha256(path) for path in files}
 
 
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
-    """Write a module's weights as safetensors: to a temporary name, then renamed.
+    """Write the weights of a module as safetensors, atomically.
 
-    `dtype` casts floating tensors; by default they keep their own. Of several processes, which
-    call it together, the first one writes.
+    `dtype` casts the tensors; by default they keep their own. All processes must call it together;
+    the first one writes.
     """
     tensors = {}
     for name, leaf in _leaves(module).items():
@@ -141,23 +141,23 @@ def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
 
 
 def write(
-    path: Path, tensors: Mapping[str, np.ndarray], *, about: Mapping[str, str] | None = None
+    path: Path, tensors: Mapping[str, np.ndarray], *, metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write tensors, and what is to be said about them, as safetensors, whole or not at all."""
+    """Write tensors and text metadata as safetensors, atomically."""
     arrays = {name: np.asarray(tensor, order="C") for name, tensor in tensors.items()}
-    # The widest first, so that every tensor lies at a multiple of its width.
+    # Wide dtypes first, so that every tensor is aligned to its item size.
     names = sorted(arrays, key=lambda name: (-arrays[name].dtype.itemsize, name))
     bytes_of = {name: arrays[name].reshape(-1).view(np.uint8).data for name in names}
-    named = [Named(name, arrays[name].shape, arrays[name].dtype) for name in names]
-    said = {"format": OURS, **(about or {})}
+    infos = [TensorInfo(name, arrays[name].shape, arrays[name].dtype) for name in names]
+    metadata = {"format": OURS, **(metadata or {})}
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(header(named, said, {name: [digest(bytes_of[name])] for name in names}))
+        file.write(header(infos, metadata, {name: [digest(bytes_of[name])] for name in names}))
         for name in names:
             file.write(bytes_of[name])
 
 
 def link_others(folder: Path, origin: Path) -> None:
-    """Link what a weights folder lacks of another one: networks that stayed, the tokenizer."""
+    """Symlink the networks and tokenizer of `origin` that a weights folder does not have."""
     for path in origin.glob("[!.]*"):
         link = folder / path.name
         kept = path.is_dir() or path.suffix == ".safetensors"
@@ -166,7 +166,7 @@ def link_others(folder: Path, origin: Path) -> None:
 
 
 def _gathered(array: Any) -> np.ndarray | None:
-    """An array's values, in the first process, from all that have a part of it."""
+    """Gather an array from all processes; None in all but the first."""
     import jax
     from jax.experimental import multihost_utils
 
@@ -178,15 +178,15 @@ def _gathered(array: Any) -> np.ndarray | None:
 def load(
     path: Path, module: nnx.Module, *, dtype: str | None = None, mesh: Mesh | None = None
 ) -> None:
-    """Fill a module from a file that `save` or a conversion wrote (`fill`)."""
+    """Fill a module from a file written by `save` or a conversion (see `fill`)."""
     fill(module, _read(path), dtype=dtype, source=str(path), mesh=mesh)
 
 
 def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
-    """The parameters of a weights folder on the devices, each of which reads its own part.
+    """Load the parameters of a weights folder onto the devices, each reading its own shard.
 
-    `abstract` holds, under the name of each network, what its parameters are to be; floats are cast
-    to that. Raises `WeightsError` naming every path that is missing, unknown or of another shape.
+    `abstract` has the shapes and dtypes to load, under the name of each network. Raises
+    `WeightsError` listing every mismatch.
     """
     import jax
     from flax import nnx
@@ -213,5 +213,7 @@ def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
 
 def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
-        raise InputError(f"No weights at {path}. (--weights must name a folder that holds it.)")
+        raise InputError(
+            f"No weights file at {path}. (--weights must name the folder that contains it.)"
+        )
     return read_safetensors(path)

@@ -114,13 +114,13 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     from flax import nnx
 
     from egosim_jax.conditioning import assemble
-    from egosim_jax.convert.rules import translate
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
     from egosim_jax.diffusion.objective import Objective
     from egosim_jax.io.weights import fill
     from egosim_jax.train.config import OptimizerConfig
     from egosim_jax.train.tasks.denoising import Denoiser, Denoising
     from egosim_jax.train.update import TrainState, make_update
+    from tests.translation import translate
 
     class GivenNoise(Denoising):
         """The task, but for noise and noise levels, which are the batch's."""

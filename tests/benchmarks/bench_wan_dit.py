@@ -67,10 +67,10 @@ def programs() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
     from einops import rearrange
     from flax import nnx
 
-    from egosim_jax.convert.rules import translate
     from egosim_jax.convert.tables import wan_dit as table
     from egosim_jax.io.weights import fill
     from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
+    from tests.translation import translate
 
     torch.set_num_threads(THREADS)
     torch.manual_seed(0)

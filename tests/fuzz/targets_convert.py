@@ -68,7 +68,7 @@ def make_foreign(folder: Path) -> None:
 
 
 def make_sealed(folder: Path) -> None:
-    weights.write(folder / "x.safetensors", tensors(), about={"config": "debug"})
+    weights.write(folder / "x.safetensors", tensors(), metadata={"config": "debug"})
 
 
 def make_sharded(folder: Path) -> None:

@@ -20,7 +20,6 @@ from egosim_jax import configs
 from egosim_jax.conditioning import condition_channels
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.rules import translate, translate_back
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.schedule import FlowSchedule
 from egosim_jax.generator import Generator, Inputs, ModelConfig, Networks, denoise, encode_condition
@@ -29,6 +28,7 @@ from egosim_jax.models.umt5 import UMT5Config
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAEConfig
 from egosim_jax.types import Triplet, VideoSpec
+from tests.translation import translate, translate_back
 
 TOLERANCE = 1e-5
 """Relative L2 of the latents in float32 after all networks and ten steps."""

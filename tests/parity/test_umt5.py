@@ -8,10 +8,10 @@ from flax import nnx
 from transformers import UMT5Config as TheirConfig
 from transformers import UMT5EncoderModel
 
-from egosim_jax.convert.rules import translate, translate_back
 from egosim_jax.convert.tables import umt5 as table
 from egosim_jax.io.weights import fill, flat_shapes
 from egosim_jax.models.umt5 import UMT5, UMT5Config, relative_buckets
+from tests.translation import translate, translate_back
 
 # Heads x head_dim is not dim, and 40 tokens reach every bucket.
 CONFIG = UMT5Config(

@@ -9,10 +9,10 @@ from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffu
 from einops import rearrange
 from flax import nnx
 
-from egosim_jax.convert.rules import translate, translate_back
 from egosim_jax.convert.tables import wan_dit as table
 from egosim_jax.io.weights import fill
 from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
+from tests.translation import translate, translate_back
 
 TOLERANCE = 1e-6
 """Relative L2 of float32 against float64: two blocks of sums over 512 to 768 terms."""

@@ -8,10 +8,10 @@ import torch
 from diffusers import AutoencoderKLWan
 from flax import nnx
 
-from egosim_jax.convert.rules import translate, translate_back
 from egosim_jax.convert.tables import wan_vae as table
 from egosim_jax.io.weights import fill, flat_shapes
 from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from tests.translation import translate, translate_back
 
 CONFIG = WanVAEConfig(dim=8)
 TOLERANCE = 1e-5

@@ -27,11 +27,11 @@ from egosim_jax.convert import commands
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.layouts import recognize
 from egosim_jax.convert.plan import TABLES
-from egosim_jax.convert.rules import translate_back
 from egosim_jax.convert.tables import wan_dit
 from egosim_jax.generator import Networks
 from egosim_jax.io.weights import flat_shapes, hashes, load
 from egosim_jax.models.wan_dit import WanDiT
+from tests.translation import translate_back
 
 CONFIG = configs.get("debug")
 NETWORKS = ("dit", "vae", "text", "image")
@@ -164,8 +164,9 @@ def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
     assert convert(source, tmp_path / "weights") == 2
     message = capsys.readouterr().err
     for name in (
-        "visual.pre_norm.weight: missing", "visual.pre_norm.bias: missing", "surprise: not known",
-        "class_token: have (7,), want (32,)",
+        "visual.pre_norm.weight: missing", "visual.pre_norm.bias: missing",
+        "surprise: not in the conversion table",
+        "class_token: has shape (7,); expected (32,)",
     ):  # fmt: skip
         assert name in message
     assert "4 weights of clip.safetensors" in message
@@ -311,7 +312,7 @@ def test_what_is_not_of_the_config_is_not_written_back(tmp_path, capsys):
     assert convert(tmp_path / "vae.pth.safetensors", tmp_path / "ours") == 0
     args = ["--config", "tabletop", "--out", str(tmp_path / "out"), "--only", "vae"]
     assert main(["to-torch", str(tmp_path / "ours"), *args]) == 2
-    assert "have" in capsys.readouterr().err
+    assert "has shape" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

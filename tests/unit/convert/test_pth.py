@@ -158,8 +158,8 @@ FORGED = {
     "a function of the tests": (lambda mark: Calls(touch, str(mark)), "touch"),
     "an object with a state": (lambda mark: collections.Counter("a"), "Counter"),
     "a set": (lambda mark: {"w": {1, 2}}, "set"),
-    "a stride that reaches out": (lambda mark: tensor(stride=(200, 1)), "reaches element 201"),
-    "an offset beyond the end": (lambda mark: tensor(offset=4), "reaches element"),
+    "a stride that reaches out": (lambda mark: tensor(stride=(200, 1)), "reads element 201"),
+    "an offset beyond the end": (lambda mark: tensor(offset=4), "reads element"),
     "a negative stride": (lambda mark: tensor(stride=(-2, 1)), "has -2 where a size"),
     "a negative offset": (lambda mark: tensor(offset=-1), "has -1 where a size"),
     "a size that is no number": (lambda mark: tensor(size=("2", 2)), "has '2' where a size"),
@@ -168,15 +168,15 @@ FORGED = {
         lambda mark: tensor(size=(10**6, 10**6), stride=(0, 0)),
         "repeats",
     ),
-    "a storage larger than its bytes": (lambda mark: tensor(count=1000), "says 4000 bytes"),
+    "a storage larger than its bytes": (lambda mark: tensor(count=1000), "declares 4000 bytes"),
     "a storage that is missing": (lambda mark: tensor(key="9"), "9 is missing"),
     "a storage outside": (lambda mark: tensor(key="../../etc/passwd"), "missing"),
     "a storage of another kind": (lambda mark: tensor(kind=dict), "dict"),
-    "a reference to something else": (lambda mark: {"w": Persistent("module", 1)}, "no storage"),
-    "a name by itself": (lambda mark: {"w": torch.FloatStorage}, "no tensor but name"),
+    "a reference to something else": (lambda mark: {"w": Persistent("module", 1)}, "not a storage"),
+    "a name by itself": (lambda mark: {"w": torch.FloatStorage}, "is a name, not a tensor"),
     "a rebuild of something else": (
         lambda mark: Calls(torch._utils._rebuild_tensor_v2, 1, 2, 3),
-        "does not take",
+        "unsupported arguments",
     ),
 }
 
@@ -195,16 +195,16 @@ def test_a_forged_pickle_is_refused_with_the_reason_and_not_run(tmp_path, name):
 
 RAW = {
     "an instance of a class by an old operation": (b"(S'x'\nios\nsystem\n.", "STRING"),
-    "a state of a number": (b"K\x01K\x02b.", "no dictionary"),
+    "a state of a number": (b"K\x01K\x02b.", "not a dictionary"),
     "a value that was not made": (b"\x80\x020.", "POP"),
-    "an empty stack": (b"\x80\x02\x85.", "has not made"),
+    "an empty stack": (b"\x80\x02\x85.", "pops from an empty stack"),
     "no mark": (b"\x80\x02t.", "no mark"),
-    "a memory that was not written": (b"\x80\x02h\x05.", "recalls 5"),
+    "a memory that was not written": (b"\x80\x02h\x05.", "reads memo 5"),
     "an extension": (b"\x80\x02\x82\x01.", "EXT1"),
-    "a key twice": (b"\x80\x02}(X\x01\x00\x00\x00aK\x01X\x01\x00\x00\x00aK\x02u.", "twice"),
+    "a key twice": (b"\x80\x02}(X\x01\x00\x00\x00aK\x01X\x01\x00\x00\x00aK\x02u.", "duplicate key"),
     "no end": (b"\x80\x02}", "pickle exhausted"),
     "text longer than the file": (b"\x80\x02X\xff\xff\xff\x7fa.", "expected"),
-    "a list in itself": (b"\x80\x02]q\x00h\x00a.", "without end"),
+    "a list in itself": (b"\x80\x02]q\x00h\x00a.", "reference themselves"),
     "a thousand million lists": (
         b"\x80\x02]q\x00" + b"".join(
             b"]q" + bytes([i + 1]) + b"(" + 10 * (b"h" + bytes([i])) + b"e" for i in range(9)
@@ -227,15 +227,15 @@ def test_files_that_are_no_archive_of_torch_are_refused(tmp_path):
     pkl, bytes_4 = pickled({"w": tensor()}), np.arange(4, dtype=np.float32).tobytes()
     whole = {"a/data.pkl": pkl, "a/data/0": bytes_4}
     cases = {
-        "points outside": archive(tmp_path / "1", {**whole, "a/../../b": b"x"}),
-        "points outside ": archive(tmp_path / "2", {**whole, "/etc/passwd": b"x"}),
+        "path outside": archive(tmp_path / "1", {**whole, "a/../../b": b"x"}),
+        "path outside ": archive(tmp_path / "2", {**whole, "/etc/passwd": b"x"}),
         "compressed": archive(tmp_path / "3", whole, zipfile.ZIP_DEFLATED),
-        "larger than the file": archive(
+        "exceed the file": archive(
             tmp_path / "4", {"a/bomb": bytes(1 << 24), **whole}, zipfile.ZIP_DEFLATED
         ),
         "no data.pkl": archive(tmp_path / "5", {"a/data/0": bytes_4}),
         "big-endian": archive(tmp_path / "6", {**whole, "a/byteorder": b"big"}),
-        "there twice": archive(tmp_path / "7", {**whole, "b/data.pkl": pkl}),
+        "duplicate entry": archive(tmp_path / "7", {**whole, "b/data.pkl": pkl}),
     }
     for reason, path in cases.items():
         with pytest.raises(InputError, match=reason.strip()):
@@ -264,5 +264,5 @@ def test_entries_that_lie_on_each_other_are_refused(tmp_path):
     for field in (20, 24):  # its stored and its own size
         struct.pack_into("<I", data, directory + field, len(data))
     path.write_bytes(data)
-    with pytest.raises(InputError, match="goes on after the file's end"):
+    with pytest.raises(InputError, match="extends beyond the end"):
         read_pth(path)

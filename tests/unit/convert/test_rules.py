@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from egosim_jax.convert.rules import Rule, assign, translate, translate_back
+from egosim_jax.convert.rules import Rule, assign
 from egosim_jax.io.weights import WeightsError
+from tests.translation import translate, translate_back
 
 RULES = [
     Rule("head.weight", "head.kernel", "linear"),
@@ -62,13 +63,13 @@ def test_every_problem_is_listed_at_once():
     want = {"head.bias": (2,), "blocks.q.kernel": (2, 3, 5), "tail.bias": (1,)}
     listed = problems(theirs, want=want).splitlines()
     expected = [
-        "surprise: not known",
-        "head.weight: have (2,), want a shape that 'linear' can bring to head.kernel",
+        "surprise: not in the conversion table",
+        "head.weight: has shape (2,); expected a shape that 'linear' maps to head.kernel",
         "head.bias: missing (fills head.bias)",
         "blocks.*.norm.weight: layers [0] are missing",
-        "blocks.k.kernel: have (2, 3, 4), want nothing",
-        "blocks.q.kernel: have (2, 3, 4), want (2, 3, 5)",
-        "tail.bias: have nothing, want (1,)",
+        "blocks.k.kernel: unexpected, with shape (2, 3, 4)",
+        "blocks.q.kernel: has shape (2, 3, 4); expected (2, 3, 5)",
+        "tail.bias: missing; expected (1,)",
     ]
     assert len(listed) == len(expected)
     for line in expected:
@@ -83,7 +84,7 @@ def test_layers_that_differ_are_named():
 
 def test_a_layer_has_one_name():
     theirs = foreign() | {"blocks.01.norm.weight": np.zeros(3, np.float32)}
-    assert problems(theirs) == "blocks.01.norm.weight: not known to this network's name table"
+    assert problems(theirs) == "blocks.01.norm.weight: not in the conversion table of this network"
 
 
 def test_an_ignored_tensor_is_no_problem():

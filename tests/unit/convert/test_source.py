@@ -43,18 +43,18 @@ def about(dtype="F32", shape=(4,), places=(0, 16)):
 
 
 BROKEN = {
-    "header would have": lambda p: written(p, {"a": about()}, length=1 << 40),
-    "header would have ": lambda p: p.write_bytes(b"abc"),
+    "header size, ": lambda p: written(p, {"a": about()}, length=1 << 40),
+    "header size,  ": lambda p: p.write_bytes(b"abc"),
     "name 'a' is repeated": lambda p: written(
         p, b'{"a": %s, "a": %s}' % ((json.dumps(about()).encode(),) * 2)
     ),
-    "no list of tensors": lambda p: written(p, []),
-    "is not described": lambda p: written(p, {"a": {"dtype": "F32"}}),
-    "is not described ": lambda p: written(p, {"a": about(places=(0, 1, 2))}),
-    "of F4, which": lambda p: written(p, {"a": about(dtype="F4")}),
+    "not a JSON object": lambda p: written(p, []),
+    "must have exactly": lambda p: written(p, {"a": {"dtype": "F32"}}),
+    "must have exactly ": lambda p: written(p, {"a": about(places=(0, 1, 2))}),
+    "unsupported dtype F4": lambda p: written(p, {"a": about(dtype="F4")}),
     "has -4 where a size": lambda p: written(p, {"a": about(shape=(-4,))}),
     "has 4.0 where a size": lambda p: written(p, {"a": about(shape=(4.0,))}),
-    "not in the file": lambda p: written(p, {"a": about(shape=(8,), places=(0, 32))}),
+    "outside the file": lambda p: written(p, {"a": about(shape=(8,), places=(0, 32))}),
     "not its size": lambda p: written(p, {"a": about(shape=(3,))}),
     "not its size ": lambda p: written(p, {"a": about(places=(16, 0))}),
     "Expecting property name": lambda p: written(p, b"{,}"),
