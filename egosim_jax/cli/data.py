@@ -174,10 +174,10 @@ class Make:
 
     def run(self) -> int:
         """Make scene after scene."""
-        from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         check_counts({"--workers": self.workers})
-        plan = Plan(
+        plan = DatasetConfig(
             seeds=tuple(range(self.seed, self.seed + self.scenes)),
             clips=self.clips,
             spec=VideoSpec(frames=self.frames, height=self.height, width=self.width, fps=self.fps),

@@ -151,9 +151,9 @@ class Told:
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
         """The truth of the clip after so many steps."""
         from egosim_jax.perception.oracle import oracle
-        from egosim_jax.worlds.tabletop import to_truth
+        from egosim_jax.worlds.tabletop import to_ground_truth
 
-        return oracle(to_truth(self.truth[state.step]))(clip, action, state)
+        return oracle(to_ground_truth(self.truth[state.step]))(clip, action, state)
 
 
 MEASURES = {

@@ -209,10 +209,10 @@ class Embodiment:
         """Make the clips of a split, and cache their latents."""
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.train.encode import cache
-        from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         model = self._model
-        plan = Plan(seeds=tuple(seeds), clips=1, spec=model.video, kind=kind)
+        plan = DatasetConfig(seeds=tuple(seeds), clips=1, spec=model.video, kind=kind)
         frames, latents = self.out / "frames" / split, self.out / "latents" / split
         scenes = make_shards(plan, out=frames, workers=os.cpu_count() or 1)
         for _ in track(scenes, f"making {split}", total=len(seeds)):

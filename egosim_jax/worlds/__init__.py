@@ -1,1 +1,1 @@
-"""Procedural worlds, whose every frame is known exactly."""
+"""Procedural worlds with exact ground truth for any action."""

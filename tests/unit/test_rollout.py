@@ -18,7 +18,7 @@ from egosim_jax.simulator import Simulator
 from egosim_jax.state.snapshot import fingerprint
 from egosim_jax.state.tsdf import Fusion
 from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_action, to_truth
+from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
 
@@ -41,7 +41,7 @@ def clips():
 class SequenceOracle:
     """The oracle of each clip in turn."""
 
-    truths: list = field(default_factory=lambda: [to_truth(clip) for clip in clips()])
+    truths: list = field(default_factory=lambda: [to_ground_truth(clip) for clip in clips()])
 
     def __call__(self, clip, action, state):
         return oracle(self.truths[state.step])(clip, action, state)

@@ -109,10 +109,10 @@ class Tabletop(Recipe):
         """The clips of a split, decoded."""
         from egosim_jax import configs
         from egosim_jax.progress import track
-        from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         spec = configs.get(self.config).video
-        plan = Plan(seeds=tuple(seeds), clips=clips, spec=spec, kind="mixed")
+        plan = DatasetConfig(seeds=tuple(seeds), clips=clips, spec=spec, kind="mixed")
         out = self.out / "frames" / split
         scenes = make_shards(plan, out=out, workers=os.cpu_count() or 1)
         for _ in track(scenes, f"making {split}", total=len(seeds)):

@@ -1,8 +1,8 @@
-"""The tabletop world: a table, a few things, and hands that do something with one of them.
+"""The tabletop world: a table with a few objects, and hands or a gripper that manipulate one.
 
-Everything is exact: the pictures are cast rays, and joints, poses, depth and ids come from the
-same numbers. A seed gives a sequence of clips; the first frame of each is the last of the one
-before.
+All ground truth is exact: frames are ray cast, and joints, poses, depth and ids come from the
+same geometry. A seed gives a sequence of clips; the first frame of each clip is the last frame of
+the clip before.
 """
 
 from __future__ import annotations
@@ -21,54 +21,65 @@ from egosim_jax.types import Action, Cameras, Kind, SceneState, Triplet, VideoSp
 from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.bodies import Part
-from egosim_jax.worlds.tabletop.raycast import Picture, Placed, Stage
+from egosim_jax.worlds.tabletop.raycast import Picture, Placed, RayCaster
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene, make_scene
 
 FIELD_OF_VIEW = 60.0
-"""Degrees, across."""
-FINER, POINT_PX = 2, 2
-"""The scene's points: rays along each side of a pixel of the first frame, and their size."""
+"""Horizontal field of view in degrees."""
+POINTS_PER_PIXEL = 2
+"""Points of a clip's first state along each side of a pixel of its first frame."""
+POINT_PX = 2
+"""Size in pixels at which the points of a state are rendered."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class TabletopClip:
-    """One clip and all that is true of it."""
+    """One clip of the tabletop world with its complete ground truth."""
 
     seed: int
+    """Seed of the sequence."""
     number: int
-    """Of the clip in its sequence."""
+    """Index of the clip in its sequence, from 0."""
     kind: Kind
+    """Human hands or a robot gripper."""
     verb: str
+    """Action of the clip, such as "carry"."""
     target: str
-    """Name of the thing that is acted on."""
+    """Name of the manipulated body."""
     caption: str
+    """Prompt that describes the action."""
     cameras: Cameras
+    """Camera of every frame."""
     frames: UInt8[np.ndarray, "f h w 3"]
+    """RGB video."""
     depth_m: Float32[np.ndarray, "f h w"]
+    """Depth along the camera axis in meters; infinite where a ray hits nothing."""
     ids: Int[np.ndarray, "f h w"]
+    """Instance id of every pixel (`scene.py`)."""
     joints_m: Float[np.ndarray, "f n j 3"]
+    """World positions of the joints of n hands in meters."""
     world_from_body: Mapping[str, Float[np.ndarray, "f 4 4"]]
-    """Pose of every body; of an articulated one, that of its moving part."""
+    """Pose of every body in every frame; for an articulated body, of its moving part."""
     body_ids: Mapping[str, int]
-    """Id of the same in `ids`."""
+    """Instance id in `ids` of every body or moving part."""
     parts: Mapping[str, Part]
-    """The mesh of the same, in its own coordinates."""
+    """Mesh of every body or moving part, in its own coordinates."""
     paints: Mapping[int, tuple[int, int, int]]
-    """RGB of everything by its id in `ids`, in full light."""
+    """Unshaded RGB color by instance id."""
     first: Picture
-    """The first frame without hands."""
+    """First frame without hands."""
     state: SceneState
-    """The scene as its first frame shows it without hands, a moving part and its case apart."""
+    """Points visible in the first frame without hands; a moving part and its case have own ids."""
 
 
 def make_sequence(
     seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human", bare: bool = False
 ) -> Iterator[TabletopClip]:
-    """The clips of a seed, each `spec.frames` long; robots have one gripper.
+    """Yield the clips of a seed, each `spec.frames` long; a robot has one gripper.
 
-    Equal seeds give equal clips at equal sizes, and the same events at any. `bare` leaves the hands
-    and what they act on out of the pictures: the background of the same clip.
+    Equal seeds give equal clips at equal sizes, and the same events at any size. `bare` renders the
+    same clips without hands and manipulated body, which gives their background.
     """
     rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
     scene = make_scene(rng)
@@ -88,7 +99,7 @@ def make_sequence(
 
 
 def _cameras(times: np.ndarray, eye: np.ndarray, sway: tuple[Any, Any], spec: VideoSpec) -> Cameras:
-    """A head that sways and looks about the middle of the table."""
+    """Return cameras of a head that sways while it looks at the middle of the table."""
     phases, rates = sway
     swing = np.sin(phases + 2 * np.pi * 0.45 * rates * times[:, None])
     eyes = eye + swing[:, :3] * [0.04, 0.02, 0.02]
@@ -120,7 +131,7 @@ def _clip(
         placed = moment.scene.placed()
         here = []
         for index, hand in enumerate(moment.hands):
-            keypoints, parts = actions.parts_of(hand, kind)
+            keypoints, parts = actions.hand_parts(hand, kind)
             here.append(keypoints)
             placed += [
                 Placed(part=part, world_from_part=np.eye(4), number=FIRST_HAND + 2 * index + k)
@@ -131,8 +142,8 @@ def _clip(
         if bare:
             target = moment.scene.number(intent.name)
             placed = [x for x in placed if x.number < FIRST_HAND and x.number != target]
-        pictures.append(_look(Stage(placed), pose, cameras))
-    first, state = _first_look(moments[0].scene, cameras)
+        pictures.append(_render(RayCaster(placed), pose, cameras))
+    first, state = _first_view(moments[0].scene, cameras)
     who = f"The {moments[0].hands[0].side} hand" if kind == "human" else "The gripper"
     return TabletopClip(
         seed=seed,
@@ -155,8 +166,8 @@ def _clip(
     )
 
 
-def _look(stage: Stage, pose: np.ndarray, cameras: Cameras) -> Picture:
-    return stage.look(pose, cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+def _render(caster: RayCaster, pose: np.ndarray, cameras: Cameras) -> Picture:
+    return caster.render(pose, cameras.intrinsics_px, height=cameras.height, width=cameras.width)
 
 
 def _poses(moments: list[Moment]) -> dict[str, np.ndarray]:
@@ -171,13 +182,13 @@ def _numbers(scene: Scene) -> dict[str, int]:
     return {body.name: scene.number(body.name) for body in scene.bodies}
 
 
-def _first_look(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
-    """The first frame without hands, and the points of a finer picture of it."""
-    stage, pose = Stage(scene.placed()), cameras.world_from_camera[0]
-    first = _look(stage, pose, cameras)
-    intrinsics = finer(cameras.intrinsics_px, FINER)
-    height, width = FINER * cameras.height, FINER * cameras.width
-    fine = stage.look(pose, intrinsics, height=height, width=width)
+def _first_view(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
+    """Render the first frame without hands, and unproject a finer rendering of it to points."""
+    caster, pose = RayCaster(scene.placed()), cameras.world_from_camera[0]
+    first = _render(caster, pose, cameras)
+    intrinsics = finer(cameras.intrinsics_px, POINTS_PER_PIXEL)
+    height, width = POINTS_PER_PIXEL * cameras.height, POINTS_PER_PIXEL * cameras.width
+    fine = caster.render(pose, intrinsics, height=height, width=width)
     seen = np.isfinite(fine.depth_m)
     rays = pixel_rays(intrinsics, height=height, width=width)
     points = transform(pose, rays[seen] * fine.depth_m[seen][:, None])
@@ -193,7 +204,7 @@ def _first_look(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
 
 
 def state_after(clip: TabletopClip, state: SceneState) -> SceneState:
-    """A state before the clip with every thing moved as it truly moved; nothing new is seen."""
+    """Move the objects of a state by their ground-truth motion in the clip; add no points."""
     points = state.points_m.copy()
     for name, world_from_body in clip.world_from_body.items():
         moved = state.object_ids == clip.body_ids[name]
@@ -203,12 +214,12 @@ def state_after(clip: TabletopClip, state: SceneState) -> SceneState:
 
 
 def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
-    """The clip in EgoSim's format: prior and mask from a state, hands as skeletons.
+    """Return the clip in EgoSim's format: prior and mask rendered from a state, hands as skeletons.
 
-    The state is the clip's own, with the true picture of its first camera, unless another is given:
-    one that was carried over from the clip before, as in the closed loop, where the first picture
-    is the state's own and has holes. What leaves the view, hands and things, is simply not seen
-    there. A first frame without any point raises `InputError`.
+    By default the state is the clip's own and the first frame is ray cast. A given state, such as
+    one carried over from the clip before in the closed loop, also renders the first frame, holes
+    included. Hands and objects may leave the view. Raises `InputError` if the first frame shows no
+    point.
     """
     view = render(state or clip.state, clip.cameras, point_px=POINT_PX)
     hands, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
@@ -226,12 +237,12 @@ def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
 
 
 def to_action(clip: TabletopClip) -> Action:
-    """What the wearer does in the clip."""
+    """Return cameras, hand joints and prompt of the clip."""
     return Action(cameras=clip.cameras, joints_m=clip.joints_m, kind=clip.kind, prompt=clip.caption)
 
 
-def to_truth(clip: TabletopClip) -> Truth:
-    """What perception should find in the clip."""
+def to_ground_truth(clip: TabletopClip) -> Truth:
+    """Return the ground truth that perception is compared with."""
     ids = np.where(clip.ids >= FIRST_HAND, FIRST_HAND - 1 - clip.ids, clip.ids)
     return Truth(
         cameras=clip.cameras,

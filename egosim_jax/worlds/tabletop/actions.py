@@ -1,9 +1,9 @@
-"""What the hands do in a clip: reach, grasp, act, release, retreat.
+"""Hand motion of a clip: reach, grasp, manipulate, release, retreat.
 
-A hand moves through keyframes, each a place of the point between its grasping tips, a turn about
-the vertical, a pitch downwards and a closure; between two keyframes it speeds up for a quarter of
-the time and slows down for a quarter. From the grasp to the release the thing moves rigidly with
-that point and that turn, so that the truth of its pose is exact.
+A hand moves through keyframes, each a position of the point between its grasping fingertips, a yaw,
+a downward pitch and a closure; between two keyframes it accelerates for a quarter of the time and
+decelerates for a quarter. From grasp to release the body moves rigidly with that point and yaw, so
+that its ground-truth pose is exact.
 """
 
 from __future__ import annotations
@@ -17,33 +17,35 @@ from jaxtyping import Float
 from egosim_jax.geometry import turned
 from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Body, Part
-from egosim_jax.worlds.tabletop.hands import Side, closure_for, flesh, joints_of, pinch
+from egosim_jax.worlds.tabletop.hands import Side, closure_for, hand_meshes, joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import Scene, moving_part
 
 Verb = Literal["carry", "lift", "turn", "stack", "open", "close"]
 FLAT: tuple[str, ...] = ("box", "cylinder", "lidded box", "drawer")
-"""Shapes on which something can be put."""
+"""Shapes that others can be stacked on."""
 REST_M = {"right": np.array([0.13, 0.12, 0.09]), "left": np.array([-0.13, 0.12, 0.09])}
-"""Where a hand's grasping point waits."""
-CARRY_M, NEAR_M = (0.10, 0.20), 0.26
-"""Least and greatest way that a thing is carried; how far off a hand looks for something to do."""
+"""Position of the grasping point of a hand at rest, in meters."""
+CARRY_M = (0.10, 0.20)
+"""Minimum and maximum distance that a body is carried, in meters."""
+NEAR_M = 0.26
+"""Distance within which a hand prefers its next target, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """A hand at one moment."""
+    """The configuration of a hand at one moment."""
 
     point_m: Float[np.ndarray, " 3"]
-    """Between the tips that grasp."""
+    """Point between the grasping fingertips in meters."""
     yaw: float
-    """Turn about the vertical in radians; 0 points away from the wearer."""
+    """Rotation about the vertical in radians; 0 points away from the wearer."""
     pitch: float
-    """How far the fingers point down, in radians."""
+    """Downward pitch of the fingers in radians."""
     closure: float
-    """From open (0) to closed (1)."""
+    """Closure from open (0) to closed (1)."""
 
     def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
-        """Joints in the world, and the direction of the back of the hand."""
+        """Return joints in the world, and the unit vector of the back of the hand."""
         cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
         rotation = turned(self.yaw) @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
         local = joints_of(kind, self.closure, side)
@@ -52,32 +54,38 @@ class Grip:
 
 @dataclass(frozen=True, kw_only=True)
 class Hand:
-    """One hand of the wearer between two clips."""
+    """One hand of the wearer at one moment."""
 
     side: Side
+    """Left or right."""
     grip: Grip
+    """Configuration."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intent:
-    """What is going to happen to which thing."""
+    """The action of a clip and its target."""
 
     verb: Verb
+    """Action."""
     name: str
-    """The thing that is grasped."""
-    place_m: Float[np.ndarray, " 3"] | None = None
-    """Where its origin ends, for `carry` and `stack`."""
+    """Name of the grasped body."""
+    goal_m: Float[np.ndarray, " 3"] | None = None
+    """Final position of its origin in meters, for `carry` and `stack`."""
     turn: float = 0.0
-    """By how much about the vertical, for `turn`."""
+    """Rotation about the vertical in radians, for `turn`."""
     caption: str = ""
+    """Caption without its subject, such as "lifts the red box and puts it back."."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """Hands and scene at one frame."""
+    """Scene and hands at one frame."""
 
     scene: Scene
+    """Arrangement of all bodies."""
     hands: tuple[Hand, ...]
+    """Hands; the first one acts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,10 +97,10 @@ class _Key:
 
 
 def smooth(share: float) -> float:
-    """From 0 to 1: speed up over a quarter, go on evenly, slow down over a quarter.
+    """Ease from 0 to 1: accelerate for a quarter, keep the speed, decelerate for a quarter.
 
-    At most 4/3 of the mean speed, where the minimum-jerk curve has 15/8: what moves fast is what a
-    video VAE with a stride of four frames blurs.
+    The maximum is 4/3 of the mean speed, versus 15/8 of the minimum-jerk curve: a video VAE with a
+    temporal stride of four blurs fast motion.
     """
     s = min(max(share, 0.0), 1.0)
     if s < 0.25:
@@ -101,19 +109,19 @@ def smooth(share: float) -> float:
 
 
 def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) -> Intent:
-    """A random action that the scene allows; if there are any, with what is near the hand."""
+    """Sample an action that the scene allows, with a target near the hand if there is one."""
     options: list[Intent] = []
     for body in scene.bodies:
-        if body.stays or (_covered(scene, body) and body.shape != "drawer"):
+        if body.static or (_covered(scene, body) and body.shape != "drawer"):
             continue
         if body.articulated:
             open_now = scene.openings[body.name] > 0.5
             verb: Verb = "close" if open_now else "open"
             part = "drawer of the" if body.shape == "drawer" else "lid of the"
-            said = f"{verb}s the {part} {body.name}."
-            options += [Intent(verb=verb, name=body.name, caption=said)] * 2
+            caption = f"{verb}s the {part} {body.name}."
+            options += [Intent(verb=verb, name=body.name, caption=caption)] * 2
         else:
-            options += _with_loose(scene, body, rng)
+            options += _loose_actions(scene, body, rng)
     if hand is not None:
         here = hand.grip.point_m[:2]
         gaps = [np.linalg.norm(scene.body(o.name).world_from_body[:2, 3] - here) for o in options]
@@ -122,14 +130,14 @@ def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) 
     return options[int(rng.integers(len(options)))]
 
 
-def _with_loose(scene: Scene, body: Body, rng: np.random.Generator) -> list[Intent]:
+def _loose_actions(scene: Scene, body: Body, rng: np.random.Generator) -> list[Intent]:
     name = body.name
     options = [Intent(verb="lift", name=name, caption=f"lifts the {name} and puts it back.")]
     angle = float(rng.choice([-1, 1]) * rng.uniform(np.radians(50), np.radians(80)))
     if body.shape == "box":
         way = "left" if angle > 0 else "right"
-        said = f"turns the {name} to the {way}."
-        options.append(Intent(verb="turn", name=name, turn=angle, caption=said))
+        caption = f"turns the {name} to the {way}."
+        options.append(Intent(verb="turn", name=name, turn=angle, caption=caption))
     place = scene.free_place(body, rng, away_m=CARRY_M)
     if place is not None:
         here = body.world_from_body[:3, 3]
@@ -137,9 +145,9 @@ def _with_loose(scene: Scene, body: Body, rng: np.random.Generator) -> list[Inte
         side = "right" if way[0] > 0 else "left"
         depth = "to the back" if way[1] > 0 else "to the front"
         words = f"to the {side}" if abs(way[0]) > abs(way[1]) else depth
-        said = f"picks up the {name} and puts it down {words}."
+        caption = f"picks up the {name} and puts it down {words}."
         goal = np.array([place[0], place[1], 0.0])
-        options += [Intent(verb="carry", name=name, place_m=goal, caption=said)] * 2
+        options += [Intent(verb="carry", name=name, goal_m=goal, caption=caption)] * 2
     below = [
         other
         for other in scene.bodies
@@ -153,13 +161,13 @@ def _with_loose(scene: Scene, body: Body, rng: np.random.Generator) -> list[Inte
     if below and body.world_from_body[2, 3] < 0.01:
         other = below[int(rng.integers(len(below)))]
         goal = other.world_from_body[:3, 3] + [0, 0, other.size_m[2]]
-        said = f"puts the {name} on the {other.name}."
-        options += [Intent(verb="stack", name=name, place_m=goal, caption=said)] * 2
+        caption = f"puts the {name} on the {other.name}."
+        options += [Intent(verb="stack", name=name, goal_m=goal, caption=caption)] * 2
     return options
 
 
 def _covered(scene: Scene, body: Body) -> bool:
-    """Whether something stands on it."""
+    """Return whether another body is on top of a body."""
     x, y, z = body.world_from_body[:3, 3]
     return any(
         other.world_from_body[2, 3] > z + 0.01
@@ -170,7 +178,7 @@ def _covered(scene: Scene, body: Body) -> bool:
 
 
 def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generator) -> Hand:
-    """A hand on the side of the thing, waiting in the air before it."""
+    """Return the acting hand of the first clip, in the air in front of its target."""
     grasp = _grasp(scene, intent, kind, "right")
     side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.04) > 0 else "left"
     before = grasp.point_m + [0, -0.09, 0.07] + rng.normal(0, 0.015, 3)
@@ -180,7 +188,7 @@ def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generato
 
 
 def waiting_hand(other: Side, rng: np.random.Generator) -> Hand:
-    """The hand of the other side, at rest."""
+    """Return the hand of the other side, at rest."""
     side: Side = "left" if other == "right" else "right"
     point = REST_M[side] + rng.normal(0, 0.012, 3) + [0.06 if side == "right" else -0.06, 0, -0.03]
     return Hand(side=side, grip=_relaxed(point, side, "human"))
@@ -193,7 +201,7 @@ def _relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
 
 
 def _grasp(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
-    """The hand when it has just taken hold."""
+    """Return the configuration in which the hand grasps the target."""
     body = scene.body(intent.name)
     inward = 0.5 if side == "right" else -0.5
     if body.articulated:
@@ -217,9 +225,9 @@ def _grasp(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
 def act(
     scene: Scene, hands: tuple[Hand, ...], intent: Intent, kind: Kind, *, frames: int
 ) -> list[Moment]:
-    """Hands and scene at every frame of a clip; the first hand acts, the others wait.
+    """Return scene and hands at every frame of a clip; the first hand acts, the others rest.
 
-    The first moment is the one given, so that the last of one clip is the first of the next.
+    The first moment is the given one: the last moment of a clip is the first of the next.
     """
     hand = hands[0]
     keys = _keys(scene, hand, intent, kind)
@@ -234,14 +242,14 @@ def act(
             if body.articulated:
                 now = scene.with_opening(intent.name, opening)
             else:
-                now = scene.with_pose(intent.name, _carried(body.world_from_body, grasp, held_grip))
+                now = scene.with_pose(intent.name, _carry(body.world_from_body, grasp, held_grip))
         acting = Hand(side=hand.side, grip=grip)
         moments.append(Moment(scene=now, hands=(acting, *hands[1:])))
     return moments
 
 
-def _carried(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
-    """Where a body is when the hand that took it at `grasp` is at `grip`."""
+def _carry(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
+    """Return the pose at `grip` of a body that was grasped at `grasp`."""
     turn = turned(grip.yaw - grasp.yaw)
     pose = np.eye(4)
     pose[:3, :3] = turn @ world_from_body[:3, :3]
@@ -250,18 +258,18 @@ def _carried(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray
 
 
 def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
-    """The keyframes of a clip."""
+    """Return the keyframes of the acting hand."""
     start, grasp = hand.grip, _grasp(scene, intent, kind, hand.side)
     opened = closure_for(kind, 0.085) if kind == "robot" else 0.12
     body = scene.body(intent.name)
-    above = _moved(grasp, [0, -0.02, 0.03], closure=opened)
+    above = _shift(grasp, [0, -0.02, 0.03], closure=opened)
     reach = 0.10 + 0.6 * min(0.4, float(np.linalg.norm(start.point_m - grasp.point_m)))
     begin, end = reach + 0.10, 0.76
     first = scene.openings.get(intent.name, 0.0)
     keys = [
         _Key(time=0.0, grip=start, opening=first),
         _Key(time=reach, grip=above, opening=first),
-        _Key(time=begin - 0.04, grip=_moved(grasp, [0, 0, 0], closure=opened), opening=first),
+        _Key(time=begin - 0.04, grip=_shift(grasp, [0, 0, 0], closure=opened), opening=first),
         _Key(time=begin, grip=grasp, held=True, opening=first),
     ]
     if body.articulated:
@@ -276,7 +284,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
         final = grasp
         for share, height in ((0.35, 0.07), (0.5, 0.075), (0.65, 0.07), (1.0, 0.0)):
             time = begin + share * (end - begin)
-            keys.append(_Key(time=time, grip=_moved(grasp, [0, 0, height]), held=True))
+            keys.append(_Key(time=time, grip=_shift(grasp, [0, 0, height]), held=True))
     elif intent.verb == "turn":
         final = Grip(
             point_m=grasp.point_m, yaw=grasp.yaw + intent.turn, pitch=grasp.pitch,
@@ -284,17 +292,17 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
         )  # fmt: skip
         keys.append(_Key(time=end, grip=final, held=True))
     else:
-        way = intent.place_m - body.world_from_body[:3, 3]
-        final = _moved(grasp, way)
+        way = intent.goal_m - body.world_from_body[:3, 3]
+        final = _shift(grasp, way)
         clear = 0.03 + 0.15 * float(np.linalg.norm(way[:2])) + max(0.0, way[2])
         rise, sink = [*(0.2 * way[:2]), clear * 0.8], [*(0.8 * way[:2]), clear]
         keys += [
-            _Key(time=begin + 0.3 * (end - begin), grip=_moved(grasp, rise), held=True),
-            _Key(time=begin + 0.72 * (end - begin), grip=_moved(grasp, sink), held=True),
+            _Key(time=begin + 0.3 * (end - begin), grip=_shift(grasp, rise), held=True),
+            _Key(time=begin + 0.72 * (end - begin), grip=_shift(grasp, sink), held=True),
             _Key(time=end, grip=final, held=True),
         ]
     last_opening = keys[-1].opening
-    away = _moved(final, [0, -0.015, 0.02], closure=opened)
+    away = _shift(final, [0, -0.015, 0.02], closure=opened)
     rest = _relaxed(_retreat(final.point_m, hand.side), hand.side, kind)
     keys += [
         _Key(time=end + 0.05, grip=away, opening=last_opening),
@@ -304,12 +312,12 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
 
 
 def _retreat(point_m: np.ndarray, side: Side) -> np.ndarray:
-    """Up and back towards where the hand rests, so that what it has left can be seen."""
+    """Return a point above and towards rest, so that the hand does not occlude the target."""
     up = point_m + [0, -0.06, 0.05]
     return up + 0.3 * (REST_M[side] - up)
 
 
-def _moved(grip: Grip, by: object, *, closure: float | None = None) -> Grip:
+def _shift(grip: Grip, by: object, *, closure: float | None = None) -> Grip:
     return Grip(
         point_m=grip.point_m + np.asarray(by, float),
         yaw=grip.yaw,
@@ -319,10 +327,10 @@ def _moved(grip: Grip, by: object, *, closure: float | None = None) -> Grip:
 
 
 def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
-    """The hand at a time; the grip that fixes where the thing is, once it has been taken."""
+    """Interpolate keyframes: the grip, the grip that holds the body once grasped, the opening."""
     held = [key for key in keys if key.held]
     begin, end = held[0].time, held[-1].time
-    if begin < time < end:  # from standing to standing, without a stop at the keyframes between
+    if begin < time < end:  # from rest to rest, without a stop at the keyframes between
         time = begin + smooth((time - begin) / (end - begin)) * (end - begin)
     index = max(i for i, key in enumerate(keys) if key.time <= time + 1e-9)
     if index == len(keys) - 1:
@@ -343,9 +351,9 @@ def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
     return grip, grip if time <= end else held[-1].grip, opening
 
 
-def parts_of(hand: Hand, kind: Kind) -> tuple[Float[np.ndarray, "j 3"], tuple[Part, ...]]:
-    """Joints and flesh of a hand in the world; the forearm comes from the wearer's elbow."""
+def hand_parts(hand: Hand, kind: Kind) -> tuple[Float[np.ndarray, "j 3"], tuple[Part, ...]]:
+    """Return joints and meshes of a hand in the world; the forearm starts at the wearer's elbow."""
     joints, back = hand.grip.pose(kind, hand.side)
     outward = 0.24 if hand.side == "right" else -0.24
     elbow = np.array([0.5 * joints[0][0] + outward, -0.20, 0.5 * joints[0][2]])
-    return joints, flesh(joints, elbow, kind, back)
+    return joints, hand_meshes(joints, elbow, kind, back)

@@ -1,7 +1,7 @@
-"""What stands in the tabletop world: shapes, their paint, and where they are put at the start.
+"""Bodies of the tabletop world: meshes, solid textures and articulated furniture.
 
-The world's axes: x right, y away from the wearer, z up, in meters; the table top is z = 0 and its
-near edge y = 0. A body's own origin lies in the middle of its underside.
+World axes: x right, y away from the wearer, z up, in meters; the table top is z = 0 and its near
+edge y = 0. The origin of a body is the center of its underside.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from egosim_jax.types import InputError
 
 Shape = Literal["box", "cylinder", "ball", "cone", "ring", "cup", "lidded box", "drawer"]
 LOOSE: tuple[Shape, ...] = ("box", "cylinder", "ball", "cone", "ring", "cup")
-"""Shapes that can be picked up."""
+"""Shapes of bodies that can be picked up."""
 COLORS = {
     "red": (196, 48, 43),
     "orange": (226, 126, 38),
@@ -28,32 +28,33 @@ COLORS = {
     "white": (226, 224, 216),
     "black": (16, 16, 17),
 }
-STAYS = "black"
-"""Color of things that are never acted on. In a prior they look like what was never seen, so that
-the mask has to tell; and a black thing could not be found in a picture by its color."""
+"""RGB by the color name in captions."""
+STATIC_COLOR = "black"
+"""Color of bodies that are never manipulated. In a prior they look like unobserved pixels, so that
+only the mask tells them apart; and a black body could not be segmented by its color."""
 TABLE_SIZE_M = (1.3, 0.62, 0.03)
+"""Extent of the table top in meters."""
 REACH_M = (-0.20, 0.20, 0.15, 0.37)
-"""Least and greatest x and y at which things are put: within sight and reach."""
-
+"""Minimum and maximum x, then y, of placed bodies in meters: within view and reach."""
 
 Pattern = Literal["plain", "stripes", "checks", "grain"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Paint:
-    """A solid texture: a color at every point of a body's own space."""
+    """A solid texture: a color at every point of a body's local frame."""
 
     color: tuple[int, int, int]
     """RGB."""
     second: tuple[int, int, int]
     """RGB of the pattern."""
     pattern: Pattern
-    """What alternates between the two."""
+    """Alternation between both colors."""
     scale_m: float
-    """Length of a repetition."""
+    """Period of the pattern in meters."""
 
     def at(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """RGB in [0, 1] at points of the body's space."""
+        """Return RGB in [0, 1] at points in the body's local frame."""
         first, second = np.array([self.color, self.second], points_m.dtype) / 255
         if self.pattern == "plain":
             return np.broadcast_to(first, points_m.shape)
@@ -72,18 +73,22 @@ class Paint:
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """A rigid piece: a triangle mesh in its own space, and its paint."""
+    """A rigid part: a textured triangle mesh in its local frame."""
 
     name: str
+    """Name, for debugging."""
     vertices_m: Float[np.ndarray, "v 3"]
+    """Vertices in meters."""
     triangles: Int[np.ndarray, "t 3"]
+    """Vertex indices of each triangle."""
     paint: Paint
+    """Texture."""
     smooth: bool = False
-    """Whether the mesh stands for a round surface, shaded without facets."""
+    """Interpolate vertex normals, for round surfaces."""
 
     @cached_property
     def vertex_normals(self) -> Float32[np.ndarray, "v 3"]:
-        """Of each vertex: the mean of its triangles' normals, by area."""
+        """Area-weighted mean normal of the triangles of each vertex."""
         a, b, c = (self.vertices_m[self.triangles[:, k]] for k in range(3))
         faces = np.cross(b - a, c - a)
         normals = np.zeros_like(self.vertices_m)
@@ -95,31 +100,32 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """A thing on the table."""
+    """An object on the table."""
 
     name: str
-    """What a caption calls it, such as "red box"; unique in a scene."""
+    """Name in captions, such as "red box"; unique in a scene."""
     shape: Shape
+    """Shape class."""
     size_m: tuple[float, float, float]
-    """Extent along its own axes."""
+    """Extent along the axes of its local frame in meters."""
     parts: tuple[Part, ...]
-    """The first is what moves when the thing is opened or carried; loose bodies have one."""
+    """Rigid parts; the first one moves when the body is opened or carried."""
     world_from_body: Float[np.ndarray, "4 4"]
-    """Pose at the start."""
+    """Pose."""
 
     @property
-    def stays(self) -> bool:
-        """Whether it is left alone."""
-        return self.name.startswith(STAYS)
+    def static(self) -> bool:
+        """True for a body that is never manipulated."""
+        return self.name.startswith(STATIC_COLOR)
 
     @property
     def articulated(self) -> bool:
-        """Whether it is opened instead of carried."""
+        """True for a body that is opened instead of carried."""
         return len(self.parts) > 1
 
 
 def mesh(kind: str, **sizes: float | int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of an Open3D shape."""
+    """Return vertices and triangles of an Open3D primitive."""
     import open3d as o3d
 
     shape = getattr(o3d.geometry.TriangleMesh, f"create_{kind}")(**sizes)
@@ -129,16 +135,19 @@ def mesh(kind: str, **sizes: float | int) -> tuple[np.ndarray, np.ndarray]:
 def box(
     low: tuple[float | int, ...], high: tuple[float | int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A box between two corners."""
+    """Return the mesh of an axis-aligned box between two corners."""
     extent = np.subtract(high, low).astype(float)
     if (extent <= 0).any():
-        raise InputError(f"A box from {low} to {high} is empty: every side must be positive.")
+        raise InputError(
+            f"The box from {low} to {high} is empty: each coordinate of the second corner must "
+            "exceed that of the first."
+        )
     vertices, triangles = mesh("box", width=extent[0], height=extent[1], depth=extent[2])
     return vertices + np.array(low), triangles
 
 
 def join(*pieces: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Several meshes as one."""
+    """Concatenate meshes."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
     vertices = np.concatenate([vertices for vertices, _ in pieces])
     triangles = [tri + start for (_, tri), start in zip(pieces, starts, strict=False)]
@@ -148,9 +157,9 @@ def join(*pieces: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 def split_edges(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface with vertices doubled along edges sharper than 50 degrees.
+    """Duplicate vertices along edges sharper than 50 degrees.
 
-    Normals that are means over a vertex's triangles then stay sharp where the shape is.
+    Vertex normals, which are means over the triangles of a vertex, then keep those edges sharp.
     """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -173,7 +182,7 @@ def split_edges(
 
 
 def _outline(shape: Shape, size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh of a loose body."""
+    """Return the mesh of a loose body."""
     x, y, z = size
     radius = x / 2
     if shape == "box":
@@ -200,7 +209,7 @@ def _outline(shape: Shape, size: tuple[float, float, float]) -> tuple[np.ndarray
 
 
 def _tube(outer: float, inner: float, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """A cylinder with a hole from above that ends at its floor."""
+    """Return the mesh of a cup: a cylinder that is open at the top."""
     angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     floor = 0.006
@@ -217,13 +226,13 @@ def _tube(outer: float, inner: float, height: float) -> tuple[np.ndarray, np.nda
 
 
 def darker(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    """The same color in shade."""
+    """Return 58 % of a color's brightness."""
     red, green, blue = (int(0.58 * value) for value in color)
     return red, green, blue
 
 
 def make_loose(shape: Shape, color: str, rng: np.random.Generator) -> Body:
-    """A thing to pick up, of random size, at the origin."""
+    """Return a loose body of random size and pattern at the origin."""
     width = float(rng.uniform(0.066, 0.08))
     height = float(rng.uniform(0.065, 0.09))
     if shape == "ball":
@@ -253,7 +262,7 @@ def make_loose(shape: Shape, color: str, rng: np.random.Generator) -> Body:
 
 
 def make_drawer(color: str) -> Body:
-    """A cabinet whose drawer slides out towards the wearer (-y)."""
+    """Return a cabinet whose drawer slides towards the wearer (-y)."""
     width, depth, height, wall = 0.16, 0.12, 0.08, 0.008
     x, y = width / 2, depth / 2
     case = join(
@@ -287,7 +296,7 @@ def make_drawer(color: str) -> Body:
 
 
 def make_lidded_box(color: str) -> Body:
-    """A box whose lid turns about its far upper edge; the lid's own origin lies on that hinge."""
+    """Return a box whose lid rotates about its far upper edge."""
     width, depth, height, wall, lid = 0.13, 0.10, 0.06, 0.007, 0.012
     x, y = width / 2, depth / 2
     case = join(

@@ -1,4 +1,4 @@
-"""Shards of tabletop clips, made in parallel, one file a scene until all are there."""
+"""Datasets of the tabletop world: shards rendered in parallel, resumable scene by scene."""
 
 from __future__ import annotations
 
@@ -15,69 +15,70 @@ from egosim_jax import interrupts
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, gather, to_bytes
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.run import open_folder
+from egosim_jax.io.run import open_folder, plain
 from egosim_jax.types import InputError, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, state_after, to_triplet
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Which clips are made; equal plans make equal shards."""
+class DatasetConfig:
+    """Settings of a tabletop dataset; equal settings give equal shards."""
 
     seeds: tuple[int, ...]
-    """One scene each."""
+    """Seeds of the scenes."""
     clips: int
-    """In a row in each scene; those after the first see the state that the one before left."""
+    """Consecutive clips of each scene; all after the first start from the state of the last one."""
     spec: VideoSpec
+    """Length and size of the clips."""
     kind: Kind | Literal["mixed"]
-    """Whose hands; mixed: a robot's in the scenes whose seed is a multiple of four."""
+    """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
 
     def kind_of(self, seed: int) -> Kind:
-        """Whose hands act in a scene."""
+        """Return the kind of hands of a scene."""
         if self.kind == "mixed":
             return "human" if seed % 4 else "robot"
         return self.kind
 
     def __post_init__(self) -> None:
-        """Check that there is something to make."""
+        """Raise `InputError` if the dataset would be empty."""
         if not self.seeds or self.clips < 1:
             raise InputError(
-                f"{len(self.seeds)} scenes of {self.clips} clips are nothing: give at least one "
-                "of each. (--scenes, --clips)"
+                f"The dataset is empty: it has {len(self.seeds)} scenes of {self.clips} clips; "
+                "both must be at least 1. (--scenes, --clips)"
             )
 
 
-def make_shards(plan: Plan, *, out: Path, workers: int) -> Iterator[int]:
-    """Write the shards of a plan; yields each seed when its scene is done.
+def make_shards(config: DatasetConfig, *, out: Path, workers: int) -> Iterator[int]:
+    """Write the shards of a dataset; yield each seed when its scene is done.
 
-    Finished scenes lie in `out`/parts, so that an interrupted run goes on where it stopped.
+    Finished scenes are kept in `out`/parts, so that the same call resumes an interrupted one.
     """
     parts = out / "parts"
-    open_folder(out, plan)
+    open_folder(out, {**plain(config), "type": "Plan"})  # the type in folders of earlier versions
     if (out / MANIFEST).exists():
-        shutil.rmtree(parts, ignore_errors=True)  # it was killed just then
-        yield from plan.seeds
+        shutil.rmtree(parts, ignore_errors=True)  # killed between writing shards and removing parts
+        yield from config.seeds
         return
     parts.mkdir(exist_ok=True)
-    missing = [seed for seed in plan.seeds if not _part(parts, seed, plan.clips - 1).exists()]
-    yield from (seed for seed in plan.seeds if seed not in missing)
-    # One thread a process: two that share the cores among threads take twice as long.
+    missing = [seed for seed in config.seeds if not _part(parts, seed, config.clips - 1).exists()]
+    yield from (seed for seed in config.seeds if seed not in missing)
+    # One thread per process: two processes that share the cores by threads take twice as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
     pool = ProcessPoolExecutor(workers, mp_context=context)
     try:
         with interrupts.not_inherited():
-            jobs = {pool.submit(_make, plan, seed, parts): seed for seed in missing}
+            jobs = {pool.submit(_make, config, seed, parts): seed for seed in missing}
         for job in as_completed(jobs):
             job.result()
             yield jobs[job]
-    finally:  # after an error or Ctrl-C, scenes that are not begun are left
+    finally:  # after an error or Ctrl-C, scenes that have not started are canceled
         pool.shutdown(cancel_futures=True)
-    _gather(plan, parts, out)
+    _gather(config, parts, out)
 
 
-def _make(plan: Plan, seed: int, parts: Path) -> None:
-    sequence = make_sequence(seed, spec=plan.spec, clips=plan.clips, kind=plan.kind_of(seed))
+def _make(config: DatasetConfig, seed: int, parts: Path) -> None:
+    sequence = make_sequence(seed, spec=config.spec, clips=config.clips, kind=config.kind_of(seed))
     state = None
     for number, clip in enumerate(sequence):
         path = _part(parts, seed, number)
@@ -90,15 +91,15 @@ def _part(parts: Path, seed: int, number: int) -> Path:
     return parts / f"{seed}_{number}.record"
 
 
-def _gather(plan: Plan, parts: Path, out: Path) -> None:
-    """Put the parts into shards, in the order of the plan, and remove them."""
-    provenance = {"world": "tabletop", "kind": plan.kind, "seeds": list(plan.seeds)}
-    whole = parts / "shards"
+def _gather(config: DatasetConfig, parts: Path, out: Path) -> None:
+    """Write the parts to shards, in the order of the seeds, and remove them."""
+    provenance = {"world": "tabletop", "kind": config.kind, "seeds": list(config.seeds)}
+    complete = parts / "shards"
     with ShardWriter(
-        whole, kind="frames", spec=plan.spec, provenance=provenance, overwrite=True
+        complete, kind="frames", spec=config.spec, provenance=provenance, overwrite=True
     ) as writer:
-        for path in (_part(parts, s, n) for s in plan.seeds for n in range(plan.clips)):
+        for path in (_part(parts, s, n) for s in config.seeds for n in range(config.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)
             writer.add(record.arrays, record.metadata)
-    gather([whole], out)
+    gather([complete], out)
     shutil.rmtree(parts)

@@ -1,8 +1,8 @@
-"""The wearer's hands: their joints by forward kinematics, and the flesh around them.
+"""Hands and grippers: joints by forward kinematics, and the meshes around them.
 
-A right hand's own space has the wrist at the origin, the fingers along y, the back of the hand
-along z and the thumb on the side of -x; a left hand is its mirror image in x. A gripper's has its
-wrist at the origin and its two fingers along y, opening along x.
+A right hand's local frame has the wrist at the origin, the fingers along y, the back of the hand
+along z and the thumb on the side of -x; a left hand is its mirror image in x. A gripper's frame has
+its wrist at the origin and its two fingers along y, opening along x.
 """
 
 from __future__ import annotations
@@ -22,28 +22,30 @@ Side = Literal["left", "right"]
 
 KNUCKLES_M = np.array([[-0.026, 0.090, 0.0], [-0.004, 0.094, 0.002], [0.017, 0.088, 0.0],
                        [0.036, 0.078, -0.004]])  # fmt: skip
-"""Of index, middle, ring and little finger."""
+"""Knuckles of index, middle, ring and little finger in the local frame, in meters."""
 PHALANGES_M = np.array([[0.042, 0.025, 0.021], [0.046, 0.029, 0.022], [0.042, 0.027, 0.022],
                         [0.033, 0.020, 0.019]])  # fmt: skip
+"""Lengths of the three phalanges of each finger in meters."""
 SPREAD = np.radians([8.0, 1.0, -6.0, -14.0])
-"""How far the open fingers point towards the thumb."""
+"""Angle of each open finger towards the thumb, in radians."""
 THUMB_M = (np.array([-0.028, 0.026, -0.014]), (0.040, 0.031, 0.025))
-"""First joint of the thumb, and the lengths after it."""
+"""First joint of the thumb, and the lengths of its three segments, in meters."""
 GRIPPER_M = (0.12, 0.10)
-"""Length of a gripper's fingers, and between its open tips."""
+"""Length of a gripper's fingers, and distance of its open tips, in meters."""
 SKIN, SLEEVE, ENAMEL, RUBBER = (216, 150, 118), (72, 88, 112), (40, 150, 160), (52, 52, 56)
+"""RGB colors of hand, forearm, gripper body and gripper fingers."""
 
 
 def human_joints(closure: float, side: Side) -> Float[np.ndarray, "21 3"]:
-    """The 21 keypoints in the hand's own space, from open (0) to a fist (1)."""
+    """Return the 21 keypoints in the local frame, from open (closure 0) to a fist (1)."""
     joints = [np.zeros(3)]
     base, lengths = THUMB_M
     aside, across = np.array([-0.62, 0.66, -0.42]), np.array([0.10, 0.72, -0.69])
     direction = aside + min(1.0, 1.4 * closure) * (across - aside)
     ends = [base]
     for number, length in enumerate(lengths):
-        turned = direction + number * closure * np.array([0.25, 0.0, -0.10])
-        ends.append(ends[-1] + length * turned / np.linalg.norm(turned))
+        bent = direction + number * closure * np.array([0.25, 0.0, -0.10])
+        ends.append(ends[-1] + length * bent / np.linalg.norm(bent))
     joints += ends
     for knuckle, phalanges, spread in zip(KNUCKLES_M, PHALANGES_M, SPREAD, strict=True):
         angles = np.cumsum(np.radians([8, 10, 6]) + closure * np.radians([68, 84, 52]))
@@ -59,19 +61,19 @@ def human_joints(closure: float, side: Side) -> Float[np.ndarray, "21 3"]:
 
 
 def gripper_joints(closure: float) -> Float[np.ndarray, "3 3"]:
-    """Wrist and the tips of the two fingers, from open (0) to closed (1)."""
+    """Return wrist and fingertips in the local frame, from open (closure 0) to closed (1)."""
     length, opening = GRIPPER_M
     half = opening / 2 * (1 - closure)
     return np.array([[0, 0, 0], [-half, length, 0], [half, length, 0]])
 
 
 def joints_of(kind: Kind, closure: float, side: Side) -> Float[np.ndarray, "j 3"]:
-    """Joints in the hand's own space."""
+    """Return the joints of a hand or gripper in its local frame, in meters."""
     return human_joints(closure, side) if kind == "human" else gripper_joints(closure)
 
 
 def pinch(joints: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """The point between the tips that grasp, and how far apart they are."""
+    """Return the point between the grasping fingertips, and their distance, in meters."""
     if len(joints) == 3:
         thumb, fingers = joints[1], joints[2]
     else:
@@ -80,7 +82,7 @@ def pinch(joints: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], fl
 
 
 def closure_for(kind: Kind, width_m: float) -> float:
-    """How far a hand closes until its tips are `width_m` apart, by bisection."""
+    """Return the closure at which the fingertips are `width_m` apart, by bisection."""
     low, high = 0.0, 1.0 if kind == "robot" else 0.8
     for _ in range(30):
         middle = (low + high) / 2
@@ -89,13 +91,16 @@ def closure_for(kind: Kind, width_m: float) -> float:
     return (low + high) / 2
 
 
-def flesh(
+def hand_meshes(
     joints_m: Float[np.ndarray, "j 3"],
     elbow_m: Float[np.ndarray, " 3"],
     kind: Kind,
     back: Float[np.ndarray, " 3"],
 ) -> tuple[Part, ...]:
-    """Skin and sleeve, or rubber and enamel; `back` is the direction of the back of the hand."""
+    """Return the meshes of hand and forearm, or of gripper and wrist, in the frame of the joints.
+
+    `back` is the unit vector of the back of the hand.
+    """
     if kind == "robot":
         wrist, left, right = joints_m
         across = right - left
@@ -124,7 +129,7 @@ def flesh(
         if a
     ]
     wrist, knuckles = joints_m[0], joints_m[[5, 9, 13, 17]]
-    # The palm: thick strands from the wrist to each knuckle and across them.
+    # The palm: thick capsules from the wrist to each knuckle and across them.
     inward = -0.004 * back
     pieces += [_limb(wrist + inward, knuckle + inward, 0.021, 0.0135) for knuckle in knuckles]
     pieces += [_limb(a + inward, b + inward, 0.012, 0.012) for a, b in pairwise(knuckles)]
@@ -148,7 +153,7 @@ def _part(name: str, shape: tuple[np.ndarray, np.ndarray], paint: Paint) -> Part
 def _limb(
     start: np.ndarray, end: np.ndarray, first: float, last: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A round strand between two points, from one radius to the other, with round ends."""
+    """Return the mesh of a capsule between two points with a radius at each end."""
     ball, faces = _unit_ball()
     along = end - start
     length = np.linalg.norm(along)
@@ -156,9 +161,9 @@ def _limb(
     helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
     x = np.cross(helper, axis)
     x = x / np.linalg.norm(x)
-    turned = ball @ np.stack([x, np.cross(axis, x), axis])
+    aligned = ball @ np.stack([x, np.cross(axis, x), axis])
     upper = ball[:, 2:] > 1e-6
-    return np.where(upper, end + turned * last, start + turned * first), faces
+    return np.where(upper, end + aligned * last, start + aligned * first), faces
 
 
 @cache

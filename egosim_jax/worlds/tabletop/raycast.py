@@ -1,8 +1,8 @@
-"""Pictures of the world by ray casting: color, depth and ids, exact at every pixel center.
+"""Ray-cast rendering of the tabletop world: color, depth and ids, exact at every pixel center.
 
-A surface of color c and normal n shows c * (ambient + sun * max(0, n . l)), where the sun's part
-falls away in shadow. Colors are means over s x s rays a pixel; depth and ids are of the ray
-through the pixel's center.
+A surface of color c and normal n is shaded as c * (ambient + sun * max(0, n . l)) in the light and
+as c * ambient in shadow. Colors are means over s x s rays per pixel; depth and ids are those of the
+ray through the pixel's center.
 """
 
 from __future__ import annotations
@@ -19,35 +19,43 @@ from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
 
 SUN = np.array([-0.25, -0.50, 0.83])
-"""Towards the light; from behind the wearer's left shoulder."""
-AMBIENT, SUNLIGHT = 0.62, 0.48
+"""Direction towards the light, which shines from behind the wearer's left shoulder."""
+AMBIENT = 0.62
+"""Intensity of the ambient light."""
+SUNLIGHT = 0.48
+"""Intensity of the directional light."""
 SKY = np.array([0.0, 0.0, 0.0])
+"""RGB in [0, 1] where a ray hits nothing."""
 RAYS = 2
-"""Rays along each side of a pixel, of which the color is the mean."""
+"""Color samples along each side of a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placed:
-    """A part where it is at one moment."""
+    """A part with its pose at one moment."""
 
     part: Part
+    """Mesh and texture."""
     world_from_part: Float[np.ndarray, "4 4"]
+    """Pose."""
     number: int
-    """Its id in the picture; 0 means nothing."""
+    """Instance id in renderings, from 1; 0 means that nothing was hit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """One frame."""
+    """A rendering of one frame."""
 
     colors: UInt8[np.ndarray, "h w 3"]
+    """RGB."""
     depth_m: Float32[np.ndarray, "h w"]
-    """Along the camera's axis; infinite where there is nothing."""
+    """Depth along the camera axis in meters; infinite where a ray hits nothing."""
     ids: Int[np.ndarray, "h w"]
+    """Instance ids; 0 where a ray hits nothing."""
 
 
-class Stage:
-    """The parts at one moment, ready to be looked at."""
+class RayCaster:
+    """A renderer of the placed parts of one moment."""
 
     def __init__(self, placed: Sequence[Placed]):
         import open3d as o3d
@@ -61,7 +69,7 @@ class Stage:
                 o3d.core.Tensor(item.part.triangles.astype(np.uint32)),
             )
 
-    def look(
+    def render(
         self,
         world_from_camera: Float[np.ndarray, "4 4"],
         intrinsics_px: Float[np.ndarray, "3 3"],
@@ -69,7 +77,7 @@ class Stage:
         height: int,
         width: int,
     ) -> Picture:
-        """The picture from a camera; one inside a thing raises `InputError`."""
+        """Render from a camera. Raises `InputError` if the camera is inside an object."""
         self._refuse_inside(world_from_camera[:3, 3])
         rays = _world_rays(world_from_camera, intrinsics_px, height=height, width=width)
         middle = self._cast(world_from_camera, rays)
@@ -83,15 +91,15 @@ class Stage:
         )
 
     def _refuse_inside(self, eye_m: np.ndarray) -> None:
-        """A ray from inside a closed surface crosses it an odd number of times."""
+        """Raise `InputError` if a ray from the camera crosses surfaces an odd number of times."""
         import open3d as o3d
 
         ray = np.concatenate([eye_m, [0, 0, 1]]).astype(np.float32)[None]
         if self.scene.count_intersections(o3d.core.Tensor(ray), nthreads=1).item() % 2:
             place = ", ".join(f"{value:.3f}" for value in eye_m)
             raise InputError(
-                f"The camera at ({place}) m is inside a thing and would see its inner side. Move "
-                "the camera or the thing."
+                f"The camera at ({place}) m is inside an object; it must be outside all objects. "
+                "Move the camera or the object."
             )
 
     def _colors(
@@ -116,7 +124,7 @@ class Stage:
     def _surface(
         self, points: Float32[np.ndarray, "n 3"], hits: dict[str, np.ndarray]
     ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-        """Color and normal at points that rays have met; arbitrary where they met nothing."""
+        """Return albedo and normal at ray hits; arbitrary where a ray hits nothing."""
         albedo, normals = np.zeros_like(points), hits["primitive_normals"]
         for number, item in enumerate(self.placed):
             (here,) = np.nonzero(hits["geometry_ids"] == number)
@@ -141,7 +149,7 @@ class Stage:
         return self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
 
     def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-        """What rays meet from the camera; one thread, for clips are made in parallel."""
+        """Cast rays from the camera, in one thread because clips are made in parallel."""
         import open3d as o3d
 
         eye = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
@@ -153,6 +161,6 @@ class Stage:
 def _world_rays(
     pose: np.ndarray, intrinsics_px: np.ndarray, *, height: int, width: int
 ) -> Float32[np.ndarray, "n 3"]:
-    """Directions of camera rays with z = 1 in the world: distances along them are depths."""
+    """Return world directions of camera rays of unit z, so that distances along them are depths."""
     rays = pixel_rays(intrinsics_px, height=height, width=width)
     return rearrange(rays @ pose[:3, :3].T, "h w c -> (h w) c").astype(np.float32)

@@ -1,4 +1,4 @@
-"""A table with things on it: where everything is, and what may be done with it."""
+"""The arrangement of a tabletop scene: poses of all bodies, free space, and random scenes."""
 
 from __future__ import annotations
 
@@ -26,36 +26,42 @@ from egosim_jax.worlds.tabletop.bodies import (
 from egosim_jax.worlds.tabletop.raycast import Placed
 
 TABLE, FLOOR, WALL, FIRST_BODY, FIRST_HAND = 1, 2, 3, 10, 100
-"""Ids in the pictures. Body i has 10 + 2 i, its case, if it has one, 11 + 2 i; hand i has
-100 + 2 i and its forearm 101 + 2 i."""
-DRAWER_M, LID_DEGREES = 0.075, 100.0
-"""How far a drawer slides, and a lid turns, when it is open."""
+"""Instance ids in renderings. Body i has 10 + 2 i and its case, if it has one, 11 + 2 i; hand i
+has 100 + 2 i and its forearm 101 + 2 i."""
+DRAWER_M = 0.075
+"""Travel of an open drawer in meters."""
+LID_DEGREES = 100.0
+"""Rotation of an open lid in degrees."""
 WOODS = (
     (196, 178, 150), (170, 168, 160), (118, 92, 72), (105, 112, 120), (214, 200, 172), (88, 78, 70),
     (150, 122, 92),
 )  # fmt: skip
 """RGB of table tops: oak, ash, walnut, slate, birch, wenge, teak."""
 GAP_M = 0.035
-"""Least free space between two things on the table."""
-LEAST, MOST = 3, 6
-"""Things on a table."""
+"""Minimum distance between the footprints of two bodies, in meters."""
+MIN_BODIES = 3
+"""Minimum number of bodies on a table."""
+MAX_BODIES = 6
+"""Maximum number of bodies on a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Where everything is at one moment."""
+    """The arrangement of all bodies at one moment."""
 
     bodies: tuple[Body, ...]
+    """Bodies on the table, with their poses."""
     room: tuple[Placed, ...]
+    """Table, floor and walls."""
     openings: Mapping[str, float]
-    """How far each articulated body is open, by name: 0 closed, 1 open."""
+    """Opening of each articulated body by name: 0 closed, 1 open."""
 
     def body(self, name: str) -> Body:
-        """The body of that name."""
+        """Return the body of that name."""
         return next(body for body in self.bodies if body.name == name)
 
     def with_pose(self, name: str, world_from_body: Float[np.ndarray, "4 4"]) -> Scene:
-        """The scene with one body elsewhere."""
+        """Return the scene with another pose of one body."""
         bodies = (
             replace(body, world_from_body=world_from_body) if body.name == name else body
             for body in self.bodies
@@ -63,15 +69,15 @@ class Scene:
         return replace(self, bodies=tuple(bodies))
 
     def with_opening(self, name: str, opening: float) -> Scene:
-        """The scene with one body opened so far."""
+        """Return the scene with another opening of one articulated body."""
         return replace(self, openings={**self.openings, name: opening})
 
     def number(self, name: str) -> int:
-        """The id in the pictures of a body, or of its moving part."""
+        """Return the instance id of a body, or of its moving part."""
         return FIRST_BODY + 2 * [body.name for body in self.bodies].index(name)
 
     def names(self) -> dict[int, str]:
-        """What the ids of bodies mean; an articulated body's case has one of its own."""
+        """Return the names of all bodies and cases by instance id."""
         found = {}
         for body in self.bodies:
             found[self.number(body.name)] = body.name
@@ -80,14 +86,14 @@ class Scene:
         return found
 
     def first_part_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
-        """Where a body is or, if it is articulated, its moving part."""
+        """Return the pose of a body or, if it is articulated, of its moving part."""
         body = self.body(name)
         if not body.articulated:
             return body.world_from_body
         return body.world_from_body @ moving_part(body, self.openings[name])
 
     def placed(self) -> list[Placed]:
-        """Every part where it is, without hands."""
+        """Return every part of room and bodies with its pose, without hands."""
         items = list(self.room)
         for body in self.bodies:
             poses = [self.first_part_pose(body.name), body.world_from_body]
@@ -99,7 +105,10 @@ class Scene:
     def free_place(
         self, body: Body, rng: np.random.Generator, *, away_m: tuple[float, float] = (0, np.inf)
     ) -> Float[np.ndarray, " 2"] | None:
-        """A random x and y where the body fits, so far from where it is, if there is any."""
+        """Sample a free x and y for a body at a distance in `away_m` from its place; None if none.
+
+        Distances are in meters.
+        """
         here = body.world_from_body[:2, 3]
         for _ in range(200):
             place = rng.uniform([REACH_M[0], REACH_M[2]], [REACH_M[1], REACH_M[3]])
@@ -116,13 +125,13 @@ class Scene:
 
 
 def footprint(body: Body) -> float:
-    """Radius in meters of the circle on the table that a body needs; open drawers included."""
+    """Return the radius in meters of the circle that a body occupies, open drawer included."""
     reach = DRAWER_M + 0.03 if body.shape == "drawer" else 0.0
     return float(np.hypot(body.size_m[0], body.size_m[1]) / 2 + reach / 2)
 
 
 def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
-    """`body_from_part` of a drawer or a lid."""
+    """Return the pose `body_from_part` of a drawer or a lid at an opening in [0, 1]."""
     pose = np.eye(4)
     if body.shape == "drawer":
         pose[1, 3] = -DRAWER_M * opening
@@ -136,17 +145,17 @@ def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
 
 
 def make_scene(rng: np.random.Generator) -> Scene:
-    """A random scene of three to six things of different colors, at most one to be opened."""
-    while len((scene := _scatter(rng)).bodies) < LEAST:
-        pass  # the table was full before the least number stood on it
+    """Sample a scene of three to six bodies of different colors, at most one articulated."""
+    while len((scene := _scatter(rng)).bodies) < MIN_BODIES:
+        pass  # no free place was found for enough bodies
     return scene
 
 
 def _scatter(rng: np.random.Generator) -> Scene:
-    """Things put down one after another, as long as there is room."""
+    """Place random bodies one after another; skip those without a free place."""
     scene = Scene(bodies=(), room=_room(rng), openings={})
     names = list(rng.permutation(list(COLORS)))
-    count = int(rng.integers(LEAST, MOST + 1))
+    count = int(rng.integers(MIN_BODIES, MAX_BODIES + 1))
     candidates: list[Body] = []
     if rng.random() < 0.5:
         make = make_drawer if rng.random() < 0.5 else make_lidded_box
@@ -170,7 +179,7 @@ def _scatter(rng: np.random.Generator) -> Scene:
 
 
 def _room(rng: np.random.Generator) -> tuple[Placed, ...]:
-    """Table, floor and three walls."""
+    """Return table, floor and three walls in random colors."""
     x, y, z = TABLE_SIZE_M
     wood = np.array(WOODS[rng.integers(len(WOODS))]) + rng.normal(0, 6, 3)
     walls = rng.uniform(150, 205) + rng.normal(0, 12, 3)

@@ -10,7 +10,7 @@ from egosim_jax.perception.classical import Classical, flesh
 from egosim_jax.perception.oracle import oracle
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Clip, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_action, to_truth
+from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 SPEC = VideoSpec(frames=17, height=96, width=160, fps=8)
@@ -34,7 +34,9 @@ def test_the_thing_that_was_carried_is_found(clip, found):
 def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
     target = clip.body_ids[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float)
-    true = oracle(to_truth(clip))(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
+    true = oracle(to_ground_truth(clip))(
+        Clip(frames=clip.frames, fps=8), to_action(clip), clip.state
+    )
     here = transform(found.world_from_object[target][-1], points)
     there = transform(true.world_from_object[target][-1], points)
     gaps = np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)

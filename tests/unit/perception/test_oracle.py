@@ -9,7 +9,7 @@ from egosim_jax.geometry import look_at
 from egosim_jax.perception import archive
 from egosim_jax.perception.oracle import oracle
 from egosim_jax.types import Clip, InputError, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_action, to_truth
+from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def asked(clip):
 
 
 def test_hands_are_negative_and_the_room_is_background(clips):
-    found = oracle(to_truth(clips[0]))(*asked(clips[0]))
+    found = oracle(to_ground_truth(clips[0]))(*asked(clips[0]))
     assert found.object_ids.min() < 0
     known = set(np.unique(found.object_ids[found.object_ids > 0]).tolist())
     assert known <= set(clips[0].state.names)
@@ -34,7 +34,7 @@ def test_paths_begin_at_the_pose_in_the_state(clips):
     target = clip.body_ids[clip.target]
     before = look_at(np.ones(3), np.zeros(3), up=np.array([0, 0, 1.0]))
     state = replace(clip.state, world_from_object={target: before})
-    found = oracle(to_truth(clip))(Clip(frames=clip.frames, fps=8), to_action(clip), state)
+    found = oracle(to_ground_truth(clip))(Clip(frames=clip.frames, fps=8), to_action(clip), state)
     assert set(found.world_from_object) == {target}
     path, truth = found.world_from_object[target], clip.world_from_body[clip.target]
     np.testing.assert_allclose(path[0], before, atol=1e-12)
@@ -45,11 +45,11 @@ def test_paths_begin_at_the_pose_in_the_state(clips):
 def test_a_clip_of_another_size_is_refused(clips):
     small = Clip(frames=clips[0].frames[:, ::2], fps=8)
     with pytest.raises(InputError, match="Perception gave depth"):
-        oracle(to_truth(clips[0]))(small, to_action(clips[0]), clips[0].state)
+        oracle(to_ground_truth(clips[0]))(small, to_action(clips[0]), clips[0].state)
 
 
 def test_an_archive_keeps_everything(clips, tmp_path):
-    found = oracle(to_truth(clips[1]))(*asked(clips[1]))
+    found = oracle(to_ground_truth(clips[1]))(*asked(clips[1]))
     found = replace(found, touched={10: np.array([False, True, True, False, False])})
     archive.save(tmp_path / "perceived.npz", found)
     again = archive.load(tmp_path / "perceived.npz")

@@ -1,46 +1,46 @@
-"""Shards of the tabletop world: complete, in order, and the same however they were made."""
+"""Datasets of the tabletop world: complete, ordered and independent of interruptions."""
 
 import pytest
 
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop.dataset import Plan, make_shards
+from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 SPEC = VideoSpec(frames=5, height=32, width=48)
-PLAN = Plan(seeds=(3, 4), clips=2, spec=SPEC, kind="human")
+CONFIG = DatasetConfig(seeds=(3, 4), clips=2, spec=SPEC, kind="human")
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_and_gives_the_same_shards(tmp_path):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    assert sorted(make_shards(PLAN, out=whole, workers=2)) == [3, 4]
-    progress = make_shards(PLAN, out=broken, workers=1)
+def test_an_interrupted_run_resumes_and_gives_the_same_shards(tmp_path):
+    complete, broken = tmp_path / "complete", tmp_path / "broken"
+    assert sorted(make_shards(CONFIG, out=complete, workers=2)) == [3, 4]
+    progress = make_shards(CONFIG, out=broken, workers=1)
     next(progress)
     progress.close()
     assert not (broken / "manifest.json").exists()
-    assert sorted(make_shards(PLAN, out=broken, workers=1)) == [3, 4]
-    first, second = ShardReader(whole), ShardReader(broken)
+    assert sorted(make_shards(CONFIG, out=broken, workers=1)) == [3, 4]
+    first, second = ShardReader(complete), ShardReader(broken)
     assert first.manifest.fingerprint == second.manifest.fingerprint
     names = [record.metadata["video_id"] for record in first]
     assert names == [f"tabletop_human_{seed}_{number}" for seed in (3, 4) for number in (0, 1)]
     assert not (broken / "parts").exists()
 
 
-def test_a_finished_folder_is_left_alone(tmp_path):
-    plan = Plan(seeds=(5,), clips=1, spec=SPEC, kind="robot")
-    list(make_shards(plan, out=tmp_path, workers=1))
+def test_a_finished_folder_is_not_written_again(tmp_path):
+    config = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
+    list(make_shards(config, out=tmp_path, workers=1))
     before = (tmp_path / "manifest.json").stat().st_mtime_ns
-    assert list(make_shards(plan, out=tmp_path, workers=1)) == [5]
+    assert list(make_shards(config, out=tmp_path, workers=1)) == [5]
     assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
 
 
-def test_of_mixed_scenes_every_fourth_is_a_robots(tmp_path):
-    plan = Plan(seeds=(7, 8, 9), clips=1, spec=SPEC, kind="mixed")
-    list(make_shards(plan, out=tmp_path, workers=1))
+def test_every_fourth_mixed_scene_has_a_robot(tmp_path):
+    config = DatasetConfig(seeds=(7, 8, 9), clips=1, spec=SPEC, kind="mixed")
+    list(make_shards(config, out=tmp_path, workers=1))
     records = list(ShardReader(tmp_path))
     assert [record.metadata["extra"]["kind"] for record in records] == ["human", "robot", "human"]
 
 
-def test_nothing_to_make_is_refused():
+def test_an_empty_dataset_is_refused():
     with pytest.raises(InputError, match="--scenes"):
-        Plan(seeds=(), clips=1, spec=SPEC, kind="human")
+        DatasetConfig(seeds=(), clips=1, spec=SPEC, kind="human")

@@ -1,4 +1,4 @@
-"""The tabletop world is exact: what the pictures show is where the numbers say."""
+"""The tabletop world: renderings agree with the ground-truth geometry."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import actions, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.bodies import box, make_loose, split_edges
 from egosim_jax.worlds.tabletop.hands import closure_for, joints_of, pinch
-from egosim_jax.worlds.tabletop.raycast import Placed, Stage
+from egosim_jax.worlds.tabletop.raycast import Placed, RayCaster
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, TABLE, Scene, make_scene
 
 SPEC = VideoSpec(frames=5, height=48, width=80)
@@ -22,14 +22,14 @@ def clips():
 
 
 def points_of(clip, frame):
-    """The world point at every pixel, from the depth."""
+    """Unproject the depth of a frame to world points."""
     cameras = clip.cameras
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     local = rays * clip.depth_m[frame][..., None]
     return transform(cameras.world_from_camera[frame], local.reshape(-1, 3)).reshape(local.shape)
 
 
-def test_the_table_lies_in_its_plane(clips):
+def test_the_table_is_planar(clips):
     for clip in clips:
         for frame in range(SPEC.frames):
             points = points_of(clip, frame)[clip.ids[frame] == TABLE]
@@ -44,12 +44,12 @@ def test_depth_and_ids_of_a_box_against_its_slabs():
     turn = 0.7
     pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     pose[:3, 3] = [0.02, 0.3, 0]
-    stage = Stage([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
+    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
     camera = np.eye(4)
     camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     camera[:3, 3] = [0, -0.1, 0.05]
     intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
-    picture = stage.look(camera, intrinsics, height=48, width=80)
+    picture = caster.render(camera, intrinsics, height=48, width=80)
     rays = pixel_rays(intrinsics, height=48, width=80).reshape(-1, 3)
     body_from_camera = invert(pose) @ camera
     start = body_from_camera[:3, 3]
@@ -71,12 +71,12 @@ def test_a_ball_is_seen_where_its_pose_projects():
     body = make_loose("ball", "red", rng)
     pose = np.eye(4)
     pose[:3, 3] = [0.02, 0.3, 0]
-    stage = Stage([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
+    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
     camera = np.eye(4)
     camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     camera[:3, 3] = [0.02, -0.1, body.size_m[2] / 2]
     intrinsics = np.array([[160.0, 0, 79.5], [0, 160.0, 47.5], [0, 0, 1]])
-    picture = stage.look(camera, intrinsics, height=96, width=160)
+    picture = caster.render(camera, intrinsics, height=96, width=160)
     rows, columns = np.nonzero(picture.ids == FIRST_BODY)
     center = pose @ [0, 0, body.size_m[2] / 2, 1]
     u, v = project(intrinsics, transform(invert(camera), center[None, :3]))
@@ -112,7 +112,7 @@ def test_the_last_frame_of_a_clip_is_the_first_of_the_next(clips):
         assert (poses[-1] == second.world_from_body[name][0]).all()
 
 
-def test_the_same_seed_makes_the_same_clip(clips):
+def test_equal_seeds_give_equal_clips(clips):
     again = next(make_sequence(3, spec=SPEC))
     assert (again.frames == clips[0].frames).all()
     assert again.caption == clips[0].caption
@@ -147,7 +147,7 @@ def test_a_prior_shows_the_first_frame_where_it_is_observed():
     assert not triplet.prior[-1][triplet.mask[-1] == 255].any()
 
 
-def test_a_carried_state_has_its_things_where_the_clip_left_them(clips):
+def test_a_carried_state_has_its_objects_at_their_final_poses(clips):
     first, second = clips
     state = state_after(first, first.state)
     start, end = first.world_from_body[first.target][[0, -1]]
@@ -162,16 +162,16 @@ def test_a_carried_state_has_its_things_where_the_clip_left_them(clips):
     np.testing.assert_array_equal(triplet.first_frame, triplet.prior[0])
 
 
-def test_black_things_are_left_alone():
+def test_black_bodies_are_never_chosen():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         scene = make_scene(rng)
-        assert not scene.body(actions.choose(scene, rng).name).stays
+        assert not scene.body(actions.choose(scene, rng).name).static
 
 
 @pytest.mark.parametrize("kind", ["human", "robot"])
 @pytest.mark.parametrize("width", [0.02, 0.05, 0.07])
-def test_a_hand_closes_until_its_tips_are_as_far_apart_as_asked(kind, width):
+def test_a_hand_closes_until_its_fingertips_have_the_requested_distance(kind, width):
     closure = closure_for(kind, width)
     assert pinch(joints_of(kind, closure, "right"))[1] == pytest.approx(width, abs=1e-4)
 
@@ -181,26 +181,26 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one():
     np.testing.assert_allclose(right * [-1, 1, 1], left)
 
 
-def test_a_camera_inside_a_thing_is_refused():
+def test_a_camera_inside_an_object_is_refused():
     body = make_loose("box", "red", np.random.default_rng(0))
-    stage = Stage([Placed(part=body.parts[0], world_from_part=np.eye(4), number=FIRST_BODY)])
+    caster = RayCaster([Placed(part=body.parts[0], world_from_part=np.eye(4), number=FIRST_BODY)])
     camera = np.eye(4)
     camera[2, 3] = body.size_m[2] / 2
     intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
-    with pytest.raises(InputError, match="inside a thing"):
-        stage.look(camera, intrinsics, height=48, width=80)
+    with pytest.raises(InputError, match="inside an object"):
+        caster.render(camera, intrinsics, height=48, width=80)
     camera[0, 3] = 0.2
-    assert (stage.look(camera, intrinsics, height=48, width=80).ids == 0).all()
+    assert (caster.render(camera, intrinsics, height=48, width=80).ids == 0).all()
 
 
-def test_a_scene_that_nobody_sees_is_refused(clips):
+def test_a_state_outside_the_view_is_refused(clips):
     state = clips[0].state
     behind = replace(state, points_m=state.points_m - np.array([0, 9, 0], np.float32))
     with pytest.raises(InputError, match="None of the"):
         to_triplet(replace(clips[0], state=behind))
 
 
-def test_hands_and_things_may_leave_the_view(clips):
+def test_hands_and_objects_may_leave_the_view(clips):
     away = clips[0].joints_m.copy()
     away[2:] += [5.0, 0, 0]
     away[1] = np.nan
@@ -230,7 +230,7 @@ def test_a_camera_without_a_picture_is_refused(clips):
 
 
 def act_on(verb, kind="human"):
-    """The first action of that kind among the seeds, and its moments."""
+    """Return the first action of that verb among the seeds, and its moments."""
     for seed in range(200):
         rng = np.random.default_rng(seed)
         scene = make_scene(rng)
@@ -243,14 +243,14 @@ def act_on(verb, kind="human"):
 
 @pytest.mark.parametrize("kind", ["human", "robot"])
 @pytest.mark.parametrize("verb", ["carry", "lift", "turn", "stack", "open"])
-def test_a_thing_moves_smoothly_and_ends_where_it_is_meant_to(verb, kind):
+def test_a_body_moves_smoothly_and_ends_at_its_goal(verb, kind):
     _, intent, moments = act_on(verb, kind)
     poses = np.stack([moment.scene.first_part_pose(intent.name) for moment in moments])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps.max() < 0.06
     start, end = poses[0], poses[-1]
-    if intent.place_m is not None:
-        np.testing.assert_allclose(end[:3, 3], intent.place_m, atol=1e-6)
+    if intent.goal_m is not None:
+        np.testing.assert_allclose(end[:3, 3], intent.goal_m, atol=1e-6)
     elif verb == "lift":
         np.testing.assert_allclose(end, start, atol=1e-6)
         assert poses[:, 2, 3].max() > 0.07
@@ -261,8 +261,8 @@ def test_a_thing_moves_smoothly_and_ends_where_it_is_meant_to(verb, kind):
         assert moments[-1].scene.openings[intent.name] == pytest.approx(1)
 
 
-def test_what_stands_under_something_is_neither_taken_nor_opened():
-    """After stacking, the lower thing is offered for nothing, except that a drawer may slide."""
+def test_a_body_under_another_is_neither_taken_nor_opened():
+    """After stacking, the lower body is never a target, except that a drawer may slide."""
     checked = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -284,7 +284,7 @@ def test_what_stands_under_something_is_neither_taken_nor_opened():
     assert checked > 5
 
 
-def test_what_was_opened_can_be_closed():
+def test_an_opened_body_can_be_closed():
     scene, intent, moments = act_on("open")
     opened = moments[-1].scene
     close = actions.Intent(verb="close", name=intent.name)
@@ -293,7 +293,7 @@ def test_what_was_opened_can_be_closed():
     assert scene.openings[intent.name] == 0
 
 
-def test_things_do_not_stand_in_each_other():
+def test_bodies_do_not_intersect():
     for seed in range(20):
         scene: Scene = make_scene(np.random.default_rng(seed))
         assert 3 <= len(scene.bodies) <= 6
