@@ -20,13 +20,14 @@ from egosim_jax.convert.layouts import Found, naming_in
 from egosim_jax.convert.plan import BASE_CHANNELS, MASK, Widening, to_theirs
 from egosim_jax.convert.skeleton import skeleton
 from egosim_jax.convert.theirs import arguments
-from egosim_jax.generator import ModelConfig, Program
+from egosim_jax.generator import Program
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import fill, flat_shapes
 from egosim_jax.models.clip_vision import CLIPVisionConfig
 from egosim_jax.models.umt5 import UMT5Config
 from egosim_jax.models.wan_dit import WanDiTConfig
 from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.networks import ModelConfig
 from egosim_jax.types import InputError
 
 LAYERS, VOCAB = 2, 512

@@ -20,9 +20,9 @@ from egosim_jax.io.weights import WeightsError, mismatches
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.generator import ModelConfig
     from egosim_jax.models.lora import Change
     from egosim_jax.models.wan_dit import WanDiTConfig
+    from egosim_jax.networks import ModelConfig
 
 TABLES: dict[Network, str] = {
     "dit": "wan_dit",

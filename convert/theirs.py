@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from egosim_jax.convert.layouts import Network
 
 if TYPE_CHECKING:
-    from egosim_jax.generator import ModelConfig
+    from egosim_jax.networks import ModelConfig
 
 FOLDERS: dict[Network, str] = {
     "dit": "transformer", "vae": "vae", "text": "text_encoder", "image": "image_encoder",

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from egosim_jax.configs import get as get_config
     from egosim_jax.data.clips import load_triplet
     from egosim_jax.data.metadata import read_metadata
-    from egosim_jax.generator import Generator, ModelConfig, Networks
+    from egosim_jax.generator import Generator
+    from egosim_jax.networks import ModelConfig, Networks
     from egosim_jax.types import Clip, Condition, InputError, Triplet, VideoSpec
 
 __all__ = [
@@ -35,7 +36,8 @@ _HOMES = {
     "get_config": ("configs", "get"),
     "load_triplet": ("data.clips", "load_triplet"),
     "read_metadata": ("data.metadata", "read_metadata"),
-    **{name: ("generator", name) for name in ("Generator", "ModelConfig", "Networks")},
+    "Generator": ("generator", "Generator"),
+    **{name: ("networks", name) for name in ("ModelConfig", "Networks")},
     **{
         name: ("types", name)
         for name in ("Clip", "Condition", "InputError", "Triplet", "VideoSpec")

@@ -14,8 +14,7 @@ the denoising of a clip, and each of them encodes and decodes it, too.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, no_type_check
 
 import jax
@@ -28,19 +27,13 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from egosim_jax.conditioning import condition_channels, pack_mask
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.image import clip_pixels
-from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.conditioning.video import to_model, to_uint8
-from egosim_jax.diffusion.guidance import Guidance
-from egosim_jax.diffusion.schedule import FlowSchedule, VelocityFn
-from egosim_jax.diffusion.solver import Euler, UniPC, integrate
-from egosim_jax.io import weights
+from egosim_jax.diffusion.schedule import VelocityFn
+from egosim_jax.diffusion.solver import integrate
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import plain
-from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
-from egosim_jax.models.layers import initialize
-from egosim_jax.models.umt5 import UMT5, UMT5Config
-from egosim_jax.models.wan_dit import WanDiT, WanDiTConfig
-from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.models import Denoiser
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import Program, gathered, place
 from egosim_jax.rendering.reference import draw_hands
 from egosim_jax.types import (
@@ -49,104 +42,12 @@ from egosim_jax.types import (
     Condition,
     InputError,
     Triplet,
-    VideoSpec,
     View,
     check_seed,
     check_video,
 )
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelConfig:
-    """A released model: its networks, its conditioning and how it is sampled."""
-
-    name: str
-    """The name that commands know it by."""
-    video: VideoSpec
-    """Length and size of its clips."""
-    dit: WanDiTConfig
-    """The denoiser."""
-    vae: WanVAEConfig = field(default_factory=WanVAEConfig)
-    """The video autoencoder."""
-    text: UMT5Config = field(default_factory=UMT5Config)
-    """The text encoder."""
-    image: CLIPVisionConfig | None = field(default_factory=CLIPVisionConfig)
-    """The image encoder; None for models without the image branch."""
-    tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
-    """Prompts to token ids."""
-    encoders: Literal["frozen", "joint"] = "frozen"
-    """Whether text and image encoder are given, or small and trained together with the denoiser."""
-    image_range: Literal["signed", "unit"] = "signed"
-    """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
-    schedule: FlowSchedule = field(default_factory=FlowSchedule)
-    """Noise levels."""
-    solver: Euler | UniPC = field(default_factory=Euler)
-    """Steps from noise to data."""
-    guidance: Guidance = field(default_factory=Guidance)
-    """Classifier-free guidance on the text."""
-    steps: int = 50
-    """Denoising steps."""
-
-    def __post_init__(self) -> None:
-        """Check that the networks fit each other."""
-        pairs = [
-            ("dit.text_dim", self.dit.text_dim, "text.dim", self.text.dim),
-            ("dit.out_channels", self.dit.out_channels, "vae.z_dim", self.vae.z_dim),
-            ("dit.image_dim", self.dit.image_dim, "image.dim", self.image and self.image.dim),
-        ]
-        for left, a, right, b in pairs:
-            if a != b:
-                raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
-
-    def at(self, folder: Path) -> ModelConfig:
-        """This config, with a tokenizer that has files looked up in a weights folder."""
-        if self.tokenizer.kind == "byt5":
-            return self
-        files = replace(self.tokenizer, kind=folder / self.tokenizer.kind)
-        return replace(self, tokenizer=files)
-
-
-class Networks(nnx.Module):
-    """The four networks of a model."""
-
-    def __init__(self, config: ModelConfig, *, rngs: nnx.Rngs):
-        self.dit = WanDiT(config.dit, rngs=rngs)
-        self.vae = WanVAE(config.vae, rngs=rngs)
-        self.text = UMT5(config.text, rngs=rngs)
-        self.image = None if config.image is None else CLIPVision(config.image, rngs=rngs)
-
-    @classmethod
-    def load(cls, config: ModelConfig, folder: Path | str, *, mesh: Mesh | None = None) -> Networks:
-        """The networks of a weights folder, which holds `<network>.safetensors` for each.
-
-        With a mesh each device reads its own part of the weights. Raises `InputError` with every
-        path that is missing, unknown or of another shape.
-        """
-        networks, folder = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))), Path(folder)
-        if not folder.is_dir():
-            raise InputError(f"{folder} is not a folder of weights. (--weights)")
-        for name, network in networks.parts().items():
-            weights.load(folder / f"{name}.safetensors", network, mesh=mesh)
-        return networks
-
-    @classmethod
-    def random(cls, config: ModelConfig, *, seed: int) -> Networks:
-        """Untrained networks, made in one compiled program."""
-        graph = nnx.graphdef(nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0))))
-        params = initialize(lambda: nnx.state(cls(config, rngs=nnx.Rngs(seed)), nnx.Param))
-        return nnx.merge(graph, params)
-
-    def save(self, folder: Path, *, dtype: str | None = None) -> None:
-        """Write a weights folder; `dtype` casts, by default weights keep their own."""
-        for name, network in self.parts().items():
-            weights.save(folder / f"{name}.safetensors", network, dtype=dtype)
-
-    def parts(self) -> dict[str, nnx.Module]:
-        """The networks by name."""
-        named = {"dit": self.dit, "vae": self.vae, "text": self.text, "image": self.image}
-        return {name: network for name, network in named.items() if network is not None}
 
 
 @no_type_check
@@ -211,7 +112,7 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
 
 
 def denoise(
-    dit: WanDiT, condition: Condition, noise: Float[Array, "b f h w 16"], config: ModelConfig
+    dit: Denoiser, condition: Condition, noise: Float[Array, "b f h w 16"], config: ModelConfig
 ) -> Float[Array, "b f h w 16"]:
     """Walk from noise to latents; the unconditional branch knows no text."""
     channels = condition_channels(condition)

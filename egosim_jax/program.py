@@ -14,7 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 from egosim_jax.io.executables import kept, share_with_jax
 from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
 
-Module = TypeVar("Module", bound=nnx.Module)
+Module = TypeVar("Module")
 
 
 class Program:
@@ -28,7 +28,7 @@ class Program:
     def __init__(
         self,
         function: Callable[..., Any],
-        networks: nnx.Module,
+        networks: Any,
         *,
         mesh: Mesh | None = None,
         about: Any = None,

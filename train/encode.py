@@ -29,14 +29,12 @@ from jax.sharding import Mesh
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, gather, read_manifest
 from egosim_jax.data.transforms import decode_record, record_length
-from egosim_jax.generator import Inputs, ModelConfig, Program, batches, place, truths
+from egosim_jax.generator import Inputs, Program, batches, place, truths
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote
 from egosim_jax.io.video import Decoding
-from egosim_jax.io.weights import hashes, load
-from egosim_jax.models.clip_vision import CLIPVision
-from egosim_jax.models.umt5 import UMT5
-from egosim_jax.models.wan_vae import WanVAE
+from egosim_jax.io.weights import hashes
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.progress import track
 from egosim_jax.sharding import check_batch
 from egosim_jax.types import InputError, Triplet, check_counts
@@ -50,39 +48,10 @@ Window = tuple[int, int]
 """Record number and first frame."""
 
 
-class Encoders(nnx.Module):
-    """The networks that training a denoiser leaves alone: the VAE, and frozen encoders."""
-
-    def __init__(self, config: ModelConfig, *, rngs: nnx.Rngs):
-        names = encoder_names(config)
-        self.vae = WanVAE(config.vae, rngs=rngs)
-        self.text = UMT5(config.text, rngs=rngs) if "text" in names else None
-        image = config.image if "image" in names else None
-        self.image = None if image is None else CLIPVision(image, rngs=rngs)
-
-    @classmethod
-    def load(cls, config: ModelConfig, folder: Path, *, mesh: Mesh | None = None) -> Encoders:
-        """Read them, and nothing else, from a weights folder, onto a mesh if there is one.
-
-        Raises `InputError` with every path that is missing, unknown or of another shape.
-        """
-        encoders = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0)))
-        for name in encoder_names(config):
-            load(folder / f"{name}.safetensors", getattr(encoders, name), mesh=mesh)
-        return encoders
-
-
-def encoder_names(config: ModelConfig) -> list[str]:
-    """Networks whose output is cached: the VAE; text and image encoder unless they are trained."""
-    if config.encoders == "joint":
-        return ["vae"]
-    return ["vae", "text"] if config.image is None else ["vae", "text", "image"]
-
-
 class Encoding:
     """Clips to the arrays of latents shards, on one device or on those of a mesh."""
 
-    def __init__(self, config: ModelConfig, encoders: Encoders, mesh: Mesh | None = None):
+    def __init__(self, config: ModelConfig, encoders: Networks, mesh: Mesh | None = None):
         self.config = config
         self._encode = Program(_encode, place(encoders, mesh), mesh=mesh)
 
@@ -99,7 +68,7 @@ class Encoding:
         return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
 
 
-def _encode(encoders: Encoders, inputs: Inputs, truth: jax.Array) -> dict[str, jax.Array]:
+def _encode(encoders: Networks, inputs: Inputs, truth: jax.Array) -> dict[str, jax.Array]:
     """One video after the other, so that the VAE is compiled once and needs little memory."""
     videos = jnp.stack([truth, jnp.asarray(inputs.prior), jnp.asarray(inputs.hands)])
     latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), videos)
@@ -115,7 +84,7 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
     """What a batch of records that were encoded for a model holds, before any are."""
     inputs, video = Inputs.shapes(batch, config), config.video
     truth = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
-    graph, params = nnx.split(nnx.eval_shape(lambda: Encoders(config, rngs=nnx.Rngs(0))))
+    graph, params = nnx.split(Networks.abstract(config, only=config.cached_networks))
     encoded = jax.eval_shape(
         lambda params, *given: _encode(nnx.merge(graph, params), *given), params, inputs, truth
     )
@@ -166,11 +135,11 @@ def cache(
 ) -> None:
     """Write the latents shards of every window of `source`, or go on where a run was interrupted.
 
-    `folder` holds the weights, of which `encoder_names` are read. Each batch is dealt out over
-    `mesh`, which holds devices of this process. All processes call this alike and have `out` in
-    common; it is whole when they return. `decoding` is recorded in the manifest; that of frames was
-    chosen when they were packed. Raises `InputError` if `out` was begun with another
-    config, source, stride or number of windows in a shard, or with other encoders.
+    `folder` holds the weights, of which `config.cached_networks` are read. Each batch is dealt out
+    over `mesh`, which holds devices of this process. All processes call this alike and have `out`
+    in common; it is whole when they return. `decoding` is recorded in the manifest; that of frames
+    was chosen when they were packed. Raises `InputError` if `out` was begun with another config,
+    source, stride or number of windows in a shard, or with other encoders.
     """
     check_counts({"--stride": stride, "--batch-size": batch_size, "--shard-windows": shard_windows})
     if mesh is not None:
@@ -182,7 +151,7 @@ def cache(
     provenance = {
         "config": config.name,
         "source": source.manifest.fingerprint,
-        "encoders": hashes(folder, only=encoder_names(config)),
+        "encoders": hashes(folder, only=config.cached_networks),
         "decoding": decoding,
     }
     _open(
@@ -205,7 +174,9 @@ def cache(
         if not (parts[number] / MANIFEST).exists()
     }
     if missing:
-        encode = Encoding(config, Encoders.load(config, folder, mesh=mesh), mesh)
+        encode = Encoding(
+            config, Networks.load(config, folder, only=config.cached_networks, mesh=mesh), mesh
+        )
         progress = _write(encode, missing, source, batch_size, provenance, decoding)
         for _ in track(progress, verb, total=sum(map(len, missing.values()))):
             pass

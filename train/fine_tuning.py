@@ -15,8 +15,7 @@ from egosim_jax.train.config import Recipe, Training
 from egosim_jax.train.update import Stage
 
 if TYPE_CHECKING:
-    from egosim_jax.generator import ModelConfig
-    from egosim_jax.train.tasks.denoising import Denoiser
+    from egosim_jax.networks import ModelConfig, Networks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +98,7 @@ class FineTuning(Recipe):
         return replace(model, dit=replace(model.dit, **given))
 
 
-def write_trained(trained: Denoiser, out: Path, *, model: ModelConfig, start: Path) -> Path:
+def write_trained(trained: Networks, out: Path, *, model: ModelConfig, start: Path) -> Path:
     """Write OUT/lora.safetensors, if that was trained, or OUT/weights, which is then complete.
 
     `start` is the weights folder that a LoRA is for, or that has the networks that stayed. All

@@ -10,15 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flax import nnx
-
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import MANIFEST, ShardReader
 from egosim_jax.data.transforms import record_length
 from egosim_jax.diffusion.objective import Objective
-from egosim_jax.generator import ModelConfig, Networks
 from egosim_jax.io import weights
+from egosim_jax.models import abstract
 from egosim_jax.models.wan_vae import WanVAE, standardise_latents
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.config import Training
 from egosim_jax.train.encode import cache
 from egosim_jax.train.loop import train
@@ -89,7 +88,7 @@ class FromScratch:
     def _autoencoder(self) -> WanVAE:
         """The VAE, trained, with latents of mean 0 and deviation 1."""
         path = self.out / "weights" / "vae.safetensors"
-        vae = nnx.eval_shape(lambda: WanVAE(self.config.vae, rngs=nnx.Rngs(0)))
+        vae = abstract(self.config.vae)
         if not path.exists() and self.weights is not None:
             weights.load(self.weights / path.name, vae)
             weights.save(path, vae)

@@ -27,12 +27,12 @@ from egosim_jax.command import HUNG
 from egosim_jax.conditioning.video import to_uint8
 from egosim_jax.data.shards import Record, ShardReader
 from egosim_jax.data.sheet import Block, draw_sheet
-from egosim_jax.generator import ModelConfig, denoise
-from egosim_jax.io import weights
+from egosim_jax.generator import denoise
 from egosim_jax.io.video import write_video
-from egosim_jax.models.wan_vae import WanVAE
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.targets import peak
 from egosim_jax.sharding import batch_sharding, parts
+from egosim_jax.train.tasks.denoising import condition_of
 
 Phase = Literal["start", "compile", "data", "step", "validate", "sample", "save"]
 PHASES: dict[Phase, str] = {
@@ -212,9 +212,8 @@ class Samples:
 
     @cached_property
     def _vae(self) -> tuple[nnx.GraphDef, nnx.State]:
-        vae = nnx.eval_shape(lambda: WanVAE(self.model.vae, rngs=nnx.Rngs(0)))
-        weights.load(self.vae / "vae.safetensors", vae)
-        return nnx.split(vae)
+        networks = Networks.load(self.model, self.vae, only=["vae"])
+        return nnx.split(networks.vae)
 
     @cached_property
     def _records(self) -> list[Record]:
@@ -242,7 +241,7 @@ def _generate(
     networks: Any = nnx.merge(graph, params)
     keys = jax.random.split(jax.random.key(0), len(batch["target"]))
     noise = jax.vmap(lambda key: jax.random.normal(key, batch["target"].shape[1:]))(keys)
-    return denoise(networks.dit, networks.condition(batch), noise, model)
+    return denoise(networks.dit, condition_of(networks, batch), noise, model)
 
 
 @jax.jit(static_argnums=0)

@@ -18,7 +18,7 @@ from egosim_jax.command import DONE, FAILED
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from egosim_jax.generator import ModelConfig
+    from egosim_jax.networks import ModelConfig
 
 LIBRARIES = (
     "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "open3d-cpu", "av",
@@ -111,9 +111,9 @@ def _bytes(config: ModelConfig) -> int:
     import jax.numpy as jnp
     from flax import nnx
 
-    from egosim_jax.generator import Networks
+    from egosim_jax.networks import Networks
 
-    parts = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0))).parts()
+    parts = Networks.abstract(config).parts()
     return sum(
         leaf.size * jnp.dtype(getattr(config, network).dtype).itemsize
         for network, part in parts.items()

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from jax.sharding import Mesh
 
     from egosim_jax.data.metadata import ClipFiles
-    from egosim_jax.generator import Generator, ModelConfig
+    from egosim_jax.generator import Generator
+    from egosim_jax.networks import ModelConfig
 
 RESULTS = "results.jsonl"
 SHEET_CLIPS, SHEET_COLUMNS, SHEET_WIDTH = 6, 6, 240
@@ -281,7 +282,8 @@ class Generate:
         return bad
 
     def _generator(self, config: ModelConfig, mesh: Mesh) -> Generator:
-        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.generator import Generator
+        from egosim_jax.networks import Networks
 
         if self._weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
-    from egosim_jax.generator import ModelConfig
+    from egosim_jax.networks import ModelConfig
     from egosim_jax.preflight.report import Report, TooLarge
     from egosim_jax.preflight.targets import Target
 
@@ -77,10 +77,11 @@ def plan(
     """What each program of generation takes, beside the weights of all networks."""
     from flax import nnx
 
-    from egosim_jax.generator import Generator, Networks
+    from egosim_jax.generator import Generator
+    from egosim_jax.networks import Networks
     from egosim_jax.preflight.report import compile_for
 
-    networks = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0)))
+    networks = Networks.abstract(config)
     for name, network in networks.parts().items():
         setattr(networks, name, _stored(network, getattr(config, name).dtype))
     generator = Generator(config, networks, mesh)

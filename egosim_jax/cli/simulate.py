@@ -61,10 +61,11 @@ class Simulate:
     def run(self) -> int:
         """Simulate, measure, draw."""
         from egosim_jax import configs
-        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.generator import Generator
         from egosim_jax.io.digest import sha256
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
+        from egosim_jax.networks import Networks
         from egosim_jax.rollout import Rollout
         from egosim_jax.simulator import Simulator
         from egosim_jax.worlds.tabletop import make_sequence, to_action

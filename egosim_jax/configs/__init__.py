@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.generator import ModelConfig
+    from egosim_jax.networks import ModelConfig
 
 
 SHIPPED = Path(__file__).parents[1] / "weights"

@@ -50,9 +50,10 @@ class Continuous:
     def run(self) -> int:
         """Simulate, compare, draw."""
         from egosim_jax import configs
-        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.generator import Generator
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
+        from egosim_jax.networks import Networks
 
         check_counts({"--sequences": self.sequences, "--clips": self.clips})
         config = configs.get(self.config)

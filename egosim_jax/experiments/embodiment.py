@@ -30,7 +30,8 @@ from egosim_jax.types import check_counts
 if TYPE_CHECKING:
     import numpy as np
 
-    from egosim_jax.generator import Generator, ModelConfig
+    from egosim_jax.generator import Generator
+    from egosim_jax.networks import ModelConfig
     from egosim_jax.train.config import Training
     from egosim_jax.types import Kind
 
@@ -282,8 +283,9 @@ class Embodiment:
 
     def _generator(self, made: Mapping[str, Path], name: str) -> Generator:
         from egosim_jax.convert.lora import read_lora
-        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.generator import Generator
         from egosim_jax.models import lora
+        from egosim_jax.networks import Networks
 
         model = self._model
         networks = Networks.load(model, made["people" if name == "lora" else name])

@@ -69,9 +69,10 @@ class Tabletop:
     def run(self) -> int:
         """Make the scenes, generate, compare, draw."""
         from egosim_jax import configs
-        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.generator import Generator
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
+        from egosim_jax.networks import Networks
 
         check_counts(
             {"--scenes": self.scenes, "--seeds": self.seeds, "--batch-size": self.batch_size}

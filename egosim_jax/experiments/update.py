@@ -62,9 +62,10 @@ class Update:
     def run(self) -> int:
         """Carry, update, compare."""
         from egosim_jax import configs
-        from egosim_jax.generator import Generator, Networks
+        from egosim_jax.generator import Generator
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
+        from egosim_jax.networks import Networks
 
         check_counts({"--scenes": self.scenes})
         config = configs.get(self.config)

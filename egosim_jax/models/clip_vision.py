@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,9 @@ from egosim_jax.types import InputError
 @dataclass(frozen=True, kw_only=True)
 class CLIPVisionConfig:
     """Sizes of the image encoder; the defaults are those of ViT-H/14."""
+
+    table: ClassVar[str] = "clip_vision"
+    """Name table of conversion."""
 
     image_size: int = 224
     """Rows and columns of the picture in pixels, a multiple of `patch`."""
@@ -68,6 +72,10 @@ class CLIPVisionConfig:
                 f"skip_last {self.skip_last} does not fit {self.layers} layers: it must be at "
                 "least 0 and leave a block."
             )
+
+    def build(self, *, rngs: nnx.Rngs) -> CLIPVision:
+        """Build the network with random weights."""
+        return CLIPVision(self, rngs=rngs)
 
     @property
     def tokens(self) -> int:

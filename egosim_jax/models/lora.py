@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -45,14 +45,14 @@ MOST_RANK = 2048
 """Highest rank that is read; with the network's own widths it bounds the memory."""
 
 
-def linears(network: nnx.Module) -> Iterator[tuple[str, Linear]]:
+def linears(network: Any) -> Iterator[tuple[str, Linear]]:
     """The linear layers of a network by their dotted paths."""
     for path, module in nnx.iter_modules(network):
         if isinstance(module, Linear):
             yield ".".join(map(str, path)), module
 
 
-def apply(network: nnx.Module, changes: Mapping[str, Change], *, scale: float = 1.0) -> None:
+def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) -> None:
     """Add summands to the layers and weights of these paths, in place; low-rank ones stay apart.
 
     Raises what `check` raises.
@@ -73,7 +73,7 @@ def apply(network: nnx.Module, changes: Mapping[str, Change], *, scale: float = 
             layers[path].low_rank = LowRank(jnp.asarray(change.down), up)
 
 
-def deltas_of(network: nnx.Module) -> dict[str, Delta]:
+def deltas_of(network: Any) -> dict[str, Delta]:
     """What was added to the layers that have a summand."""
     return {
         path: Delta(
@@ -113,7 +113,7 @@ def about(config: str, *, base: str) -> dict[str, str]:
     return {"format": OURS, "config": config, BASE: base}
 
 
-def start(network: nnx.Module, rank: int, *, rngs: nnx.Rngs) -> None:
+def start(network: Any, rank: int, *, rngs: nnx.Rngs) -> None:
     """Add summands of a rank to every linear layer of the blocks, in place, to train.
 
     A is drawn as the paper does, from a normal distribution of deviation 1 / sqrt(in), and B is 0,

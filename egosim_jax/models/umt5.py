@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,9 @@ from egosim_jax.types import InputError
 @dataclass(frozen=True, kw_only=True)
 class UMT5Config:
     """Sizes of the text encoder; the defaults are umT5-XXL's."""
+
+    table: ClassVar[str] = "umt5"
+    """Name table of conversion."""
 
     vocab: int = 256384
     """Rows of the token table; the tokenizer may use fewer."""
@@ -69,6 +73,10 @@ class UMT5Config:
                 f"max_distance {self.max_distance} leaves no room for logarithmic buckets: it must "
                 f"be above buckets / 4 = {self.buckets // 4}."
             )
+
+    def build(self, *, rngs: nnx.Rngs) -> UMT5:
+        """Build the network with random weights."""
+        return UMT5(self, rngs=rngs)
 
 
 def relative_buckets(

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,9 @@ from egosim_jax.models.attention import Kernel, attention
 from egosim_jax.models.layers import Axes, Initializer, LayerNorm, Linear, RMSNorm, zeros
 from egosim_jax.models.sinusoid import time_sinusoid
 from egosim_jax.types import InputError, check_counts
+
+if TYPE_CHECKING:
+    from egosim_jax.models.wan_dit import WanDiT
 
 PATCH = 2
 """Latent rows and columns of a token; a token has one latent frame."""
@@ -54,6 +57,9 @@ gelu_erf = partial(jax.nn.gelu, approximate=False)
 @dataclass(frozen=True, kw_only=True)
 class WanDiTConfig:
     """Shape and numerics of the transformer; the defaults are EgoSim's 14B."""
+
+    table: ClassVar[str] = "wan_dit"
+    """Name table of conversion."""
 
     in_channels: int = 52
     """Channels of the noisy latents and the condition together."""
@@ -104,6 +110,12 @@ class WanDiTConfig:
             raise InputError(
                 f'The {self.attention} attention kernel needs dtype "bfloat16", not "float32".'
             )
+
+    def build(self, *, rngs: nnx.Rngs) -> WanDiT:
+        """Build the network with random weights."""
+        from egosim_jax.models.wan_dit import WanDiT
+
+        return WanDiT(self, rngs=rngs)
 
     @property
     def head_dim(self) -> int:

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,9 @@ from egosim_jax.types import SPATIAL_STRIDE, TEMPORAL_STRIDE, InputError, check_
 @dataclass(frozen=True, kw_only=True)
 class WanVAEConfig:
     """Sizes of the video VAE; the defaults are the released one's."""
+
+    table: ClassVar[str] = "wan_vae"
+    """Name table of conversion."""
 
     dim: int = 96
     """Channels at full resolution."""
@@ -91,6 +94,10 @@ class WanVAEConfig:
                     f"{name} has {len(getattr(self, name))} entries for {self.z_dim} latent "
                     "channels (z_dim): give one number per channel."
                 )
+
+    def build(self, *, rngs: nnx.Rngs) -> WanVAE:
+        """Build the network with random weights."""
+        return WanVAE(self, rngs=rngs)
 
 
 class Encoder(nnx.Module):

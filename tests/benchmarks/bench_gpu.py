@@ -32,10 +32,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.generator import Generator, Inputs, ModelConfig, Networks
+from egosim_jax.generator import Generator, Inputs
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import initialize
 from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh
@@ -167,7 +168,7 @@ def step(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """All of EgoSim-14B: conditions encoded, 50 steps, decoded, with all networks on the device."""
     config = replace(configs.get(options.config), steps=options.steps)
-    shapes = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0)))
+    shapes = Networks.abstract(config)
     graph, params = nnx.split(shapes)
     begun = time.perf_counter()
     networks = nnx.merge(graph, _draw(_half(params)))

@@ -33,7 +33,7 @@ from tests.benchmarks.bench_wan_dit import THREADS, interleave, interval
 if TYPE_CHECKING:
     import torch
 
-    from egosim_jax.generator import ModelConfig
+    from egosim_jax.networks import ModelConfig
 
 GOAL, BAR = 1.0, 1.25
 """Ratio of times, ours to theirs: what is aimed at, and what must not be exceeded."""
@@ -117,16 +117,17 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
     from egosim_jax.diffusion.objective import Objective
     from egosim_jax.io.weights import fill
+    from egosim_jax.networks import Networks
     from egosim_jax.train.config import OptimizerConfig
-    from egosim_jax.train.tasks.denoising import Denoiser, Denoising
+    from egosim_jax.train.tasks.denoising import Denoising, condition_of
     from egosim_jax.train.update import TrainState, make_update
     from tests.translation import translate
 
     class GivenNoise(Denoising):
         """The task, but for noise and noise levels, which are the batch's."""
 
-        def loss(self, networks: Denoiser, batch: Any, keys: jax.Array) -> tuple[jax.Array, dict]:
-            condition = networks.condition(batch)
+        def loss(self, networks: Networks, batch: Any, keys: jax.Array) -> tuple[jax.Array, dict]:
+            condition = condition_of(networks, batch)
 
             def velocity(x: jax.Array, t: jax.Array) -> jax.Array:
                 return networks.dit(assemble(x, condition), t, condition.text, condition.image)

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import open3d  # noqa: F401 - what is imported once is not imported in every fork
-from flax import nnx
 from jax.sharding import SingleDeviceSharding
 from PIL import Image
 from safetensors.numpy import save_file
@@ -34,7 +33,6 @@ from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter
 from egosim_jax.data.sheet import Block, draw_sheet
-from egosim_jax.generator import Networks
 from egosim_jax.io import executables, weights
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.checkpoint import Checkpoints
@@ -43,6 +41,7 @@ from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import read_lines
 from egosim_jax.io.video import read_video, write_video
+from egosim_jax.networks import Networks
 from egosim_jax.state import snapshot
 from egosim_jax.train import encode
 from egosim_jax.types import SceneState, Triplet, VideoSpec
@@ -69,7 +68,7 @@ class Writer:
 
 def inputs(folder: Path) -> None:
     """Make what the writers are given."""
-    networks = nnx.eval_shape(lambda: Networks(configs.get("debug"), rngs=nnx.Rngs(0))).parts()
+    networks = Networks.abstract(configs.get("debug")).parts()
     for name, part in networks.items():
         rng = np.random.default_rng(0)
         tensors = {
@@ -246,7 +245,7 @@ def _encode(place: Path, inputs: Path, version: int) -> None:
             return [{"target": triplet.target[:, 0, 0].copy()} for triplet in triplets]
 
     encode.Encoding = Encoding
-    encode.Encoders.load = lambda *_, **__: None
+    Networks.load = lambda *_, **__: None
     encode.cache(
         configs.get("debug"), inputs / "weights", source=ShardReader(inputs / "frames0"),
         out=place / "shards", stride=1, batch_size=1, shard_windows=1,

@@ -7,7 +7,7 @@ from flax import nnx
 from jax.sharding import AbstractMesh
 
 from egosim_jax import configs
-from egosim_jax.generator import Networks
+from egosim_jax.networks import Networks
 from egosim_jax.sharding import state_sharding
 
 GOLDEN = Path(__file__).with_name("sharding.txt")
@@ -18,7 +18,7 @@ MESHES = ((1, 8, 1), (4, 2, 1), (1, 4, 2))
 def dump() -> Iterator[str]:
     """A line for each weight: its shape, and that of a device's part on each mesh."""
     for name in ("egosim_14b", "debug"):
-        networks = nnx.eval_shape(lambda n=name: Networks(configs.get(n), rngs=nnx.Rngs(0)))
+        networks = Networks.abstract(configs.get(name))
         params = nnx.state(networks, nnx.Param)
         meshes = [AbstractMesh(shape, ("data", "fsdp", "context")) for shape in MESHES]
         placed = [dict(nnx.to_flat_state(state_sharding(mesh, params))) for mesh in meshes]

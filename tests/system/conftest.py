@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.generator import Networks
+from egosim_jax.networks import Networks
 
 
 @pytest.fixture(scope="session")

@@ -20,9 +20,9 @@ from egosim_jax.cli.__main__ import main
 from egosim_jax.data import shards
 from egosim_jax.data.check import check
 from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, read_manifest
-from egosim_jax.generator import Networks
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.networks import Networks
 from egosim_jax.train import encode as caching
 from egosim_jax.train.encode import cache, check_encoders
 from egosim_jax.types import InputError, VideoSpec

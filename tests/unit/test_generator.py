@@ -11,14 +11,8 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.diffusion.guidance import Guidance
-from egosim_jax.generator import (
-    Generator,
-    Inputs,
-    ModelConfig,
-    Networks,
-    denoise,
-    encode_condition,
-)
+from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import Program
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet

@@ -6,7 +6,7 @@ from flax import nnx
 from jax.sharding import AbstractMesh, PartitionSpec
 
 from egosim_jax import configs
-from egosim_jax.generator import Networks
+from egosim_jax.networks import Networks
 from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, state_sharding
 from egosim_jax.types import InputError
 
@@ -14,7 +14,7 @@ from egosim_jax.types import InputError
 @pytest.fixture(scope="module")
 def params() -> nnx.State:
     config = configs.get("egosim_14b")
-    return nnx.state(nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0))), nnx.Param)
+    return nnx.state(Networks.abstract(config), nnx.Param)
 
 
 def test_every_weight_of_every_network_names_its_axes(params):

@@ -60,7 +60,7 @@ class Autoencoding:
 
     def networks(self, rngs: nnx.Rngs) -> WanVAE:
         """The VAE with random weights."""
-        return WanVAE(self.vae, rngs=rngs)
+        return self.vae.build(rngs=rngs)
 
     @property
     def trained(self) -> Any:

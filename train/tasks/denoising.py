@@ -15,16 +15,13 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.conditioning import assemble
+from egosim_jax.conditioning import condition_channels
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.schedule import VelocityFn
-from egosim_jax.generator import ModelConfig
 from egosim_jax.models import lora
-from egosim_jax.models.clip_vision import CLIPVision
 from egosim_jax.models.layers import LowRankParam
-from egosim_jax.models.umt5 import UMT5
-from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.encode import example_shapes
 from egosim_jax.train.flops import count_forward
 from egosim_jax.train.update import Batch, Metrics
@@ -32,33 +29,6 @@ from egosim_jax.types import Condition
 
 VALIDATION_TIMES = (0.2, 0.5, 0.8, 0.97)
 """Noise levels at which the validation loss is measured."""
-
-
-class Denoiser(nnx.Module):
-    """The networks that are trained: the DiT, and the encoders of a model that trains its own."""
-
-    def __init__(self, config: ModelConfig, *, rngs: nnx.Rngs):
-        joint = config.encoders == "joint"
-        self.dit = WanDiT(config.dit, rngs=rngs)
-        self.text = UMT5(config.text, rngs=rngs) if joint else None
-        self.image = CLIPVision(config.image, rngs=rngs) if joint and config.image else None
-
-    def parts(self) -> dict[str, nnx.Module]:
-        """The networks by name."""
-        named = {"dit": self.dit, "text": self.text, "image": self.image}
-        return {name: network for name, network in named.items() if network is not None}
-
-    def condition(self, batch: Batch) -> Condition:
-        """The condition of a cached batch."""
-        text = batch["text"] if self.text is None else self.text(batch["ids"], batch["ids_mask"])
-        image = batch.get("image") if self.image is None else self.image(batch["pixels"])
-        return Condition(
-            mask=batch["mask"].astype(jnp.float32),
-            prior=batch["prior"],
-            hands=batch["hands"],
-            text=text,
-            image=image,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +57,9 @@ class Denoising:
         """That in which the transformer computes."""
         return self.model.dit.dtype
 
-    def networks(self, rngs: nnx.Rngs) -> Denoiser:
+    def networks(self, rngs: nnx.Rngs) -> Networks:
         """The networks with random weights."""
-        networks = Denoiser(self.model, rngs=rngs)
+        networks = Networks.build(self.model, only=self.model.trained_networks, rngs=rngs)
         if self.rank is not None:
             lora.start(networks.dit, self.rank, rngs=rngs)
         return networks
@@ -107,18 +77,18 @@ class Denoising:
         return jnp.stack([jax.random.split(drop, batch), jax.random.split(draw, batch)], axis=1)
 
     def loss(
-        self, networks: Denoiser, batch: Batch, keys: Key[Array, "b 2"]
+        self, networks: Networks, batch: Batch, keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
         """The flow-matching loss of a batch under dropped conditions."""
-        condition = self.dropout.apply(networks.condition(batch), keys[:, 0])
+        condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
         velocity = _velocity(networks, condition)
         places = changed_places(batch["target"], batch["prior"], self.change)
         loss, _ = self.objective.loss(velocity, batch["target"], keys[:, 1], places=places)
         return loss, {}
 
-    def validate(self, networks: Denoiser, batch: Batch) -> Metrics:
+    def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Errors at fixed noise levels and with fixed noise, under the full condition."""
-        velocity = _velocity(networks, networks.condition(batch))
+        velocity = _velocity(networks, condition_of(networks, batch))
         truth = batch["target"]
         noise = jax.random.normal(jax.random.key(0), truth.shape)
         errors = {
@@ -143,6 +113,21 @@ class Denoising:
         return samples * (weights * forward.weights + 3 * forward.attention)
 
 
+def condition_of(networks: Networks, batch: Batch) -> Condition:
+    """Return the condition of a cached batch, under encoders that are trained or cached."""
+    text = (
+        batch["text"] if networks.text is None else networks.text(batch["ids"], batch["ids_mask"])
+    )
+    image = batch.get("image") if networks.image is None else networks.image(batch["pixels"])
+    return Condition(
+        mask=batch["mask"].astype(jnp.float32),
+        prior=batch["prior"],
+        hands=batch["hands"],
+        text=text,
+        image=image,
+    )
+
+
 def changed_places(
     truth: Float[Array, "b f h w c"], prior: Float[Array, "b f h w c"], change: float
 ) -> Float[Array, "b f h w 1"]:
@@ -155,8 +140,7 @@ def changed_places(
     return weight / weight.mean(axis=(1, 2, 3), keepdims=True)
 
 
-def _velocity(networks: Denoiser, condition: Condition) -> VelocityFn:
-    def velocity(x: Float[Array, "b f h w c"], t: Float[Array, " b"]) -> Float[Array, "b f h w c"]:
-        return networks.dit(assemble(x, condition), t, condition.text, condition.image)
-
-    return velocity
+def _velocity(networks: Networks, condition: Condition) -> VelocityFn:
+    dit = networks.dit
+    context = dit.prepare(condition_channels(condition), condition.text, condition.image)
+    return lambda x, t: dit.denoise(x, t, context)

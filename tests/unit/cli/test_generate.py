@@ -10,7 +10,7 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.command import USAGE
 from egosim_jax.data.clips import write_clips
-from egosim_jax.generator import Networks
+from egosim_jax.networks import Networks
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 

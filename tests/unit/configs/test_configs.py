@@ -1,11 +1,10 @@
 """The released models by name."""
 
 import pytest
-from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.generator import Networks
 from egosim_jax.io.weights import flat_shapes
+from egosim_jax.networks import Networks
 from egosim_jax.types import InputError
 
 
@@ -21,7 +20,7 @@ def test_a_typo_is_answered_with_the_nearest_name():
 
 def test_egosim_14b_has_the_released_networks_at_their_size():
     config = configs.get("egosim_14b")
-    parts = nnx.eval_shape(lambda: Networks(config, rngs=nnx.Rngs(0))).parts()
+    parts = Networks.abstract(config).parts()
     patch = flat_shapes(parts["dit"])["patch.kernel"]
     assert patch == (52, 2, 2, 5120)
     assert parts.keys() == {"dit", "vae", "text", "image"}

@@ -28,9 +28,9 @@ from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.layouts import recognize
 from egosim_jax.convert.plan import TABLES
 from egosim_jax.convert.tables import wan_dit
-from egosim_jax.generator import Networks
 from egosim_jax.io.weights import flat_shapes, hashes, load
 from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.networks import Networks
 from tests.translation import translate_back
 
 CONFIG = configs.get("debug")
@@ -39,7 +39,7 @@ NETWORKS = ("dit", "vae", "text", "image")
 
 @cache
 def all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:
-    parts = nnx.eval_shape(lambda: Networks(CONFIG, rngs=nnx.Rngs(0))).parts()
+    parts = Networks.abstract(CONFIG).parts()
     return {network: flat_shapes(part) for network, part in parts.items()}
 
 

@@ -1,0 +1,163 @@
+"""A model as a choice of networks, and the networks of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from flax import nnx
+from jax.sharding import Mesh
+
+from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.diffusion.guidance import Guidance
+from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.diffusion.solver import Euler, UniPC
+from egosim_jax.io import weights
+from egosim_jax.models import Denoiser, ImageEncoder, NetworkConfig, TextEncoder, VideoCodec
+from egosim_jax.models.clip_vision import CLIPVisionConfig
+from egosim_jax.models.layers import initialize
+from egosim_jax.models.umt5 import UMT5Config
+from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.types import InputError, VideoSpec
+
+Name = Literal["dit", "vae", "text", "image"]
+"""Role of a network in a model, which is also the stem of its file of weights."""
+NAMES: tuple[Name, ...] = ("dit", "vae", "text", "image")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """A released model: its networks, its conditioning and its sampling."""
+
+    name: str
+    """Name of the model on the command line."""
+    video: VideoSpec
+    """Length and size of its clips."""
+    dit: WanDiTConfig
+    """Config of the denoiser."""
+    vae: WanVAEConfig = field(default_factory=WanVAEConfig)
+    """Config of the video autoencoder."""
+    text: UMT5Config = field(default_factory=UMT5Config)
+    """Config of the text encoder."""
+    image: CLIPVisionConfig | None = field(default_factory=CLIPVisionConfig)
+    """Config of the image encoder; None for models without the image branch."""
+    tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
+    """Tokenizer of the prompts."""
+    encoders: Literal["frozen", "joint"] = "frozen"
+    """`frozen`: text and image encoder are given; `joint`: trained together with the denoiser."""
+    image_range: Literal["signed", "unit"] = "signed"
+    """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
+    schedule: FlowSchedule = field(default_factory=FlowSchedule)
+    """Noise schedule."""
+    solver: Euler | UniPC = field(default_factory=Euler)
+    """Sampler."""
+    guidance: Guidance = field(default_factory=Guidance)
+    """Classifier-free guidance on the text."""
+    steps: int = 50
+    """Denoising steps."""
+
+    def __post_init__(self) -> None:
+        """Check that the networks fit each other."""
+        pairs = [
+            ("dit.text_dim", self.dit.text_dim, "text.dim", self.text.dim),
+            ("dit.out_channels", self.dit.out_channels, "vae.z_dim", self.vae.z_dim),
+            ("dit.image_dim", self.dit.image_dim, "image.dim", self.image and self.image.dim),
+        ]
+        for left, a, right, b in pairs:
+            if a != b:
+                raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+
+    @property
+    def networks(self) -> Mapping[Name, NetworkConfig]:
+        """Configs of the networks that the model has, by name."""
+        configs: dict[Name, NetworkConfig | None] = {name: getattr(self, name) for name in NAMES}
+        return {name: config for name, config in configs.items() if config is not None}
+
+    @property
+    def trained_networks(self) -> tuple[Name, ...]:
+        """Names of the networks that training the denoiser updates."""
+        trained = ("dit", "text", "image") if self.encoders == "joint" else ("dit",)
+        return tuple(name for name in self.networks if name in trained)
+
+    @property
+    def cached_networks(self) -> tuple[Name, ...]:
+        """Names of the networks whose outputs are cached for training the denoiser."""
+        return tuple(name for name in self.networks if name not in self.trained_networks)
+
+    def at(self, folder: Path) -> ModelConfig:
+        """Return this config with the tokenizer's files looked up in a weights folder."""
+        if self.tokenizer.kind == "byt5":
+            return self
+        files = replace(self.tokenizer, kind=folder / self.tokenizer.kind)
+        return replace(self, tokenizer=files)
+
+
+class Networks(nnx.Module):
+    """Networks of a model, all of them or some; an attribute is None where one is absent."""
+
+    dit: Denoiser
+    vae: VideoCodec
+    text: TextEncoder
+    image: ImageEncoder | None
+
+    def __init__(self, *, dit: Any = None, vae: Any = None, text: Any = None, image: Any = None):
+        self.dit, self.vae, self.text, self.image = dit, vae, text, image
+
+    @classmethod
+    def build(
+        cls, config: ModelConfig, *, only: Collection[str] | None = None, rngs: nnx.Rngs
+    ) -> Networks:
+        """Build the networks of a config, or `only` those of some names, with random weights."""
+        return cls(
+            **{
+                name: network.build(rngs=rngs)
+                for name, network in config.networks.items()
+                if only is None or name in only
+            }
+        )
+
+    @classmethod
+    def abstract(cls, config: ModelConfig, *, only: Collection[str] | None = None) -> Networks:
+        """Build the networks with shapes in place of weights."""
+        return nnx.eval_shape(lambda: cls.build(config, only=only, rngs=nnx.Rngs(0)))
+
+    @classmethod
+    def random(cls, config: ModelConfig, *, seed: int) -> Networks:
+        """Build untrained networks in one compiled program."""
+        graph = nnx.graphdef(cls.abstract(config))
+        params = initialize(lambda: nnx.state(cls.build(config, rngs=nnx.Rngs(seed)), nnx.Param))
+        return nnx.merge(graph, params)
+
+    @classmethod
+    def load(
+        cls,
+        config: ModelConfig,
+        folder: Path | str,
+        *,
+        only: Collection[str] | None = None,
+        mesh: Mesh | None = None,
+    ) -> Networks:
+        """Load networks from a weights folder, which holds `<network>.safetensors` for each.
+
+        With a mesh each device reads its own part of the weights. Raises `InputError` with every
+        path that is missing, unknown or of another shape.
+        """
+        networks, folder = cls.abstract(config, only=only), Path(folder)
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder of weights. (--weights)")
+        for name, network in networks.parts().items():
+            weights.load(folder / f"{name}.safetensors", network, mesh=mesh)
+        return networks
+
+    def save(self, folder: Path, *, dtype: str | None = None) -> None:
+        """Write a weights folder; `dtype` casts, by default weights keep their own."""
+        for name, network in self.parts().items():
+            weights.save(folder / f"{name}.safetensors", network, dtype=dtype)
+
+    def parts(self) -> dict[str, nnx.Module]:
+        """Return the networks that are present, by name."""
+        named = {name: getattr(self, name) for name in NAMES}
+        return {name: network for name, network in named.items() if network is not None}
