@@ -23,10 +23,10 @@ from egosim_jax.convert.theirs import arguments
 from egosim_jax.generator import Program
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.clip_vision import CLIPVisionConfig
-from egosim_jax.models.umt5 import UMT5Config
-from egosim_jax.models.wan_dit import WanDiTConfig
-from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.networks import ModelConfig
 from egosim_jax.types import InputError
 

@@ -40,7 +40,7 @@ from egosim_jax.models.lora import (
     pairs,
     refuse,
 )
-from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.types import InputError
 
 PREFIXES = (

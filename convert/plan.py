@@ -21,7 +21,7 @@ from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.models.lora import Change
-    from egosim_jax.models.wan_dit import WanDiTConfig
+    from egosim_jax.models.wan.config import WanDiTConfig
     from egosim_jax.networks import ModelConfig
 
 TABLES: dict[Network, str] = {

@@ -16,11 +16,11 @@ from egosim_jax.diffusion.schedule import FlowSchedule
 from egosim_jax.diffusion.solver import Euler, UniPC
 from egosim_jax.io import weights
 from egosim_jax.models import Denoiser, ImageEncoder, NetworkConfig, TextEncoder, VideoCodec
-from egosim_jax.models.clip_vision import CLIPVisionConfig
 from egosim_jax.models.layers import initialize
-from egosim_jax.models.umt5 import UMT5Config
-from egosim_jax.models.wan_dit import WanDiTConfig
-from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import InputError, VideoSpec
 
 Name = Literal["dit", "vae", "text", "image"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from egosim_jax.command import DONE
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
-from egosim_jax.models.wan_layers import Remat
+from egosim_jax.models.wan.config import Remat
 from egosim_jax.train.config import Recipe, Training
 from egosim_jax.train.update import Stage
 

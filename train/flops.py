@@ -15,8 +15,7 @@ from __future__ import annotations
 from math import prod
 from typing import NamedTuple
 
-from egosim_jax.models.wan_dit import WanDiTConfig
-from egosim_jax.models.wan_layers import PATCH
+from egosim_jax.models.wan.config import PATCH, WanDiTConfig
 
 
 class Flops(NamedTuple):

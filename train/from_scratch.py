@@ -16,7 +16,7 @@ from egosim_jax.data.transforms import record_length
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.io import weights
 from egosim_jax.models import abstract
-from egosim_jax.models.wan_vae import WanVAE, standardise_latents
+from egosim_jax.models.wan.vae import WanVAE, standardise_latents
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.config import Training
 from egosim_jax.train.encode import cache

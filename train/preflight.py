@@ -18,7 +18,7 @@ from typing import Any
 import jax
 
 from egosim_jax.command import DONE, FAILED
-from egosim_jax.models.wan_layers import Remat
+from egosim_jax.models.wan.config import Remat
 from egosim_jax.preflight.report import Report, TooLarge, compile_for, plain, size, text
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.progress import track

@@ -7,7 +7,7 @@ names, in any naming, that the network does not use.
 from __future__ import annotations
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.models.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 
 
 def wan(config: CLIPVisionConfig) -> list[Rule]:

@@ -7,7 +7,7 @@ names, in any naming, that the network does not use.
 from __future__ import annotations
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.models.umt5 import UMT5Config
+from egosim_jax.models.wan.umt5 import UMT5Config
 
 
 def wan(config: UMT5Config) -> list[Rule]:

@@ -8,7 +8,7 @@ use.
 from __future__ import annotations
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.models.wan.config import WanDiTConfig
 
 PATCH_KERNEL = "o c 1 i j -> c i j o"
 MODULATION = "1 k d -> k d"

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.skeleton import shapes
-from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.models.wan.vae import WanVAEConfig
 
 LEAVES = {"kernel": "weight", "bias": "bias", "scale": "gamma"}
 SHARED = {"space": "resample.1", "time": "time_conv", "qkv": "to_qkv", "out": "proj"}

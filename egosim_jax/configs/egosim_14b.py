@@ -8,10 +8,10 @@ from pathlib import Path
 
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.diffusion.schedule import FlowSchedule
-from egosim_jax.models.clip_vision import CLIPVisionConfig
-from egosim_jax.models.umt5 import UMT5Config
-from egosim_jax.models.wan_dit import WanDiTConfig
-from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.networks import ModelConfig
 from egosim_jax.types import VideoSpec
 

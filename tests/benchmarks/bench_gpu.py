@@ -35,7 +35,7 @@ from egosim_jax import configs
 from egosim_jax.generator import Generator, Inputs
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import initialize
-from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, find, peak

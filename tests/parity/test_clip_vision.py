@@ -12,7 +12,7 @@ from transformers import CLIPVisionModel
 
 from egosim_jax.convert.tables import clip_vision as table
 from egosim_jax.io.weights import WeightsError, fill, flat_shapes
-from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig
+from egosim_jax.models.wan.clip_vision import CLIPVision, CLIPVisionConfig
 from tests.translation import translate, translate_back
 
 CONFIG = CLIPVisionConfig(image_size=56, patch=14, dim=64, layers=3, heads=4, ffn_dim=96)

@@ -23,10 +23,10 @@ from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.schedule import FlowSchedule
 from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
-from egosim_jax.models.clip_vision import CLIPVisionConfig
-from egosim_jax.models.umt5 import UMT5Config
-from egosim_jax.models.wan_dit import WanDiTConfig
-from egosim_jax.models.wan_vae import WanVAEConfig
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.types import Triplet, VideoSpec
 from tests.translation import translate, translate_back

@@ -10,7 +10,7 @@ from flax import nnx
 
 from egosim_jax.convert.tables import wan_vae as table
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig
 from tests.translation import translate, translate_back
 
 CONFIG = WanVAEConfig(dim=8)

@@ -11,7 +11,7 @@ from egosim_jax.command import DONE, guarded
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io import weights
-from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.train.config import OptimizerConfig, Training
 from egosim_jax.train.distributed import joined
 from egosim_jax.train.loop import train

@@ -9,7 +9,7 @@ import numpy as np
 
 from egosim_jax import configs
 from egosim_jax.generator import Generator
-from egosim_jax.models.wan_dit import WanDiTConfig
+from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.networks import Networks
 from egosim_jax.sharding import MeshConfig, make_mesh
 from egosim_jax.types import InputError, Triplet, VideoSpec

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.transforms import COLORS, DecodeWindow
-from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig
+from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
 

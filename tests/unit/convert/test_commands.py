@@ -29,7 +29,7 @@ from egosim_jax.convert.layouts import recognize
 from egosim_jax.convert.plan import TABLES
 from egosim_jax.convert.tables import wan_dit
 from egosim_jax.io.weights import flat_shapes, hashes, load
-from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.networks import Networks
 from tests.translation import translate_back
 

@@ -17,9 +17,9 @@ from egosim_jax.convert.plan import to_ours, to_theirs
 from egosim_jax.convert.source import Source
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import flat_shapes
-from egosim_jax.models.umt5 import UMT5
-from egosim_jax.models.wan_dit import WanDiT
-from egosim_jax.models.wan_vae import WanVAE
+from egosim_jax.models.wan.dit import WanDiT
+from egosim_jax.models.wan.umt5 import UMT5
+from egosim_jax.models.wan.vae import WanVAE
 
 EGOSIM_14B, EGOSIM_1_3B = configs.get("egosim_14b"), configs.get("egosim_1_3b")
 

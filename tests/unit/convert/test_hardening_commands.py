@@ -27,7 +27,7 @@ from egosim_jax.convert.skeleton import shapes
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_metadata
 from egosim_jax.models import lora
-from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.types import InputError
 
 CONFIG = configs.get("debug")
@@ -424,7 +424,7 @@ def test_a_damaged_file_of_ours_is_refused_when_it_is_used(tmp_path, capsys):
     args = ["to-torch", base, "--config", "debug", "--only", "text", "--out", tmp_path / "out"]
     assert "is damaged" in one_line(capsys, 2, *args)
     assert not list((tmp_path / "out").glob("[!.]*"))
-    from egosim_jax.models.umt5 import UMT5
+    from egosim_jax.models.wan.umt5 import UMT5
 
     network = nnx.eval_shape(lambda: UMT5(CONFIG.text, rngs=nnx.Rngs(0)))
     with pytest.raises(InputError, match="is damaged"):

@@ -16,7 +16,7 @@ from egosim_jax.convert.lora import read_lora
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_metadata
 from egosim_jax.models import lora
-from egosim_jax.models.wan_dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.types import InputError
 
 CONFIG = configs.get("debug").dit

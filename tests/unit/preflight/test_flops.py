@@ -1,6 +1,5 @@
 """FLOPs counted in programs, beside the closed formula and XLA's own count."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,7 +9,8 @@ from flax import nnx
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
 from egosim_jax.models.attention import attention, keep_attention
-from egosim_jax.models.wan_dit import EGOSIM_14B, WanDiT
+from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.preflight.flops import count
 from egosim_jax.train.flops import count_forward
 
@@ -29,7 +29,7 @@ def counted(function, *args):
 def test_a_forward_of_the_14b_is_that_of_the_formula(kernel, tolerance, monkeypatch):
     """The kernels pad the image's 257 keys, cuDNN's to 264 and splash to 384, and compute those."""
     monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
-    config = replace(EGOSIM_14B, dtype="bfloat16", attention=kernel)
+    config = WanDiTConfig(dtype="bfloat16", attention=kernel)
     graph, params = nnx.split(nnx.eval_shape(lambda: WanDiT(config, rngs=nnx.Rngs(0))))
     given = shape(1, 16, 60, 104, 52), shape(1), shape(1, 512, 4096), shape(1, 257, 1280)
     have = counted(lambda params, *args: nnx.merge(graph, params)(*args), params, *given)

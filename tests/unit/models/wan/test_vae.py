@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.wan_vae import WanVAE, WanVAEConfig, standardise_latents
+from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig, standardise_latents
 from egosim_jax.types import InputError
 
 SIZES = dict(dim=4, z_dim=2, res_blocks=1, latent_mean=(0.3, -0.2), latent_std=(0.5, 2.0))

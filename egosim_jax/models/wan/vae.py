@@ -27,7 +27,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from egosim_jax.models.layers import Linear
-from egosim_jax.models.wan_vae_layers import (
+from egosim_jax.models.wan.vae_layers import (
     Cache,
     Conv,
     Downsample,

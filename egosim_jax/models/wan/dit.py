@@ -2,7 +2,7 @@
 
 Noisy latents of 16 channels and a condition of 0 (text to video), 20 (image to video) or 36
 channels (EgoSim) are cut into patches of 1 x 2 x 2 cells, one token each, which pass through the
-blocks of `wan_layers` and become the velocity of the noisy latents.
+blocks of `layers` and become the velocity of the noisy latents.
 
 Everything that does not depend on the step is computed once by `prepare`: the patch embedding is
 linear, so that the condition's summand stands alone; keys and values of the cross-attentions depend
@@ -26,9 +26,9 @@ from jaxtyping import Array, Float
 from egosim_jax.models import rope
 from egosim_jax.models.attention import keep_attention
 from egosim_jax.models.layers import scan_blocks, stack
-from egosim_jax.models.wan_layers import (
+from egosim_jax.models.wan.config import PATCH, WanDiTConfig
+from egosim_jax.models.wan.layers import (
     MLP,
-    PATCH,
     PROJECTION,
     Block,
     CrossAttention,
@@ -37,7 +37,6 @@ from egosim_jax.models.wan_layers import (
     KeysValues,
     PatchEmbedding,
     TimeEmbedding,
-    WanDiTConfig,
     gelu_tanh,
     normal,
 )
@@ -183,17 +182,3 @@ class WanDiT(nnx.Module):
             raise InputError(
                 f"Image tokens {given} given to a model with image_dim {config.image_dim}. {fix}."
             )
-
-
-T2V_14B = WanDiTConfig(in_channels=16, image_dim=None)
-"""Wan 2.1 text to video, 14B."""
-T2V_1_3B = WanDiTConfig(in_channels=16, image_dim=None, dim=1536, ffn_dim=8960, heads=12, layers=30)
-"""Wan 2.1 text to video, 1.3B."""
-I2V_14B = WanDiTConfig(in_channels=36)
-"""Wan 2.1 image to video and Wan 2.1 Fun InP, 14B."""
-INP_1_3B = WanDiTConfig(in_channels=36, dim=1536, ffn_dim=8960, heads=12, layers=30)
-"""Wan 2.1 Fun InP, 1.3B."""
-EGOSIM_14B = WanDiTConfig()
-"""EgoSim, 14B."""
-EGOSIM_1_3B = WanDiTConfig(dim=1536, ffn_dim=8960, heads=12, layers=30)
-"""EgoSim's input on the 1.3B model."""

@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.clip_vision import CLIPVision, CLIPVisionConfig, PatchEmbed
+from egosim_jax.models.wan.clip_vision import CLIPVision, CLIPVisionConfig, PatchEmbed
 from egosim_jax.types import InputError
 
 SIZES = dict(image_size=42, patch=14, dim=32, layers=3, heads=4, ffn_dim=48)

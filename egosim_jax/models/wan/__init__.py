@@ -1,0 +1,1 @@
+"""Networks of Wan 2.1 and EgoSim: video transformer, video VAE, umT5 and CLIP's image encoder."""

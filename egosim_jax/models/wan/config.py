@@ -1,0 +1,92 @@
+"""Config of Wan 2.1's video transformer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from flax import nnx
+
+from egosim_jax.models.attention import Kernel
+from egosim_jax.types import InputError, check_counts
+
+if TYPE_CHECKING:
+    from egosim_jax.models.wan.dit import WanDiT
+
+PATCH = 2
+"""Latent rows and columns of a token; a token has one latent frame."""
+Remat = Literal["none", "products", "projections", "attention", "full", "offload"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WanDiTConfig:
+    """Shape and numerics of the transformer; the defaults are EgoSim's 14B."""
+
+    table: ClassVar[str] = "wan_dit"
+    """Name table of conversion."""
+
+    in_channels: int = 52
+    """Channels of the noisy latents and the condition together."""
+    out_channels: int = 16
+    """Channels of the noisy latents and the velocity."""
+    dim: int = 5120
+    """Width of a token."""
+    ffn_dim: int = 13824
+    """Hidden width of the MLP."""
+    heads: int = 40
+    """Attention heads, each of dim / heads."""
+    layers: int = 40
+    """Blocks."""
+    text_dim: int = 4096
+    """Width of the text encoder's tokens."""
+    image_dim: int | None = 1280
+    """Width of the image encoder's tokens; None for a model without the image branch."""
+    freq_dim: int = 256
+    """Width of the time sinusoid."""
+    eps: float = 1e-6
+    """Epsilon of the norms."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Compute dtype of matrix products and the residual stream."""
+    attention: Kernel = "auto"
+    """Attention kernel."""
+    remat: Remat = "none"
+    """What the backward pass computes again: nothing; all but self-attention and products with
+    weights; all but self-attention and attention's linear layers (`PROJECTION`); all but
+    self-attention; every block; or every block from its input, which waits in the host's memory."""
+
+    def __post_init__(self) -> None:
+        """Check that the sizes fit each other and the kernel fits the dtype."""
+        sizes = ("out_channels", "dim", "ffn_dim", "heads", "layers", "text_dim", "freq_dim")
+        check_counts({name: getattr(self, name) for name in sizes})
+        if self.in_channels < self.out_channels:
+            raise InputError(
+                f"in_channels {self.in_channels} must hold the {self.out_channels} noisy channels "
+                "(out_channels) and those of the condition."
+            )
+        if self.dim % self.heads or self.head_dim % 2 or self.head_dim < 6:
+            raise InputError(
+                f"dim {self.dim} does not split into {self.heads} heads: a head needs an even size "
+                "of at least 6, so that frames, rows and columns each turn a pair. Change heads."
+            )
+        if self.freq_dim % 2:
+            raise InputError(f"freq_dim must be even (cosines and sines), not {self.freq_dim}.")
+        if self.attention in ("cudnn", "hopper") and self.dtype == "float32":
+            raise InputError(
+                f'The {self.attention} attention kernel needs dtype "bfloat16", not "float32".'
+            )
+
+    def build(self, *, rngs: nnx.Rngs) -> WanDiT:
+        """Build the network with random weights."""
+        from egosim_jax.models.wan.dit import WanDiT
+
+        return WanDiT(self, rngs=rngs)
+
+    @property
+    def head_dim(self) -> int:
+        """Size of an attention head."""
+        return self.dim // self.heads
+
+    @property
+    def condition_channels(self) -> int:
+        """Channels of the condition that is concatenated to the noisy latents."""
+        return self.in_channels - self.out_channels
