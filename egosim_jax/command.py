@@ -1,8 +1,4 @@
-"""How every command ends: with an exit code that a script can act on.
-
-0 done    1 failed    2 bad usage or input    3 some items failed
-70 hung   75 saved and to be resubmitted
-"""
+"""Command-line entry points: parsing, error messages and exit codes."""
 
 from __future__ import annotations
 
@@ -13,29 +9,46 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from enum import IntEnum
 from importlib import metadata
 from typing import Any, Protocol, get_args, get_type_hints, runtime_checkable
 
 from egosim_jax import interrupts
 from egosim_jax.types import InputError
 
-DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = 0, 1, 2, 3, 70, 75
+
+class ExitCode(IntEnum):
+    """Exit codes of every command, for scripts to act on."""
+
+    DONE = 0
+    FAILED = 1
+    USAGE = 2
+    """Wrong option or invalid input: the same command fails again."""
+    PARTIAL = 3
+    """Some items failed; the others are done."""
+    HUNG = 70
+    """Training made no progress within its timeout."""
+    RESUBMIT = 75
+    """Training was interrupted and saved: run the same command again."""
 
 
-class Stop(Exception):  # noqa: N818 - that a command ends early need not be an error
-    """Ends a command with an exit code, after printing why."""
+DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = ExitCode
 
-    def __init__(self, why: str, code: int):
-        super().__init__(why)
+
+class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
+    """Early end of a command, with the message to print and the exit code."""
+
+    def __init__(self, message: str, code: ExitCode):
+        super().__init__(message)
         self.code = code
 
 
 @runtime_checkable
 class Command(Protocol):
-    """A parsed command line."""
+    """Command line that was parsed into a dataclass."""
 
     def run(self) -> int:
-        """Do the work and give the exit code."""
+        """Run the command and return the exit code."""
         ...
 
 
@@ -45,14 +58,13 @@ def main(
     program: str,
     description: str,
     args: Sequence[str] | None,
-    within: Callable[[], AbstractContextManager[None]] = nullcontext,
+    context: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> int:
-    """Parse a command line into one of the dataclasses `commands`, run it, give its exit code.
+    """Parse a command line into one of the dataclasses `commands`, run it, return its exit code.
 
-    What `within` gives is entered before the command runs and left after it.
-
-    Results go to stdout, progress and errors to stderr. A wrong option or bad input is one clear
-    message; a traceback means that something is broken.
+    The command runs inside the context manager that `context` makes after parsing. Results go to
+    stdout, progress and errors to stderr. A wrong option or invalid input prints one message; a
+    traceback means a defect of the program.
     """
 
     given = list(sys.argv[1:] if args is None else args)
@@ -62,7 +74,7 @@ def main(
 
         if given == ["--version"]:
             print(f"{program} {metadata.version('egosim-jax')}")
-            return DONE
+            return ExitCode.DONE
         if (mistake := _mistyped(commands, given, program)) is not None:
             raise InputError(mistake)
         command: Command = tyro.cli(
@@ -72,14 +84,14 @@ def main(
             args=given,
             config=(tyro.conf.OmitSubcommandPrefixes,),
         )
-        with within():
+        with context():
             return command.run()
 
-    return guarded(run)
+    return run_with_exit_codes(run)
 
 
 def _mistyped(commands: Any, args: Sequence[str], program: str) -> str | None:
-    """Say which subcommand a word that is none may have meant; None if there is no mistake."""
+    """Return an error message for an unknown subcommand, or None; it names the nearest."""
     known = {part.__metadata__[0].name: part.__origin__ for part in get_args(commands)}
     if not known or not args or args[0].startswith("-"):
         return None
@@ -91,36 +103,36 @@ def _mistyped(commands: Any, args: Sequence[str], program: str) -> str | None:
     return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(known)}."
 
 
-def guarded(run: Callable[[], int]) -> int:
-    """Run, turning exceptions into exit codes."""
+def run_with_exit_codes(run: Callable[[], int]) -> int:
+    """Run a command, printing exceptions as messages and returning their exit codes."""
     try:
         return run()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
-        return USAGE
-    except Stop as stop:
-        print(stop, file=sys.stderr)
-        return stop.code
+        return ExitCode.USAGE
+    except CommandExit as early:
+        print(early, file=sys.stderr)
+        return early.code
     except KeyboardInterrupt:
-        interrupts.tell()
-        return FAILED
+        interrupts.print_how_to_continue()
+        return ExitCode.FAILED
     except Exception as error:
         if (reason := system_failure(error)) is not None:
             print(f"error: {reason}", file=sys.stderr)
-        else:  # everything else is a failure of ours; the traceback says where
+        else:  # a defect of the program: show where
             traceback.print_exc()
-        return FAILED
+        return ExitCode.FAILED
 
 
 def system_failure(error: BaseException) -> str | None:
-    """Describe in one line what the system refused (disk, permissions, memory); None if it did not.
+    """Return a one-line message for an error of the system (disk, permissions, memory), or None.
 
-    Libraries in C++ raise errors of their own, which name the system's reason in their text.
+    Libraries in C++ raise their own errors, with the system's reason in their text.
     """
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, MemoryError):
-            return "not enough memory. Take less at a time, or a machine with more."
+            return "not enough memory. Use smaller batches or a machine with more memory."
         text = str(seen).replace("\n", " ")
         for code in REFUSALS:
             reason = os.strerror(code)
@@ -133,7 +145,7 @@ def system_failure(error: BaseException) -> str | None:
 
 
 _WRITABLE = "Choose a folder that can be written to. (--out)"
-_RUN_AGAIN = "Free space and run the same command again; what is complete stays."
+_RUN_AGAIN = "Free space and run the same command again; complete files are kept."
 REFUSALS = {
     errno.ENOSPC: _RUN_AGAIN,
     errno.EDQUOT: _RUN_AGAIN,
@@ -143,7 +155,7 @@ REFUSALS = {
     errno.EPERM: _WRITABLE,
     errno.ENOTDIR: "A file is where a folder has to be: choose another path.",
     errno.EISDIR: "A folder is where a file has to be: choose another path.",
-    errno.EEXIST: "Something is in the way: choose another path.",
+    errno.EEXIST: "The path exists already: choose another path.",
     errno.ENAMETOOLONG: "Choose a shorter path.",
     errno.ELOOP: "Links are not followed here: give the real path.",
     errno.ENOENT: "Check the path.",
@@ -151,4 +163,4 @@ REFUSALS = {
     errno.EBUSY: "A mount point cannot be replaced: choose a folder inside it.",
     errno.EIO: "Check the disk.",
 }
-"""What the system may refuse, and the way out."""
+"""Errors of the system that a user can fix, and the fix."""

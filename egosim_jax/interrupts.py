@@ -1,4 +1,4 @@
-"""Ctrl-C, at any time: one line that says how to go on, also while a program is being imported."""
+"""Ctrl-C at any time, also during imports: one line with the command that continues."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from types import FrameType
 
 
 def expect() -> None:
-    """Be ready for Ctrl-C; a program calls this before it imports anything large."""
+    """Install the handler of Ctrl-C; a program calls this before its large imports."""
     with suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGINT, _end)
+        signal.signal(signal.SIGINT, _interrupt)
 
 
 @contextmanager
 def not_inherited() -> Iterator[None]:
-    """Let the processes that are started meanwhile ignore Ctrl-C, which reaches them, too."""
+    """Make child processes that are started in this context ignore Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -31,16 +31,16 @@ def not_inherited() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def tell() -> None:
-    """Say how to go on."""
+def print_how_to_continue() -> None:
+    """Print the command line that continues an interrupted run."""
     print(f"interrupted; to continue: {shlex.join(sys.argv)}", file=sys.stderr, flush=True)
 
 
-def _end(number: int, frame: FrameType | None) -> None:
-    """Raise `KeyboardInterrupt`, unless within an import: a library cut off there may crash."""
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise `KeyboardInterrupt`; during an import, exit: half-imported libraries may crash."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            tell()
+            print_how_to_continue()
             os._exit(1)
         frame = frame.f_back
     raise KeyboardInterrupt

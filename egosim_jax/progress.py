@@ -10,11 +10,11 @@ from typing import TypeVar
 T = TypeVar("T")
 
 PLAIN_SECONDS = 10.0
-"""At most one plain line in so many seconds."""
+"""Least time between two plain lines, in seconds."""
 
 
 def track(items: Iterable[T], verb: str, *, total: int) -> Iterator[T]:
-    """Pass the items on, showing how many of `total` are done."""
+    """Yield the items while showing how many of `total` are done."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import track as live
@@ -30,7 +30,7 @@ def track(items: Iterable[T], verb: str, *, total: int) -> Iterator[T]:
 
 
 def track_bytes(sizes: Iterable[int], verb: str, *, total: int) -> Iterator[int]:
-    """Pass the sizes of pieces on, showing bytes done, bytes a second and the time left."""
+    """Yield sizes in bytes while showing the bytes done, the speed and the time left."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import (

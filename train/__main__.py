@@ -42,7 +42,7 @@ def main(args: Sequence[str] | None = None) -> int:
         description="Train a model. The same command resumes an interrupted run. With --preflight "
         "it only says whether the training would fit a machine that need not be there.",
         args=with_paths(given) if without_training else given,
-        within=joined if args is None and not without_training else nullcontext,
+        context=joined if args is None and not without_training else nullcontext,
     )
 
 

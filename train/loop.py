@@ -24,7 +24,7 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import FAILED, RESUBMIT, Stop
+from egosim_jax.command import FAILED, RESUBMIT, CommandExit
 from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
@@ -169,7 +169,9 @@ def train(
                         checkpoints.wait()
             if preempted and not last:
                 _say(f"where the time went:\n{clock.table()}")
-                raise Stop(f"{out}: stopped and saved after step {step}; run it again", RESUBMIT)
+                raise CommandExit(
+                    f"{out}: stopped and saved after step {step}; run it again", RESUBMIT
+                )
         _say(f"where the time went:\n{clock.table()}")
     return nnx.merge(graph, state.best, frozen)
 
@@ -231,7 +233,7 @@ class _LeftOut:
         said = f"step {self.step} left out: loss {loss:.4g}, gradient norm {norm:.4g}, of {names}"
         print(said, file=sys.stderr, flush=True)
         if count >= MOST_LEFT_OUT:
-            raise Stop(
+            raise CommandExit(
                 f"{count} updates in a row were left out, so the run stops. The weights are those "
                 "before them: look at the clips above, or lower the learning rate.",
                 FAILED,

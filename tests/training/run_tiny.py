@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from egosim_jax import configs
-from egosim_jax.command import DONE, guarded
+from egosim_jax.command import DONE, run_with_exit_codes
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io import weights
@@ -68,7 +68,7 @@ def main(data: str, out: str, steps: str, save_every: str) -> int:
             weights.save(Path(out) / "dit.safetensors", networks.dit)
         return DONE
 
-    return guarded(run)
+    return run_with_exit_codes(run)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from egosim_jax.command import FAILED, Stop
+from egosim_jax.command import FAILED, CommandExit
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.loop import train
@@ -69,7 +69,7 @@ def test_weights_after_an_update_that_is_left_out_are_those_before(tmp_path):
 
 def test_three_in_a_row_stop_the_run_with_the_names(tmp_path, capsys):
     data = write_points(tmp_path / "points", huge=tuple(range(POINTS)))
-    with pytest.raises(Stop, match="3 updates in a row") as stopped:
+    with pytest.raises(CommandExit, match="3 updates in a row") as stopped:
         fit(tmp_path / "run", data)
     assert stopped.value.code == FAILED
     said = capsys.readouterr().err

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 from packaging.requirements import Requirement
 
+import egosim_jax
 from egosim_jax import command
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as convert
@@ -26,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 )
 def test_every_program_says_its_version(program, name, capsys):
     assert program(["--version"]) == command.DONE
-    assert capsys.readouterr().out == f"{name} {command.metadata.version('egosim-jax')}\n"
+    assert capsys.readouterr().out == f"{name} {egosim_jax.__version__}\n"
 
 
 def test_python_dash_m_egosim_jax_is_egosim(monkeypatch, capsys):
@@ -97,7 +98,7 @@ def test_the_preflights_search_is_announced_and_can_be_left_out(monkeypatch, cap
     assert "takes minutes; --no-search leaves it out" in capsys.readouterr().err
 
 
-def test_viser_can_be_installed_beside_us():
+def test_viser_can_be_installed_too():
     """It needs rich below 15."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     (rich,) = (r for r in map(Requirement, project["dependencies"]) if r.name == "rich")
@@ -105,11 +106,11 @@ def test_viser_can_be_installed_beside_us():
 
 
 @pytest.mark.parametrize("code", command.REFUSALS)
-def test_what_the_system_refuses_is_one_line_with_a_way_out(code, capsys):
+def test_an_error_of_the_system_is_one_line_with_a_fix(code, capsys):
     def run():
         raise OSError(code, command.os.strerror(code), "/some/where")
 
-    assert command.guarded(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.FAILED
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith("error: /some/where: ")
@@ -120,7 +121,7 @@ def test_a_library_that_hides_the_systems_reason_in_its_text_is_understood(capsy
     def run():
         raise RuntimeError(f"write failed\n{command.os.strerror(errno.ENOSPC)} [/x/y]")
 
-    assert command.guarded(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.FAILED
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "Free space" in said
@@ -130,9 +131,9 @@ def test_too_little_memory_is_one_line(capsys):
     def run():
         raise MemoryError
 
-    assert command.guarded(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.FAILED
     assert capsys.readouterr().err == (
-        "error: not enough memory. Take less at a time, or a machine with more.\n"
+        "error: not enough memory. Use smaller batches or a machine with more memory.\n"
     )
 
 
@@ -141,7 +142,7 @@ def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "argv", ["egosim", "data", "make", "--out", "a folder"])
-    assert command.guarded(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.FAILED
     said = "interrupted; to continue: egosim data make --out 'a folder'\n"
     assert capsys.readouterr().err == said
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from egosim_jax.cli.data import Check, Look, Pack, Stats
-from egosim_jax.command import DONE, FAILED, PARTIAL, USAGE, guarded
+from egosim_jax.command import DONE, FAILED, PARTIAL, USAGE, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.atomic import LOCK, hold_folder
 from egosim_jax.io.video import read_video
@@ -184,7 +184,7 @@ def test_packing_over_other_files_is_refused(clips, out):
 
 def refused(command, capsys):
     """Exit code, and the last of what is printed, which must not be a traceback."""
-    code = guarded(command.run)
+    code = run_with_exit_codes(command.run)
     error = capsys.readouterr().err
     assert "Traceback" not in error
     return code, error.splitlines()[-1]
@@ -230,8 +230,8 @@ def test_a_second_process_on_the_same_folder_is_one_line(clips, out):
     hold_folder(out)
     program = (
         "import sys; from pathlib import Path; from egosim_jax.cli.data import Pack; "
-        "from egosim_jax.command import guarded; "
-        "sys.exit(guarded(Pack(metadata=Path(sys.argv[1]), out=Path(sys.argv[2])).run))"
+        "from egosim_jax.command import run_with_exit_codes; "
+        "sys.exit(run_with_exit_codes(Pack(metadata=Path(sys.argv[1]), out=Path(sys.argv[2])).run))"
     )
     command = [sys.executable, "-c", program, str(clips), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
