@@ -27,7 +27,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from egosim_jax.conditioning.video import to_model
-from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, gather, read_manifest
+from egosim_jax.data.manifest import MANIFEST, read_manifest
+from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.generator import Inputs, Program, batches, place, truths
 from egosim_jax.io.run import open_folder

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egosim_jax.conditioning.dropout import ConditionDropout
-from egosim_jax.data.shards import MANIFEST, ShardReader
+from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.transforms import record_length
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.io import weights

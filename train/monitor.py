@@ -25,8 +25,9 @@ from jax.experimental import multihost_utils
 
 from egosim_jax.command import HUNG
 from egosim_jax.conditioning.video import to_uint8
-from egosim_jax.data.shards import Record, ShardReader
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.data.records import Record
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.generator import denoise
 from egosim_jax.io.video import write_video
 from egosim_jax.networks import ModelConfig, Networks
@@ -197,7 +198,7 @@ class Samples:
         moments = np.linspace(0, self.model.video.frames - 1, MOMENTS).round().astype(int).tolist()
         names = [record.metadata["video_id"] for record in self._records]
         blocks = [
-            Block(f"{name}, step {step}: generated, truth", list(pair))
+            SheetClip(f"{name}, step {step}: generated, truth", list(pair))
             for name, *pair in zip(names, generated, truth, strict=True)
         ]
         draw_sheet(blocks, path.with_suffix(".png"), moments=moments)

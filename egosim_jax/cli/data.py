@@ -203,7 +203,7 @@ class Check:
     def run(self) -> int:
         """Check shard after shard."""
         from egosim_jax.data.check import check
-        from egosim_jax.data.shards import read_manifest
+        from egosim_jax.data.manifest import read_manifest
 
         manifest = read_manifest(self.shards)
         found = 0
@@ -240,7 +240,7 @@ class Look:
         import numpy as np
 
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.data.sheet import Block, draw_sheet
+        from egosim_jax.data.sheet import SheetClip, draw_sheet
         from egosim_jax.data.transforms import decode_record
 
         check_counts({"--limit": self.limit, "--moments": self.moments, "--width": self.width})
@@ -248,7 +248,7 @@ class Look:
         if reader.manifest.kind == "latents":
             raise InputError(f"{self.shards} holds latents, not pictures. (--shards)")
         spec = reader.manifest.spec or VideoSpec()
-        blocks: dict[object, Block] = {}
+        blocks: dict[object, SheetClip] = {}
         for number, record in enumerate(track(reader, "reading", total=len(reader))):
             extra = record.metadata.get("extra", {})
             unknown = [name for name in self.by if name not in extra]
@@ -259,7 +259,7 @@ class Look:
             if key not in blocks:
                 videos = decode_record(record.arrays, spec)
                 shown = [videos[name] for name in self.streams if name in videos]
-                blocks[key] = Block(str(record.metadata.get("prompt", "")), shown)
+                blocks[key] = SheetClip(str(record.metadata.get("prompt", "")), shown)
             if len(blocks) == self.limit:
                 break
         moments = np.linspace(0, spec.frames - 1, self.moments).round().astype(int).tolist()

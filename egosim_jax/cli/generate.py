@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from egosim_jax.command import DONE, PARTIAL, USAGE
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.untrusted import listing, read_lines
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet, check_counts, check_seed
@@ -388,7 +388,7 @@ class Generate:
         for item in [item for item in items if self._video(item).exists()][:SHEET_CLIPS]:
             panels = read_video(self._folder / f"{item.output_id}_cmp.mp4").frames
             panels = np.split(panels, panels.shape[2] // config.video.width, axis=2)
-            blocks.append(Block(f"{item.output_id}   prior, hands, generated", panels[:3]))
+            blocks.append(SheetClip(f"{item.output_id}   prior, hands, generated", panels[:3]))
         if blocks:
             moments = np.linspace(0, config.video.frames - 1, SHEET_COLUMNS).round().astype(int)
             sheet = self._folder / "contact_sheet.png"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from egosim_jax.cli.recording import Recording
 from egosim_jax.cli.view import RECORDING, write_portrait
 from egosim_jax.command import DONE
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -210,7 +210,7 @@ def _camera_error(frames: np.ndarray, clip: TabletopClip, still: np.ndarray) -> 
     return 1000 * camera_errors(path, clip.cameras.world_from_camera)[0]
 
 
-def _write(folder: Path, clip: TabletopClip, step: Step) -> Block:
+def _write(folder: Path, clip: TabletopClip, step: Step) -> SheetClip:
     """The videos and the state of one step; its part of the contact sheet."""
     import numpy as np
 
@@ -223,7 +223,7 @@ def _write(folder: Path, clip: TabletopClip, step: Step) -> Block:
     write_video(folder / f"{name}.mp4", step.clip.frames, step.clip.fps)
     write_video(folder / f"{name}_cmp.mp4", np.concatenate(shown, axis=2), step.clip.fps)
     _write_state(folder, clip.number + 1, step.state)
-    return Block(f"{clip.number + 1}: {clip.caption}   (view, hands, generated, truth)", shown)
+    return SheetClip(f"{clip.number + 1}: {clip.caption}   (view, hands, generated, truth)", shown)
 
 
 def _write_state(folder: Path, number: int, state: SceneState) -> None:

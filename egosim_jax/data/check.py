@@ -1,4 +1,4 @@
-"""Verifying shards: every hash, count, shape and video, and every problem by its file."""
+"""Verification of shards: every hash, count, shape and video, and every problem with its file."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ from pathlib import Path
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader
 
+from egosim_jax.data.manifest import ArrayInfo, Manifest, ShardInfo, file_problems, read_manifest
 from egosim_jax.data.metadata import is_safe_id
-from egosim_jax.data.shards import (
-    ArrayInfo,
-    Manifest,
-    Record,
-    RecordError,
-    ShardInfo,
-    file_problems,
-    from_bytes,
-    read_manifest,
-)
+from egosim_jax.data.records import Record, RecordError, from_bytes
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.untrusted import quote
 from egosim_jax.io.video import decode_image, decode_video
@@ -26,11 +18,11 @@ from egosim_jax.types import InputError, check_frame_count
 
 
 def check(folder: Path) -> Iterator[tuple[ShardInfo, list[str]]]:
-    """Each shard of a folder with what is wrong with it; every problem names the file.
+    """Yield each shard of a folder with a list of its problems; every problem names the file.
 
-    Compares size and SHA-256 with the manifest, reads every record, holds its arrays against the
-    manifest, decodes videos and images in full and looks for numbers that are not finite. Raises
-    `InputError` if there is no manifest, or one that cannot be trusted.
+    Compares size and SHA-256 with the manifest, reads every record, compares its arrays with the
+    manifest, decodes all videos and images and searches for non-finite numbers. Raises `InputError`
+    if the manifest is missing or invalid.
     """
     manifest = read_manifest(folder)
     for shard in manifest.shards:
@@ -43,13 +35,11 @@ def _shard_problems(folder: Path, shard: ShardInfo, manifest: Manifest) -> list[
     if problems:
         return problems
     if sha256(path) != shard.sha256:
-        problems.append(f"{path}: its SHA-256 is not the manifest's")
+        problems.append(f"{path}: its SHA-256 differs from the manifest")
     try:
         reader = ArrayRecordReader(str(path))
         if reader.num_records() != shard.records:
-            problems.append(
-                f"{path}: {reader.num_records()} records, the manifest says {shard.records}"
-            )
+            problems.append(f"{path}: {reader.num_records()} records, expected {shard.records}")
         for index in range(reader.num_records()):
             name = f"{path}, record {index}"
             problems += [f"{name}: {line}" for line in _read_problems(reader, index, manifest)]
@@ -71,13 +61,13 @@ def _record_problems(record: Record, manifest: Manifest) -> list[str]:
     video_id = record.metadata.get("video_id")
     problems = []
     if not isinstance(video_id, str) or not is_safe_id(video_id):
-        problems.append(f"video_id {quote(video_id)} cannot name a file")
+        problems.append(f"video_id {quote(video_id)} is not a valid file name")
     problems += _shape_problems(record.arrays, manifest.arrays)
     if manifest.kind == "videos":
         problems += _video_problems(record.arrays)
     else:
         problems += [
-            f"{name} holds numbers that are not finite"
+            f"{name} has values that are not finite"
             for name, array in record.arrays.items()
             if not np.isfinite(array.astype(np.float32)).all()
         ]
@@ -89,7 +79,7 @@ def _shape_problems(arrays: Mapping[str, np.ndarray], wanted: Mapping[str, Array
     for name in sorted(arrays.keys() | wanted.keys()):
         if name not in arrays or name not in wanted:
             where = "the manifest" if name in arrays else "the record"
-            problems.append(f"{name} is not in {where}")
+            problems.append(f"{name} is missing in {where}")
             continue
         array, info = arrays[name], wanted[name]
         fits = len(array.shape) == len(info.shape) and all(
@@ -97,8 +87,7 @@ def _shape_problems(arrays: Mapping[str, np.ndarray], wanted: Mapping[str, Array
         )
         if not fits or array.dtype.name != info.dtype:
             problems.append(
-                f"{name} is {array.dtype.name} {array.shape}, the manifest says {info.dtype} "
-                f"{info.shape}"
+                f"{name} is {array.dtype.name} {array.shape}, expected {info.dtype} {info.shape}"
             )
     return problems
 

@@ -1,11 +1,11 @@
-"""One clip's files, checked and read at a model's length and size.
+"""Reading and writing of clips as files, checked and at a model's length and size.
 
-Strict, the default, refuses what would otherwise be repaired in silence: a missing mask, videos
-whose frame counts disagree or are not 4k+1, sizes that disagree or are not multiples of 16, clips
-shorter than the model's. Lenient does what the EgoSim release does: the last frame is repeated or
-the video cut, every size is stretched, and without a mask everything counts as observed; a warning
-says how many frames were missing. In both, a clip longer than the model's gives the window that
-begins at `start`.
+The strict policy, the default, rejects what would otherwise be repaired silently: a missing mask,
+videos whose frame counts disagree or are not 4k+1, sizes that disagree or are not multiples of 16,
+clips shorter than the model's. The lenient policy does what the EgoSim release does: it repeats the
+last frame or cuts the video, resizes every video, and treats every pixel as observed if there is no
+mask; a warning reports the number of missing frames. In both, a longer clip yields the window that
+starts at `start`.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
 def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
-    """Write triplets as files in EgoSim's layout; the path of their metadata.csv.
+    """Write triplets as files in EgoSim's layout; return the path of their metadata.csv.
 
-    Each clip has a folder; what `extra` holds becomes columns. All clips have a target video, or
-    none has, and all have the same columns.
+    Each clip has a folder; the entries of `extra` become columns. All clips must have the same
+    columns, and either all or none a target video.
     """
     rows: list[dict[str, str]] = []
     for triplet in triplets:
@@ -86,9 +86,9 @@ def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
 def check_clip(
     files: ClipFiles, spec: VideoSpec | None, *, start: int = 0, policy: Policy = "strict"
 ) -> list[str]:
-    """Everything that would keep `load_triplet` from reading a clip, without decoding its videos.
+    """List the problems that would make `load_triplet` fail, without decoding the videos.
 
-    Each problem names the metadata row and the file. Without a `spec` any length is long enough.
+    Each problem names the metadata row and the file. Without a `spec` every length is accepted.
     """
     problems = []
     probed: dict[str, VideoInfo] = {}
@@ -119,8 +119,8 @@ def load_triplet(
 ) -> Triplet:
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
-    The image for CLIP is the clip's own, wherever the window begins. Raises `InputError` listing
-    what `check_clip` finds, or naming the video that is damaged further on.
+    The CLIP image is that of the clip for every window. Raises `InputError` with the problems of
+    `check_clip`, or naming a damaged video.
     """
     problems = check_clip(files, spec, start=start, policy=policy)
     if problems:
@@ -149,7 +149,7 @@ def load_triplet(
             )
             if policy == "strict":
                 raise InputError(f"{why}. (--lenient repeats the last frame)")
-            logger.warning("%s; the last one is repeated", why)
+            logger.warning("%s; the last frame is repeated", why)
         arrays[name] = fit_length(frames, spec.frames)
     image = _read_first_frame(files.first_frame, decoding)
     return Triplet(
@@ -166,7 +166,7 @@ def _fit_mask(frame: UInt8[np.ndarray, "h w 3"], *, height: int, width: int) -> 
 
 
 def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
-    """The videos to read; the lenient policy does without a mask or a target that is missing."""
+    """Return the videos to read; the lenient policy omits a missing mask or target."""
     videos = {"prior": files.prior, "hands": files.hands, "mask": files.mask}
     if files.target is not None:
         videos["target"] = files.target
@@ -198,9 +198,9 @@ def _length_problems(probed: dict[str, VideoInfo], needed: int) -> list[str]:
 def _size_problems(sizes: dict[str, tuple[int, int]]) -> list[str]:
     written = {name: f"{width}x{height}" for name, (height, width) in sizes.items()}
     if len(set(written.values())) > 1:
-        return [f"the sizes disagree: {_table(written)}. (--lenient stretches each)"]
+        return [f"the sizes disagree: {_table(written)}. (--lenient resizes each)"]
     return [
-        f"{width}x{height} pixels: width and height must be multiples of 16. (--lenient stretches)"
+        f"{width}x{height} pixels: width and height must be multiples of 16. (--lenient resizes)"
         for height, width in set(sizes.values())
         if height % 16 or width % 16
     ]

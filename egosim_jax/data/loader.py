@@ -1,9 +1,9 @@
 """Batches from shards: shuffled, split over processes, cut into windows, prefetched, resumable.
 
-The loader walks one endless sequence of records that depends on the seed alone: every epoch is a
-new permutation, and position k of the sequence has its own random numbers for its window. Process
-p of n takes positions p, p + n, p + 2n, ..., so that global batch b holds the same positions
-however many processes share it. Worker processes deal the positions out in the same order.
+The loader iterates over one endless sequence of records that depends on the seed alone: every epoch
+is a new permutation, and position k of the sequence has its own random numbers for its window.
+Process p of n takes positions p, p + n, p + 2n, ..., so that global batch b holds the same
+positions for any number of processes. Worker processes share the positions in the same order.
 
 A record that cannot be read is skipped, counted in `Loader.skipped` under its file and position,
 and replaced by the next one; more than `Loader.MAX_BAD` different ones stop the run.
@@ -22,14 +22,15 @@ import ml_dtypes
 import numpy as np
 from absl import flags
 
-from egosim_jax.data.shards import Manifest, ShardReader
+from egosim_jax.data.manifest import Manifest
+from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.untrusted import listing
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
 
 LATENTS = ("target", "prior", "hands", "mask")
-"""Arrays of a latents record that are as long and as large as its clip."""
+"""Arrays of a latents record with latent frames, rows and columns."""
 _THREADS = 4
 
 Example = Mapping[str, np.ndarray]
@@ -48,12 +49,13 @@ def make_loader(
     repeat: bool = True,
     transform: Transform = None,
 ) -> Loader:
-    """An iterator over this process's part of each batch: `batch_size / process_count` examples.
+    """Return an iterator over this process's examples of each batch.
 
-    `transform` turns a record's arrays into an example, with random numbers if it is a
-    `RandomMap`; examples also get `record`, their number in the source. Without `repeat` the
-    iterator ends after one pass, leaving out what does not fill a batch. `workers` processes
-    prepare examples; 0 prepares them in threads of this process.
+    A process gets `batch_size / process_count` examples of each batch. `transform` maps a record's
+    arrays to an example, with random numbers if it is a `RandomMap`; examples also get `record`,
+    their index in the source. Without `repeat` the iterator ends after one pass and drops an
+    incomplete last batch. `workers` processes prepare examples; 0 prepares them in threads of this
+    process.
     """
     if batch_size < 1 or batch_size % process_count:
         raise InputError(
@@ -67,8 +69,8 @@ def make_loader(
     positions = grain.MapDataset.range(len(source)).seed(seed)
     if shuffle:
         positions = positions.shuffle()
-    whole = slice(len(source) // batch_size * batch_size)
-    positions = positions.repeat() if repeat else positions[whole]
+    full_batches = slice(len(source) // batch_size * batch_size)
+    positions = positions.repeat() if repeat else positions[full_batches]
     examples = positions.random_map(_Read(source, transform))
     mine = examples[process_index::process_count]
     stream = mine.to_iter_dataset(
@@ -95,14 +97,14 @@ def make_loader(
 
 
 class Loader(grain.DatasetIterator):
-    """Iterates over batches; its state goes into a checkpoint beside the weights.
+    """An iterator over batches, whose state is saved in checkpoints along with the weights.
 
-    `skipped` counts the bad records met so far, by name. `set_state` raises `InputError` when the
-    state was saved by a loader that would give another sequence. Close it when done: worker
-    processes live until then.
+    `skipped` counts the bad records so far, by name. `set_state` raises `InputError` if the state
+    was saved by a loader of another sequence. Close the loader to end its worker processes.
     """
 
     MAX_BAD = 16
+    """Maximum number of different bad records."""
 
     def __init__(
         self,
@@ -118,11 +120,11 @@ class Loader(grain.DatasetIterator):
         return next(self._batches)
 
     def get_state(self) -> dict[str, Any]:
-        """The position, and everything the sequence depends on, as JSON values."""
+        """Return the position and all settings that determine the sequence, as JSON values."""
         return {"contract": self.contract, "position": self._batches.get_state()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Continue where `get_state` was called."""
+        """Continue from a state of `get_state`."""
         saved = state["contract"]
         differing = [
             f"{name}: the state has {saved.get(name)}, this loader {value}"
@@ -130,12 +132,14 @@ class Loader(grain.DatasetIterator):
             if saved.get(name) != value
         ]
         if differing:
-            raise InputError(f"The data would come in another order: {listing(differing)}.")
+            raise InputError(
+                f"The saved data position is of another sequence: {listing(differing)}."
+            )
         self._batches.set_state(state["position"])
 
 
 def _check(arrays: Example, manifest: Manifest) -> None:
-    """Raise `InputError` for a record with numbers that are none, or latents of another length."""
+    """Raise `InputError` for non-finite values, or latents of another shape than the manifest's."""
     for name, array in arrays.items():
         floating = array.dtype.kind == "f" or array.dtype == ml_dtypes.bfloat16
         if floating and not np.isfinite(array).all():
@@ -144,26 +148,26 @@ def _check(arrays: Example, manifest: Manifest) -> None:
             have, want = array.shape[:-1], manifest.spec.latent_shape
             if have != want:
                 raise InputError(
-                    f"{name} has {have} latent frames, rows and columns; the manifest says {want}."
+                    f"{name} has {have} latent frames, rows and columns; expected {want}."
                 )
 
 
 @dataclass(frozen=True)
 class _Bad:
-    """Stands for a record that cannot be read, on its way to be counted."""
+    """A placeholder of a record that cannot be read."""
 
     message: str
 
 
 @dataclass(frozen=True)
 class _Read(grain.transforms.RandomMap):
-    """Record number to example."""
+    """A transform from the index of a record to an example."""
 
     source: ShardReader
     transform: Transform
 
     def random_map(self, element: int, rng: np.random.Generator) -> Any:
-        """The example, or why there is none."""
+        """Return the example, or a placeholder with the error."""
         try:
             arrays = self.source[element].arrays
             _check(arrays, self.source.manifest)
@@ -186,12 +190,12 @@ class _Read(grain.transforms.RandomMap):
 
 @dataclass(frozen=True)
 class _Healthy(grain.transforms.Filter):
-    """Lets examples pass; counts the bad records and stops the run when there are too many."""
+    """A filter that drops and counts bad records, and stops the run after too many."""
 
     skipped: Counter[str]
 
     def filter(self, element: Any) -> bool:
-        """Whether it is an example."""
+        """Return True for an example, False for a placeholder."""
         if not isinstance(element, _Bad):
             return True
         if element.message not in self.skipped:

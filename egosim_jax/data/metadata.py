@@ -1,17 +1,17 @@
-"""The table that lists clips: EgoSim's metadata, as CSV or as JSON lines.
+"""Metadata of clips: a table in EgoSim's columns, as CSV or as JSON lines.
 
-    column               holds                                          if there is no such column
-    video                the recorded video (truth)                     there is no truth
-    ego_prior_video      the scene rendered along the camera path       needed
+    column               holds                                          default without the column
+    video                the recorded video (ground truth)              no ground truth
+    ego_prior_video      the scene rendered along the camera path       required
     hand_keypoint_video  the hand skeletons                             hand_kp_video.mp4
     first_frame          image (or video: its first frame) for CLIP     hand_inpaint.png
-    prompt               the caption                                    needed
+    prompt               the caption                                    required
     video_id             names the outputs                              video, with _ for /
 
-Paths are relative to the folder of the metadata file; the defaults, EgoSim's own, lie beside the
-prior, and so does the mask, `pc_mask_video.mp4`, which has no column. Ids are letters, digits,
-`.`, `_` and `-`; with `/` they make folders of the outputs. Further columns are carried to the
-results. No cell of these columns may be empty.
+Paths are relative to the folder of the metadata file; the defaults, EgoSim's own, are in the folder
+of the prior, and so is the mask, `pc_mask_video.mp4`, which has no column. Ids consist of letters,
+digits, `.`, `_` and `-`; a `/` in an id makes a folder of the outputs. Further columns are copied
+to the results. No cell of these columns may be empty.
 """
 
 from __future__ import annotations
@@ -30,35 +30,39 @@ from egosim_jax.types import InputError, check_counts
 
 REQUIRED = ("ego_prior_video", "prompt")
 COLUMNS = ("video", "ego_prior_video", "hand_keypoint_video", "first_frame", "prompt", "video_id")
-TRUTH = "video"
+TARGET = "video"
+"""Column of the recorded video."""
 MASK_NAME, HANDS_NAME, IMAGE_NAME = "pc_mask_video.mp4", "hand_kp_video.mp4", "hand_inpaint.png"
+"""Default file names, in the folder of the prior."""
 MAX_BYTES = 1 << 28
-"""Largest metadata file."""
+"""Maximum size of a metadata file in bytes."""
 MAX_CLIPS = 400_000
+"""Maximum number of rows."""
 MAX_COLUMNS = 256
+"""Maximum number of columns."""
 _SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
 
 
 def is_safe_id(video_id: str) -> bool:
-    """Whether an id may name output files, in folders of their own if it has slashes.
+    """Return True if an id may name output files, in subfolders if it has slashes.
 
-    Folders have no dots, so that no id takes the place of another one's file.
+    Folders have no dots, so that an id cannot collide with the file of another one.
     """
     return len(video_id) <= 200 and _SAFE_ID.fullmatch(video_id) is not None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClipFiles:
-    """One row of the metadata: where a clip's files lie."""
+    """The files of a clip: one row of the metadata."""
 
     video_id: str
-    """Names the outputs; unique."""
+    """Unique id, which names the outputs."""
     prompt: str
-    """Caption."""
+    """Caption of the clip."""
     prior: Path
     """Video of the rendered scene."""
     mask: Path
-    """Video of where the render shows nothing (white)."""
+    """Video of the mask: white where the prior shows nothing."""
     hands: Path
     """Video of the hand skeletons."""
     first_frame: Path
@@ -66,16 +70,16 @@ class ClipFiles:
     target: Path | None
     """Recorded video, if the metadata names one."""
     extra: Mapping[str, str]
-    """Further columns."""
+    """Cells of further columns by column."""
     row: str
-    """File and line, for messages."""
+    """File and line of the row, for messages."""
 
 
 def read_metadata(path: Path) -> list[ClipFiles]:
-    """Read every row of a metadata file (`.csv`, or `.jsonl` with an object a line).
+    """Read every row of a metadata file (`.csv`, or `.jsonl` with one object per line).
 
     Raises one `InputError` that lists the problems: missing columns, empty cells (which the
-    official loader turns into the text "nan"), cells beyond the header, unsafe and repeated ids.
+    official loader reads as the text "nan"), cells beyond the header, unsafe and duplicate ids.
     """
     clips: list[ClipFiles] = []
     problems = _Problems()
@@ -95,11 +99,11 @@ def read_metadata(path: Path) -> list[ClipFiles]:
 
 
 def check_presence(items: Sequence[ClipFiles]) -> None:
-    """Raise `InputError` if not one of the clips has its prior: the folder is another one."""
+    """Raise `InputError` if no clip has its prior, as with metadata in a wrong folder."""
     if not any(item.prior.exists() for item in items):
         shown = ", ".join(quote_path(item.prior) for item in items[:3])
         raise InputError(
-            f"No prior video of the {len(items):,} clips is there: {shown}"
+            f"None of the {len(items):,} clips has its prior video: {shown}"
             f"{', …' if len(items) > 3 else ''}. Paths are relative to the folder of the metadata. "
             "(--metadata)"
         )
@@ -112,7 +116,7 @@ def select(
     video_ids: Sequence[str] = (),
     limit: int | None = None,
 ) -> list[ClipFiles]:
-    """Rows whose extra column has a value (`where="split=test"`), of these ids, the first `limit`.
+    """Select rows by the value of a column (`where="split=test"`), by id, and the first `limit`.
 
     Raises `InputError` for a column, value or id that does not occur.
     """
@@ -135,7 +139,7 @@ def select(
             if video_id not in by_id:
                 near = difflib.get_close_matches(video_id, by_id, n=1)
                 hint = f" Did you mean {near[0]}?" if near else ""
-                raise InputError(f"No clip is called {video_id}.{hint} (--video-id)")
+                raise InputError(f"No clip has the id {video_id}.{hint} (--video-id)")
         chosen = [by_id[video_id] for video_id in video_ids]
     if limit is not None:
         check_counts({"--limit": limit})
@@ -149,7 +153,7 @@ def _some(values: Sequence[str]) -> str:
 
 
 class _Problems:
-    """The first problems of a list that may be long, and their number."""
+    """The first problems of a possibly long list, and their number."""
 
     def __init__(self, most: int = 10):
         self._most, self._shown, self._count = most, list[str](), 0
@@ -161,7 +165,7 @@ class _Problems:
                 self._shown.append(problem)
 
     def refuse(self, what: str) -> None:
-        """Raise `InputError` if there are any."""
+        """Raise `InputError` if there is any problem."""
         if self._count > self._most:
             self._shown.append(f"and {self._count - self._most:,} more")
         if self._count:
@@ -170,7 +174,7 @@ class _Problems:
 
 def _row_problems(row: Mapping[str, str], first_seen: Mapping[str, int]) -> Iterator[str]:
     absent = [name for name in REQUIRED if name not in row]
-    if "video_id" not in row and TRUTH not in row:
+    if "video_id" not in row and TARGET not in row:
         absent.append("video_id")
     if absent:
         yield f": no column {', '.join(absent)}"
@@ -181,27 +185,27 @@ def _row_problems(row: Mapping[str, str], first_seen: Mapping[str, int]) -> Iter
     video_id = _video_id(row)
     if video_id.strip() and not is_safe_id(video_id):
         yield (
-            f": video_id {quote(video_id)} cannot name a file; use letters, digits, '.', '_' and "
-            "'-', and '/' between folders without dots"
+            f": video_id {quote(video_id)} is not a valid file name; use letters, digits, '.', '_' "
+            "and '-', and '/' between folders without dots"
         )
     if video_id in first_seen:
-        yield f": video_id {quote(video_id)} is already that of line {first_seen[video_id]}"
+        yield f": video_id {quote(video_id)} is a duplicate of line {first_seen[video_id]}"
 
 
 def _video_id(row: Mapping[str, str]) -> str:
     if "video_id" in row:
         return row["video_id"]
-    return row[TRUTH].replace("/", "_").removesuffix(".mp4")
+    return row[TARGET].replace("/", "_").removesuffix(".mp4")
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and cells of each row; `InputError` if the file is no table."""
+    """Yield line number and cells of each row; raise `InputError` for an invalid table."""
     name = quote_path(path)
     try:
         text = read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig")
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         header = next(reader, [])
-        needed = (*REQUIRED, *(() if TRUTH in header else ("video_id",)))
+        needed = (*REQUIRED, *(() if TARGET in header else ("video_id",)))
         absent = [column for column in needed if column not in header]
         if absent:
             raise InputError(f"{name} has no column {', '.join(absent)}.")
@@ -229,7 +233,7 @@ def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def _json_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and values of each line; null counts as an empty cell."""
+    """Yield line number and values of each line; null is read as an empty cell."""
     for line, row in read_lines(path, limit=MAX_BYTES, last="read"):
         where = f"{quote_path(path)}, line {line}"
         if not isinstance(row, dict):
@@ -249,7 +253,7 @@ def _files(path: Path, line: int, row: Mapping[str, str]) -> ClipFiles:
     folder = path.parent
     prior = folder / row["ego_prior_video"]
 
-    def beside(column: str, name: str) -> Path:
+    def path_of(column: str, name: str) -> Path:
         return folder / row[column] if column in row else prior.parent / name
 
     return ClipFiles(
@@ -257,9 +261,9 @@ def _files(path: Path, line: int, row: Mapping[str, str]) -> ClipFiles:
         prompt=row["prompt"],
         prior=prior,
         mask=prior.parent / MASK_NAME,
-        hands=beside("hand_keypoint_video", HANDS_NAME),
-        first_frame=beside("first_frame", IMAGE_NAME),
-        target=folder / row[TRUTH] if TRUTH in row else None,
+        hands=path_of("hand_keypoint_video", HANDS_NAME),
+        first_frame=path_of("first_frame", IMAGE_NAME),
+        target=folder / row[TARGET] if TARGET in row else None,
         extra={name: cell for name, cell in row.items() if name not in COLUMNS},
         row=f"{path.name} line {line}",
     )

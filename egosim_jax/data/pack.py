@@ -1,4 +1,4 @@
-"""Records from clips: the source's own files, or decoded frames at a model's size."""
+"""Packing of clips into records: the source files, or frames decoded at a model's size."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import numpy as np
 
 from egosim_jax.data.clips import check_clip, load_triplet
 from egosim_jax.data.metadata import ClipFiles, check_presence
-from egosim_jax.data.shards import Record, ShardWriter
+from egosim_jax.data.records import Record
+from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import listing, read_bytes
 from egosim_jax.io.video import Decoding
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
 MAX_FILE = 1 << 28
-"""Largest file of a clip that is packed as it is, in bytes."""
+"""Maximum size of a source file that is packed, in bytes."""
 
 
 def pack(
@@ -30,9 +31,9 @@ def pack(
     overwrite: bool = False,
     decoding: Decoding = "accurate",
 ) -> Iterator[str | None]:
-    """Write the shards of some clips: decoded at `spec`, or their own files without one.
+    """Write the shards of clips: decoded at `spec`, or as their source files without one.
 
-    Yields, after each clip, what kept it out, or None. Raises `InputError` if none could be packed,
+    Yields, after each clip, why it was skipped, or None. Raises `InputError` if all were skipped,
     or if another process writes to the same folder.
     """
     failed = 0
@@ -60,12 +61,12 @@ def pack(
 
 
 def clip_metadata(clip: ClipFiles | Triplet) -> dict[str, object]:
-    """What a record says about its clip."""
+    """Return the metadata of a clip's record."""
     return {"video_id": clip.video_id, "prompt": clip.prompt, "extra": dict(clip.extra)}
 
 
 def encoded_record(files: ClipFiles) -> Record:
-    """The bytes of a clip's files, unchanged, after the strict checks.
+    """Return a record of the bytes of a clip's files, after the strict checks.
 
     Raises `InputError` listing what `check_clip` finds.
     """
@@ -88,12 +89,12 @@ def encoded_record(files: ClipFiles) -> Record:
 
 
 def decoded_record(files: ClipFiles, spec: VideoSpec, decoding: Decoding = "accurate") -> Record:
-    """A clip's first `spec.frames` frames at the size of `spec`, after the strict checks."""
+    """Return a record of a clip's first `spec.frames` frames, after the strict checks."""
     return triplet_record(load_triplet(files, spec, decoding=decoding))
 
 
 def triplet_record(triplet: Triplet) -> Record:
-    """A triplet's frames and what is known of its clip."""
+    """Return a record of the frames and metadata of a triplet."""
     arrays = {
         "prior": triplet.prior,
         "hands": triplet.hands,

@@ -1,4 +1,4 @@
-"""Contact sheets: videos as a page of pictures, where people would rather look than read."""
+"""Contact sheets: frames of several videos on one image."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ if TYPE_CHECKING:
     import numpy as np
 
 TITLE_PX = 16
+"""Height of a title in pixels."""
 
 
 @dataclass(frozen=True)
-class Block:
-    """One clip on a sheet: a title, and videos of equal length and size below each other."""
+class SheetClip:
+    """One clip on a contact sheet: a title and videos of equal length and size."""
 
     title: str
+    """Text above the videos."""
     videos: Sequence[np.ndarray]
-    """uint8 RGB, each `f h w 3`."""
+    """RGB videos, uint8, each `f h w 3`."""
 
 
 def draw_sheet(
-    blocks: Sequence[Block], out: Path, *, moments: Sequence[int], width: int | None = None
+    clips: Sequence[SheetClip], out: Path, *, moments: Sequence[int], width: int | None = None
 ) -> None:
-    """Draw a row for each video, with its frames at `moments` (the last for any later one).
+    """Draw a row for each video of each clip, with its frames at `moments`.
 
-    Each picture is stretched to `width` pixels, if given.
+    The last frame replaces frames beyond the end. Frames are resized to `width` pixels, if given.
     """
     import numpy as np
     from PIL import Image, ImageDraw
@@ -37,8 +39,8 @@ def draw_sheet(
     from egosim_jax.data.transforms import resize_video
 
     rows = []
-    for block in blocks:
-        for number, video in enumerate(block.videos):
+    for clip in clips:
+        for number, video in enumerate(clip.videos):
             frames = video[[min(moment, len(video) - 1) for moment in moments]]
             if width is not None:
                 _, rows_px, columns_px, _ = frames.shape
@@ -46,7 +48,7 @@ def draw_sheet(
             row = np.concatenate(list(frames), axis=1)
             if number == 0:
                 header = Image.new("RGB", (row.shape[1], TITLE_PX), "white")
-                ImageDraw.Draw(header).text((2, 2), block.title, fill="black")
+                ImageDraw.Draw(header).text((2, 2), clip.title, fill="black")
                 rows.append(np.asarray(header))
             rows.append(row)
     with atomic_write(out) as temporary:

@@ -1,8 +1,8 @@
-"""From the pixels of files to the pixels a model sees; the same code in training and inference.
+"""Resizing and windowing of videos for a model; the same code in training and inference.
 
-Every video is stretched to the model's size, without cropping and without keeping the aspect
-ratio: colors with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Pixels that
-have the right size already pass unchanged.
+Every video is resized to the model's size, without cropping and without keeping the aspect ratio:
+colors with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Videos that already have
+the right size stay unchanged.
 """
 
 from __future__ import annotations
@@ -20,44 +20,45 @@ from egosim_jax.io.video import Decoding, decode_image, decode_video, probe_enco
 from egosim_jax.types import InputError, VideoSpec
 
 COLORS = ("target", "prior", "hands")
-"""The color videos of a triplet, by their names in a record."""
+"""Names of the color videos of a record."""
 
 
 def resize_image(
     image: UInt8[np.ndarray, "h w 3"], height: int, width: int
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Stretch an RGB image with LANCZOS."""
+    """Resize an RGB image with LANCZOS."""
     return _resize(image, height, width, Image.Resampling.LANCZOS)
 
 
 def resize_video(
     frames: UInt8[np.ndarray, "f h w 3"], height: int, width: int
 ) -> UInt8[np.ndarray, "f height width 3"]:
-    """Stretch every RGB frame with LANCZOS."""
+    """Resize every frame of an RGB video with LANCZOS."""
     return _resize_all(frames, height, width, Image.Resampling.LANCZOS)
 
 
 def resize_mask(
     mask: UInt8[np.ndarray, "f h w"], height: int, width: int
 ) -> UInt8[np.ndarray, "f height width"]:
-    """Stretch every frame of a mask with BILINEAR; edges become gray levels."""
+    """Resize every frame of a mask with BILINEAR; edges become gray levels."""
     return _resize_all(mask, height, width, Image.Resampling.BILINEAR)
 
 
 def fit_length(frames: UInt8[np.ndarray, "f ..."], count: int) -> UInt8[np.ndarray, "g ..."]:
-    """The first `count` frames, the last one repeated where there are too few."""
+    """Return the first `count` frames; repeat the last one if there are too few."""
     return frames[np.minimum(np.arange(count), len(frames) - 1)]
 
 
 @dataclass(frozen=True)
 class DecodeWindow(grain.transforms.RandomMap):
-    """A random window of `spec.frames` frames out of a record of videos, at the model's size.
+    """A transform that cuts a random window of `spec.frames` frames out of a record.
 
-    Takes records of kind "videos", which it decodes, and of kind "frames". Gives `target`, `prior`,
-    `hands`, `mask` and `first_frame`; the image stays the clip's own wherever the window begins.
+    Takes records of kind "videos", which it decodes, and of kind "frames". Returns `target`,
+    `prior`, `hands`, `mask` and `first_frame`; the image is that of the clip for every window.
     """
 
     spec: VideoSpec
+    """Length and size of the window."""
 
     def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
         """Cut the same window out of every video. Raises `InputError` if the clip is shorter."""
@@ -69,10 +70,10 @@ class DecodeWindow(grain.transforms.RandomMap):
 
 
 def record_length(arrays: Mapping[str, np.ndarray]) -> int:
-    """Frames of a record's prior, encoded or decoded."""
+    """Return the number of frames of a record's prior, encoded or decoded."""
     prior = arrays.get("prior")
     if prior is None:
-        raise InputError("The record is no clip: it has no prior.")
+        raise InputError("The record is not a clip: prior is missing.")
     return len(prior) if prior.ndim > 1 else probe_encoded(prior.tobytes(), name="prior").frames
 
 
@@ -83,15 +84,15 @@ def decode_record(
     start: int = 0,
     decoding: Decoding = "accurate",
 ) -> dict[str, np.ndarray]:
-    """Frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
+    """Return frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
 
-    Raises `InputError` naming the video that cannot be decoded or ends too early.
+    Raises `InputError` naming the video that cannot be decoded or is too short.
     """
     stop = start + spec.frames
     decoded: dict[str, np.ndarray] = {}
     absent = [name for name in ("prior", "hands", "mask", "first_frame") if name not in arrays]
     if absent:
-        raise InputError(f"The record is no clip: it has no {', '.join(absent)}.")
+        raise InputError(f"The record is not a clip: missing {', '.join(absent)}.")
     for name in (*COLORS, "mask"):
         if name not in arrays:
             continue

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import RESULTS, Generate
 from egosim_jax.command import DONE
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.io.untrusted import read_json, read_lines
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def _row(clip: ClipFiles, other: ClipFiles) -> dict[str, str]:
     }
 
 
-def _blocks(folder: Path) -> list[Block]:
+def _blocks(folder: Path) -> list[SheetClip]:
     """The comparison video of each generated clip, by split and id."""
     from egosim_jax.io.video import read_video
 
@@ -140,7 +140,7 @@ def _blocks(folder: Path) -> list[Block]:
     ordered = sorted(shown.values(), key=lambda line: (line.get("split", ""), line["video_id"]))
     title = "{}  {}  prior | hands | generated | truth"
     return [
-        Block(
+        SheetClip(
             title.format(line.get("split", ""), line["video_id"]),
             [read_video(folder / f"{line['video_id']}_cmp.mp4").frames],
         )

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from egosim_jax.data.sheet import Block
+from egosim_jax.data.sheet import SheetClip
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,10 +76,10 @@ class Scene:
             "object_error": 100 * float(np.mean(errors)) / ids.shape[2] if len(errors) else np.nan,
         }
 
-    def block(self, videos: Mapping[str, np.ndarray]) -> Block:
+    def block(self, videos: Mapping[str, np.ndarray]) -> SheetClip:
         """This scene on a contact sheet: its conditions, the videos by name, the truth."""
         names = ", ".join(("prior", "hands", *videos, "truth"))
-        return Block(
+        return SheetClip(
             f"{self.triplet.video_id}: {self.clip.caption}   ({names})",
             [self.triplet.prior, self.triplet.hands, *videos.values(), self.clip.frames],
         )

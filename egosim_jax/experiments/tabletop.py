@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.command import DONE
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
@@ -99,7 +99,7 @@ class Tabletop:
             for seed in track(seeds, f"making {kind} scenes", total=self.scenes)
         ]
         table: Table = {}
-        shown: list[Block] = []
+        shown: list[SheetClip] = []
         size = self.batch_size
         for name, hidden in METHODS:
             runs = []

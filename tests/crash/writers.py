@@ -31,8 +31,9 @@ from egosim_jax.cli import view
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.data.clips import write_clips
-from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter
-from egosim_jax.data.sheet import Block, draw_sheet
+from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.io import executables, weights
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.checkpoint import Checkpoints
@@ -286,7 +287,7 @@ def _read_kept(place: Path) -> Read:
 
 
 def _sheet(place: Path, inputs: Path, version: int) -> None:
-    draw_sheet([Block("a", [_frames(version)])], place / "sheet.png", moments=[0, 1])
+    draw_sheet([SheetClip("a", [_frames(version)])], place / "sheet.png", moments=[0, 1])
 
 
 def _picture(path: Path) -> str:

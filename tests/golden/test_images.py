@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egosim_jax.data.sheet import TITLE_PX, Block, draw_sheet
+from egosim_jax.data.sheet import TITLE_PX, SheetClip, draw_sheet
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
@@ -19,16 +19,18 @@ IMAGES = Path(__file__).parent / "images"
 SPEC = VideoSpec(frames=5, height=48, width=80)
 SEEDS = {"human": 3, "robot": 7}
 LEVELS = 2
-"""Largest difference of a pixel, of 255: a rounding of the mean of its rays."""
+"""Maximum difference of a pixel, of 255: a rounding of the mean of its rays."""
 EDGES = 0.005
-"""Largest share of other pixels: where a ray meets an edge, vector units may round otherwise."""
+"""Maximum share of other pixels: at edges, other vector units may round a ray hit otherwise."""
 
 
 def draw(kind, path: Path) -> None:
     """Draw ground truth, prior and hands of a clip, its first and its last frame."""
     triplet = to_triplet(next(make_sequence(SEEDS[kind], spec=SPEC, kind=kind)))
     assert triplet.target is not None
-    draw_sheet([Block("", [triplet.target, triplet.prior, triplet.hands])], path, moments=(0, 4))
+    draw_sheet(
+        [SheetClip("", [triplet.target, triplet.prior, triplet.hands])], path, moments=(0, 4)
+    )
 
 
 @pytest.mark.parametrize("kind", SEEDS)
@@ -44,7 +46,7 @@ def test_a_contact_sheet_of_the_tabletop_world_looks_as_before(kind, tmp_path):
 
 def test_the_title_of_a_contact_sheet_is_above_its_frames(tmp_path):
     frames = np.full((3, 16, 96, 3), 255, np.uint8)
-    draw_sheet([Block("title", [frames])], tmp_path / "sheet.png", moments=(0,))
+    draw_sheet([SheetClip("title", [frames])], tmp_path / "sheet.png", moments=(0,))
     drawn = np.asarray(Image.open(tmp_path / "sheet.png"))
     assert (drawn[:TITLE_PX] < 128).any()
     assert (drawn[TITLE_PX:] == 255).all()

@@ -165,7 +165,7 @@ def test_evaluate_reports_the_generated_clips_beside_the_baselines(generated, cl
         (["--config", "real_tiny"], "--weights"),
         (["--metadata", "nowhere.csv"], "nowhere.csv"),
         (["--where", "split=nowhere"], "split is one of: train"),
-        (["--video-id", "sample_7"], "No clip is called sample_7"),
+        (["--video-id", "sample_7"], "No clip has the id sample_7"),
         (["--weights", "nowhere"], "--weights"),
         (["--steps", "0"], "--steps must be at least 1"),
         (["--limit", "0"], "--limit must be at least 1"),

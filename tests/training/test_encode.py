@@ -17,9 +17,10 @@ from safetensors.numpy import load_file, save_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
-from egosim_jax.data import shards
+from egosim_jax.data import manifest
 from egosim_jax.data.check import check
-from egosim_jax.data.shards import MANIFEST, ShardReader, ShardWriter, read_manifest
+from egosim_jax.data.manifest import MANIFEST, read_manifest
+from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import Networks
@@ -161,8 +162,8 @@ def test_a_run_killed_while_the_shards_are_put_together_goes_on(
             raise KeyboardInterrupt
         before(path, value)
 
-    before = shards.write_json
-    monkeypatch.setattr(shards, "write_json", killed)
+    before = manifest.write_json
+    monkeypatch.setattr(manifest, "write_json", killed)
     with pytest.raises(KeyboardInterrupt):
         encode(source, weights, tmp_path)
     monkeypatch.undo()
@@ -171,7 +172,7 @@ def test_a_run_killed_while_the_shards_are_put_together_goes_on(
 
 
 def test_processes_share_the_parts_and_give_the_same_bytes(encoded, source, weights, tmp_path):
-    with pytest.raises(InputError, match=r"1 of 3 parts are not in .*: 00001"):
+    with pytest.raises(InputError, match=r"1 of 3 parts are missing in .*: 00001"):
         encode(source, weights, tmp_path, process_index=0, process_count=2)
     encode(source, weights, tmp_path, process_index=1, process_count=2)
     assert not (tmp_path / MANIFEST).exists()
@@ -232,7 +233,7 @@ def test_a_part_that_lost_its_bytes_is_named(source, weights, tmp_path):
     encode(source, weights, tmp_path, process_index=1, process_count=2)
     (part,) = (tmp_path / "parts").glob("*/*.array_record")
     part.write_bytes(b"")
-    with pytest.raises(InputError, match=r"0 bytes, the manifest says .*remove .*parts/00001"):
+    with pytest.raises(InputError, match=r"0 bytes, expected .*remove .*parts/00001"):
         encode(source, weights, tmp_path, process_index=0, process_count=2)
     assert not (tmp_path / MANIFEST).exists()
 

@@ -96,9 +96,9 @@ class RealTiny(Recipe):
     def _pack(self, split: str) -> Path:
         """Decode the clips of a split at the model's size."""
         from egosim_jax import configs
+        from egosim_jax.data.manifest import MANIFEST
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.data.pack import pack
-        from egosim_jax.data.shards import MANIFEST
         from egosim_jax.progress import track
 
         out = self.out / "frames" / split

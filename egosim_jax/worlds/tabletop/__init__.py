@@ -52,7 +52,7 @@ class TabletopClip:
     cameras: Cameras
     """Camera of every frame."""
     frames: UInt8[np.ndarray, "f h w 3"]
-    """RGB video."""
+    """RGB frames of the clip."""
     depth_m: Float32[np.ndarray, "f h w"]
     """Depth along the camera axis in meters; infinite where a ray hits nothing."""
     ids: Int[np.ndarray, "f h w"]

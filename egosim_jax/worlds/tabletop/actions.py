@@ -59,7 +59,7 @@ class Hand:
     side: Side
     """Left or right."""
     grip: Grip
-    """Configuration."""
+    """Configuration of the hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class Intent:
     """The action of a clip and its target."""
 
     verb: Verb
-    """Action."""
+    """Action of the hand."""
     name: str
     """Name of the grasped body."""
     goal_m: Float[np.ndarray, " 3"] | None = None

@@ -30,8 +30,11 @@ COLORS = {
 }
 """RGB by the color name in captions."""
 STATIC_COLOR = "black"
-"""Color of bodies that are never manipulated. In a prior they look like unobserved pixels, so that
-only the mask tells them apart; and a black body could not be segmented by its color."""
+"""Color of bodies that are never manipulated.
+
+In a prior they look like unobserved pixels, so that only the mask distinguishes them; and a black
+body could not be segmented by its color.
+"""
 TABLE_SIZE_M = (1.3, 0.62, 0.03)
 """Extent of the table top in meters."""
 REACH_M = (-0.20, 0.20, 0.15, 0.37)
@@ -45,7 +48,7 @@ class Paint:
     """A solid texture: a color at every point of a body's local frame."""
 
     color: tuple[int, int, int]
-    """RGB."""
+    """RGB of the texture."""
     second: tuple[int, int, int]
     """RGB of the pattern."""
     pattern: Pattern
@@ -82,7 +85,7 @@ class Part:
     triangles: Int[np.ndarray, "t 3"]
     """Vertex indices of each triangle."""
     paint: Paint
-    """Texture."""
+    """Texture of the mesh."""
     smooth: bool = False
     """Interpolate vertex normals, for round surfaces."""
 
@@ -105,13 +108,13 @@ class Body:
     name: str
     """Name in captions, such as "red box"; unique in a scene."""
     shape: Shape
-    """Shape class."""
+    """Class of its shape."""
     size_m: tuple[float, float, float]
     """Extent along the axes of its local frame in meters."""
     parts: tuple[Part, ...]
     """Rigid parts; the first one moves when the body is opened or carried."""
     world_from_body: Float[np.ndarray, "4 4"]
-    """Pose."""
+    """Pose in the world."""
 
     @property
     def static(self) -> bool:
@@ -147,7 +150,7 @@ def box(
 
 
 def join(*pieces: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Concatenate meshes."""
+    """Concatenate meshes into one."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
     vertices = np.concatenate([vertices for vertices, _ in pieces])
     triangles = [tri + start for (_, tri), start in zip(pieces, starts, strict=False)]

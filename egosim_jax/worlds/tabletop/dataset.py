@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Literal
 
 from egosim_jax import interrupts
+from egosim_jax.data.manifest import MANIFEST
 from egosim_jax.data.pack import triplet_record
-from egosim_jax.data.shards import MANIFEST, ShardWriter, from_bytes, gather, to_bytes
+from egosim_jax.data.records import from_bytes, to_bytes
+from egosim_jax.data.shards import ShardWriter, gather
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder, plain
 from egosim_jax.types import InputError, Kind, VideoSpec

@@ -37,7 +37,7 @@ class Placed:
     part: Part
     """Mesh and texture."""
     world_from_part: Float[np.ndarray, "4 4"]
-    """Pose."""
+    """Pose in the world."""
     number: int
     """Instance id in renderings, from 1; 0 means that nothing was hit."""
 
@@ -47,7 +47,7 @@ class Picture:
     """A rendering of one frame."""
 
     colors: UInt8[np.ndarray, "h w 3"]
-    """RGB."""
+    """RGB of every pixel."""
     depth_m: Float32[np.ndarray, "h w"]
     """Depth along the camera axis in meters; infinite where a ray hits nothing."""
     ids: Int[np.ndarray, "h w"]

@@ -26,8 +26,11 @@ from egosim_jax.worlds.tabletop.bodies import (
 from egosim_jax.worlds.tabletop.raycast import Placed
 
 TABLE, FLOOR, WALL, FIRST_BODY, FIRST_HAND = 1, 2, 3, 10, 100
-"""Instance ids in renderings. Body i has 10 + 2 i and its case, if it has one, 11 + 2 i; hand i
-has 100 + 2 i and its forearm 101 + 2 i."""
+"""Instance ids in renderings.
+
+Body i has 10 + 2 i and its case, if it has one, 11 + 2 i; hand i has 100 + 2 i and its forearm
+101 + 2 i.
+"""
 DRAWER_M = 0.075
 """Travel of an open drawer in meters."""
 LID_DEGREES = 100.0

@@ -197,7 +197,7 @@ def test_a_file_where_a_folder_has_to_be_is_one_line(clips, out, tmp_path, capsy
     assert "Not a directory" in line
     code, line = refused(Check(shards=out), capsys)
     assert code == USAGE
-    assert "holds no dataset" in line
+    assert "is not a dataset" in line
     for command in (Stats(shards=clips), Look(shards=clips, out=tmp_path / "a.png")):
         assert refused(command, capsys)[0] == USAGE
 
@@ -243,6 +243,6 @@ def test_a_second_process_on_the_same_folder_is_one_line(clips, out):
 def test_missing_files_are_refused_before_anything_is_written(clips, out):
     for folder in ("clip0", "clip1"):
         (clips.parent / folder / "ego_prior_video.mp4").unlink()
-    with pytest.raises(InputError, match="No prior video of the 2 clips is there"):
+    with pytest.raises(InputError, match="None of the 2 clips has its prior video"):
         Pack(metadata=clips, out=out).run()
     assert not out.exists()

@@ -80,7 +80,7 @@ def test_a_clip_without_truth_has_none(files):
     assert load_triplet(dataclasses.replace(files, target=None), NATIVE).target is None
 
 
-def test_a_sound_clip_has_no_problems(files):
+def test_a_valid_clip_has_no_problems(files):
     assert check_clip(files, NATIVE) == []
 
 
@@ -147,7 +147,7 @@ def test_lenient_cuts(files):
     np.testing.assert_array_equal(triplet.prior, read_video(files.prior).frames[:5])
 
 
-def test_lenient_stretches_each_video_to_the_size(files):
+def test_lenient_resizes_each_video(files):
     shrink(files.hands, 16, 32)
     hands = load_triplet(files, NATIVE, policy="lenient").hands
     frame = Image.fromarray(read_video(files.hands).frames[0])

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from egosim_jax.data.loader import Loader, make_loader
-from egosim_jax.data.shards import ShardReader, ShardWriter, to_bytes
+from egosim_jax.data.records import to_bytes
+from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import DecodeWindow
 from egosim_jax.types import InputError, VideoSpec
 
@@ -186,7 +187,7 @@ def test_a_record_with_nan_or_latents_of_another_length_is_skipped_and_named(tmp
     reasons = sorted(loader.skipped)
     assert "record 1: target has values that are not finite" in reasons[0]
     assert "record 2: target has (4, 2, 4) latent frames, rows and columns" in reasons[1]
-    assert "the manifest says (2, 2, 4)" in reasons[1]
+    assert "expected (2, 2, 4)" in reasons[1]
 
 
 def test_a_mistake_in_a_transform_is_not_taken_for_a_bad_record(source):

@@ -1,4 +1,4 @@
-"""What a metadata file says, and every way in which it can be wrong."""
+"""Metadata files: defaults of missing columns, and every invalid input."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def test_paths_are_relative_to_the_metadata(write, tmp_path):
     assert item.target == tmp_path / "a/video.mp4"
 
 
-def test_the_mask_lies_beside_the_prior(write, tmp_path):
+def test_the_mask_is_next_to_the_prior(write, tmp_path):
     (item,) = read_metadata(write(HEADER, ROW.replace("a/prior.mp4", "renders/a/p.mp4")))
     assert item.mask == tmp_path / "renders/a/pc_mask_video.mp4"
 
@@ -96,12 +96,12 @@ def test_null_is_an_empty_cell(write):
     ["../a", "a/../b", "/a", "a/", "a//b", "a.mp4/b", ".a", "a b", "a\\b", "é", "a" * 201],
 )
 def test_an_id_that_cannot_name_a_file_is_refused(write, video_id):
-    with pytest.raises(InputError, match=r"line 2: video_id .* cannot name a file"):
+    with pytest.raises(InputError, match=r"line 2: video_id .* is not a valid file name"):
         read_metadata(write(HEADER, _other(video_id)))
 
 
 def test_a_repeated_id_is_named_with_both_lines(write):
-    with pytest.raises(InputError, match="line 3: video_id 'a' is already that of line 2"):
+    with pytest.raises(InputError, match="line 3: video_id 'a' is a duplicate of line 2"):
         read_metadata(write(HEADER, ROW, ROW))
 
 
@@ -158,7 +158,7 @@ def test_a_limit_takes_the_first_rows(items):
         ({"where": "splt=x"}, "with one of the columns split"),
         ({"where": "split"}, "must be COLUMN=VALUE"),
         ({"where": "split=z"}, "split is one of: x, y"),
-        ({"video_ids": ["d"]}, "No clip is called d"),
+        ({"video_ids": ["d"]}, "No clip has the id d"),
         ({"limit": 0}, "--limit must be at least 1, not 0"),
     ],
 )
@@ -236,7 +236,7 @@ def test_a_hundred_thousand_missing_files_are_refused_at_once(write):
     items = read_metadata(write("video,ego_prior_video,prompt", "v.mp4,p.mp4,x"))
     many = [dataclasses.replace(items[0], video_id=str(n)) for n in range(1000)] * 100
     then = time.monotonic()
-    with pytest.raises(InputError, match=r"No prior video of the 100,000 clips is there: .*, …"):
+    with pytest.raises(InputError, match=r"None of the 100,000 clips has its prior video: .*, …"):
         check_presence(many)
     assert time.monotonic() - then < 5
 
@@ -245,4 +245,4 @@ def test_only_the_first_of_many_problems_are_listed(write):
     with pytest.raises(InputError, match="and 990 more") as caught:
         read_metadata(write(HEADER, *[_other(f"a b{n}") for n in range(1000)]))
     assert len(str(caught.value).split("; and ")) == 2
-    assert str(caught.value).count("cannot name a file") == 10
+    assert str(caught.value).count("is not a valid file name") == 10

@@ -1,4 +1,4 @@
-"""Shards: what goes in comes out bit for bit, and what is broken is named."""
+"""Shards: records survive bit for bit, and damage is named."""
 
 import json
 import os
@@ -10,17 +10,9 @@ import pytest
 import safetensors.numpy
 
 from egosim_jax.data.check import check
-from egosim_jax.data.shards import (
-    MANIFEST,
-    SEAL,
-    Record,
-    RecordError,
-    ShardReader,
-    ShardWriter,
-    from_bytes,
-    read_manifest,
-    to_bytes,
-)
+from egosim_jax.data.manifest import MANIFEST, SEAL, read_manifest
+from egosim_jax.data.records import Record, RecordError, from_bytes, to_bytes
+from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import encode_video
 from egosim_jax.types import InputError, VideoSpec
 
@@ -89,7 +81,7 @@ def test_a_transposed_array_keeps_its_order():
     "data", [b"", b"short", bytes(64), to_bytes(Record(arrays={}, metadata={}))[:-1]]
 )
 def test_bytes_that_are_no_record_are_refused(data):
-    with pytest.raises(RecordError, match="is not a record"):
+    with pytest.raises(RecordError, match="is not a valid record"):
         from_bytes(data)
 
 
@@ -133,7 +125,7 @@ def test_the_manifest_describes_the_records(folder):
     assert manifest.arrays["target"].shape == (3, 4, 6, 16)
 
 
-def test_axes_on_which_records_differ_are_left_open(tmp_path):
+def test_axes_on_which_records_differ_are_none(tmp_path):
     with ShardWriter(tmp_path, kind="videos") as writer:
         writer.add({"x": np.zeros((2, 3), np.uint8)}, {"video_id": "a"})
         writer.add({"x": np.zeros((2, 5), np.uint8)}, {"video_id": "b"})
@@ -144,10 +136,10 @@ def test_axes_on_which_records_differ_are_left_open(tmp_path):
 @pytest.mark.parametrize(
     ("second", "message"),
     [
-        ({"y": np.zeros(3, np.uint8)}, "holds .'y'., but the records before it hold .'x'."),
-        ({"x": np.zeros(3, np.float32)}, "x is float32, wanted uint8"),
-        ({"x": np.zeros((3, 1), np.uint8)}, r"x is \(3, 1\), wanted \(3,\)"),
-        ({"x": np.zeros(3, np.complex64)}, "x is complex64"),
+        ({"y": np.zeros(3, np.uint8)}, "holds the arrays .'y'.; expected .'x'."),
+        ({"x": np.zeros(3, np.float32)}, "x has dtype float32; expected uint8"),
+        ({"x": np.zeros((3, 1), np.uint8)}, r"x has shape \(3, 1\); expected \(3,\)"),
+        ({"x": np.zeros(3, np.complex64)}, "x has dtype complex64"),
     ],
 )
 def test_records_must_hold_the_same_arrays(tmp_path, second, message):
@@ -172,9 +164,9 @@ def test_an_interrupted_writer_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_without_manifest_is_no_dataset(folder):
+def test_a_folder_without_manifest_is_not_a_dataset(folder):
     (folder / MANIFEST).unlink()
-    with pytest.raises(InputError, match=r"holds no dataset: there is no manifest\.json"):
+    with pytest.raises(InputError, match=r"is not a dataset: it has no manifest\.json"):
         ShardReader(folder)
 
 
@@ -197,7 +189,7 @@ def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "shard-00000.array_record"}
 
 
-def test_the_old_shards_stay_until_the_new_ones_are_whole(folder):
+def test_the_old_shards_stay_until_the_new_ones_are_complete(folder):
     def write():
         with ShardWriter(folder, kind="latents", overwrite=True) as writer:
             writer.add(latents(9), {"video_id": "new"})
@@ -216,7 +208,7 @@ def test_writing_no_record_is_refused(tmp_path):
         pass
 
 
-def test_sound_shards_have_no_problems(folder):
+def test_valid_shards_have_no_problems(folder):
     assert problems(folder) == []
 
 
@@ -224,8 +216,8 @@ def test_sound_shards_have_no_problems(folder):
     ("damage", "message"),
     [
         (lambda path: path.unlink(), "missing"),
-        (lambda path: path.write_bytes(b""), "0 bytes, the manifest says"),
-        (lambda path: path.write_bytes(path.read_bytes()[:1000]), "1000 bytes, the manifest says"),
+        (lambda path: path.write_bytes(b""), "0 bytes, expected"),
+        (lambda path: path.write_bytes(path.read_bytes()[:1000]), "1000 bytes, expected"),
     ],
 )
 def test_a_missing_empty_or_truncated_shard_is_named_at_opening(folder, damage, message):
@@ -256,7 +248,7 @@ def test_check_names_a_flipped_byte(folder):
     path = first_shard(folder)
     flip(path, path.read_bytes().index(to_bytes(ShardReader(folder)[1])[200:300]))
     found = problems(folder)
-    assert found[0] == f"{path}: its SHA-256 is not the manifest's"
+    assert found[0] == f"{path}: its SHA-256 differs from the manifest"
     assert found[1].startswith(f"{path}, record 1: cannot be read")
     assert len(found) == 2
 
@@ -264,13 +256,13 @@ def test_check_names_a_flipped_byte(folder):
 def test_check_names_a_file_that_is_no_array_record(folder):
     path = first_shard(folder)
     path.write_bytes(b"x" * path.stat().st_size)
-    assert f"{path}: 0 records, the manifest says 4" in problems(folder)
+    assert f"{path}: 0 records, expected 4" in problems(folder)
 
 
 @pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "shard-1.array_record", ""])
 def test_a_manifest_that_names_other_paths_is_refused(folder, name):
     rewrite_manifest(folder, lambda fields: fields["shards"][0].update(file=name))
-    with pytest.raises(InputError, match="must name different shards like"):
+    with pytest.raises(InputError, match="must list unique shards named like"):
         ShardReader(folder)
 
 
@@ -319,7 +311,7 @@ def test_a_dataset_that_calls_the_target_truth_is_read(tmp_path):
 
 def test_check_names_a_wrong_record_count(folder):
     rewrite_manifest(folder, lambda fields: fields["shards"][0].update(records=3))
-    assert problems(folder) == [f"{first_shard(folder)}: 4 records, the manifest says 3"]
+    assert problems(folder) == [f"{first_shard(folder)}: 4 records, expected 3"]
 
 
 def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
@@ -330,10 +322,10 @@ def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
 
     rewrite_manifest(folder, change)
     found = "\n".join(problems(folder))
-    assert "text is float32 (5, 8), the manifest says float32 (5, 9)" in found
-    assert "mask is uint8 (3, 4, 6, 4), the manifest says int32" in found
-    assert "target is not in the manifest" in found
-    assert "hands is not in the record" in found
+    assert "text is float32 (5, 8), expected float32 (5, 9)" in found
+    assert "mask is uint8 (3, 4, 6, 4), expected int32" in found
+    assert "target is missing in the manifest" in found
+    assert "hands is missing in the record" in found
 
 
 def test_check_names_numbers_that_are_not_finite(tmp_path):
@@ -342,14 +334,14 @@ def test_check_names_numbers_that_are_not_finite(tmp_path):
     with ShardWriter(tmp_path, kind="latents") as writer:
         writer.add(arrays, {"video_id": "a"})
     assert problems(tmp_path) == [
-        f"{first_shard(tmp_path)}, record 0: target holds numbers that are not finite"
+        f"{first_shard(tmp_path)}, record 0: target has values that are not finite"
     ]
 
 
 def test_check_names_an_id_that_is_a_path(tmp_path):
     with ShardWriter(tmp_path, kind="latents") as writer:
         writer.add(latents(0), {"video_id": "../../etc/x"})
-    assert "'../../etc/x' cannot name a file" in problems(tmp_path)[0]
+    assert "'../../etc/x' is not a valid file name" in problems(tmp_path)[0]
 
 
 def as_bytes(frames):
@@ -436,7 +428,7 @@ def test_a_changed_manifest_is_named(folder, change):
     fields = json.loads((folder / MANIFEST).read_text())
     change(fields)
     (folder / MANIFEST).write_text(json.dumps(fields))
-    with pytest.raises(InputError, match="was changed after it was written"):
+    with pytest.raises(InputError, match="was modified after it was written"):
         read_manifest(folder)
 
 
@@ -462,7 +454,7 @@ def test_a_manifest_of_wrong_types_is_refused(folder, change):
 
 
 @pytest.mark.parametrize("text", ["[]", "3", '{"version": 1}', "[" * 100_000, "\ud800"])
-def test_what_is_no_manifest_is_refused(folder, text):
+def test_an_invalid_manifest_is_refused(folder, text):
     (folder / MANIFEST).write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(InputError):
         read_manifest(folder)
@@ -474,5 +466,5 @@ def test_what_is_no_manifest_is_refused(folder, text):
 def test_a_record_of_wrong_types_is_refused(metadata):
     header = {"json": json.dumps(metadata)}
     data = safetensors.numpy.save({"x": np.zeros(2, np.float32)}, metadata=header)
-    with pytest.raises(RecordError, match="is not a record"):
+    with pytest.raises(RecordError, match="is not a valid record"):
         from_bytes(data)
