@@ -114,7 +114,8 @@ def umeyama(
     u, strength, vt = np.linalg.svd(aimed.T @ centerd / len(points))
     if len(points) < 3 or strength[1] <= 1e-12 * max(strength[0], 1e-300):
         raise InputError(
-            f"{len(points)} points do not determine a motion: it takes three that are not in line."
+            f"{len(points)} points do not determine a motion: it needs at least three that are "
+            "non-collinear."
         )
     signs = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     motion = np.eye(4)

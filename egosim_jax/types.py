@@ -376,5 +376,5 @@ class Perceived:
     """What the things are called, by id."""
     world_from_object: Mapping[int, Float[np.ndarray, "f 4 4"]]
     """Poses of the things that were tracked; the first is that in the state before."""
-    touched: Mapping[int, Bool[np.ndarray, " f"]]
-    """For each thing that hands acted on, the frames in which they did."""
+    interacted_frames: Mapping[int, Bool[np.ndarray, " f"]]
+    """Frames in which hands acted on each object; only objects with at least one."""

@@ -21,11 +21,10 @@ if TYPE_CHECKING:
 
     from egosim_jax.perception import Perception
     from egosim_jax.simulator import Step
-    from egosim_jax.types import Action, Clip, Perceived, SceneState
+    from egosim_jax.types import SceneState
     from egosim_jax.worlds.tabletop import TabletopClip
 
 SHEET_MOMENTS = (0, 3, 6, 9, 12, 16)
-Backend = Literal["classical", "oracle"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +44,9 @@ class Simulate:
     """How many."""
     seed: int = 0
     """Of the scene, what is done in it, and the noise."""
-    perception: Backend = "classical"
-    """What reads the clips: without network weights, or told the truth."""
+    perception: str = "classical"
+    """Perception pipeline and its options: classical (no network weights), oracle (ground truth),
+    or another registered one."""
     update: Literal["full", "none"] = "full"
     """Whether the state learns from the clips, or stays as it was before the first."""
     robot: bool = False
@@ -134,27 +134,13 @@ class Simulate:
         return image
 
 
-def backend(name: Backend, truth: Sequence[TabletopClip]) -> Perception:
-    """The perception of that name, for a sequence whose truth is known."""
-    if name == "oracle":
-        return Told(truth)
-    from egosim_jax.perception.classical import Classical
+def backend(perception: str, clips: Sequence[TabletopClip]) -> Perception:
+    """Return the perception of that name and options, for a sequence with ground truth."""
+    from egosim_jax.perception import registry
+    from egosim_jax.worlds.tabletop import to_ground_truth
 
-    return Classical()
-
-
-@dataclass(frozen=True)
-class Told:
-    """Perception that knows the truth of every clip of a sequence."""
-
-    truth: Sequence[TabletopClip]
-
-    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        """The truth of the clip after so many steps."""
-        from egosim_jax.perception.oracle import oracle
-        from egosim_jax.worlds.tabletop import to_ground_truth
-
-        return oracle(to_ground_truth(self.truth[state.step]))(clip, action, state)
+    ground_truth = {clip.number: to_ground_truth(clip) for clip in clips}
+    return registry.parse(perception).build(ground_truth)
 
 
 MEASURES = {

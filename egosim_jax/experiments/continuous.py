@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, Backend, backend, score
+from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, backend, score
 from egosim_jax.command import DONE
 from egosim_jax.experiments.tables import Line, print_table, summarize
 from egosim_jax.io.atomic import atomic_write
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Scores = Sequence[Mapping[str, float]]
 """Of one sequence, clip by clip."""
-METHODS: dict[str, Backend | None] = {
+METHODS: dict[str, str | None] = {
     "update, oracle": "oracle",
     "update, classical": "classical",
     "no update": None,

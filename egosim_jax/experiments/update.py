@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.cli.simulate import Backend, backend
+from egosim_jax.cli.simulate import backend
 from egosim_jax.command import DONE
 from egosim_jax.experiments.tables import print_table, summarize
 from egosim_jax.progress import track
@@ -111,7 +111,7 @@ def _rows(
     yield "classical, generated frames", judge(clip, generated, "classical")
 
 
-def judge(clip: TabletopClip, frames: np.ndarray, perception: Backend) -> dict[str, float]:
+def judge(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, float]:
     """How well the state is after these frames of a clip were perceived and fused."""
     from egosim_jax.geometry import transform
     from egosim_jax.metrics.update import both_ways, thing_accuracy

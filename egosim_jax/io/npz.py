@@ -23,14 +23,20 @@ _HEADER = 4096
 
 
 def read_arrays(
-    path: Path, dtypes: Mapping[str, str], *, others: Collection[str] = (), packed: bool = False
+    path: Path,
+    dtypes: Mapping[str, str],
+    *,
+    others: Collection[str] = (),
+    packed: bool = False,
+    renamed: Mapping[str, str] | None = None,
 ) -> dict[str, np.ndarray]:
     """Read exactly the named arrays of an npz that `np.savez` wrote.
 
     `dtypes` names the dtype of each array; those in `others` may have any that holds numbers.
-    Compressed ones are read if `packed`. Raises `InputError` if an array is missing, unknown, of
-    another dtype, too large or damaged: shapes are checked against sizes before anything is built,
-    contents against their CRC-32.
+    Compressed ones are read if `packed`. `renamed` maps the names of arrays in earlier files to
+    those of now. Raises `InputError` if an array is missing, unknown, of another dtype, too large
+    or damaged: shapes are checked against sizes before anything is built, contents against their
+    CRC-32.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -38,6 +44,7 @@ def read_arrays(
             with zipfile.ZipFile(file) as archive:
                 found = archive.infolist()
                 names = [entry.filename.removesuffix(".npy") for entry in found[:MAX_ENTRIES]]
+                names = [(renamed or {}).get(n, n) for n in names]
                 if len(found) > MAX_ENTRIES or sorted(names) != sorted({*dtypes, *others}):
                     listing = ", ".join(quote_text(n) for n in names[:8])
                     raise InputError(f"{name} holds the arrays {listing}: not those expected.")

@@ -1,4 +1,4 @@
-"""What was perceived, as one npz file without pickle."""
+"""Storage of a `Perceived` as one npz file, without pickle."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import numpy as np
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.untrusted import parse_json, quote_path, quote_text
-from egosim_jax.state.filter import from_arrays, to_arrays
 from egosim_jax.types import Cameras, InputError, Perceived
 
 PIXELS = ("frames", "depth_m", "object_ids")
 _DTYPES = {
     "about": "uint8", "world_from_camera": "float64", "intrinsics_px": "float64",
     "paths": "float64", "frames": "uint8", "depth_m": "float32", "object_ids": "int32",
-    "touched_ids": "int32", "touched_frames": "bool",
+    "interacted_ids": "int32", "interacted_frames": "bool",
 }  # fmt: skip
+_RENAMED = {"touched_ids": "interacted_ids", "touched_frames": "interacted_frames"}
+"""Names of arrays in files of earlier versions."""
 
 
 def save(path: Path, perceived: Perceived) -> None:
-    """Write a file that ends in .npz, whole or not at all."""
-    tracked = sorted(perceived.world_from_object)
+    """Write a file that ends in .npz, atomically."""
+    tracked, interacted = sorted(perceived.world_from_object), sorted(perceived.interacted_frames)
     about = {
         "step": perceived.step,
         "names": {str(number): name for number, name in sorted(perceived.names.items())},
@@ -37,15 +38,16 @@ def save(path: Path, perceived: Perceived) -> None:
         "intrinsics_px": np.asarray(perceived.cameras.intrinsics_px, float),
         "paths": np.array([perceived.world_from_object[number] for number in tracked], float),
         **{name: getattr(perceived, name) for name in PIXELS},
-        **to_arrays(perceived.touched),
+        "interacted_ids": np.array(interacted, np.int32),
+        "interacted_frames": np.array([perceived.interacted_frames[n] for n in interacted], bool),
     }
     with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def load(path: Path) -> Perceived:
-    """Read what `save` wrote. Raises `InputError` if the file is something else."""
-    arrays = read_arrays(path, _DTYPES)
+    """Read a file that `save` wrote. Raises `InputError` if it is any other file, or damaged."""
+    arrays = read_arrays(path, _DTYPES, renamed=_RENAMED)
     about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
     try:
         cameras = Cameras(
@@ -54,14 +56,15 @@ def load(path: Path) -> Perceived:
             height=about["size"][0],
             width=about["size"][1],
         )
+        interacted = arrays["interacted_ids"].tolist(), arrays["interacted_frames"]
         return Perceived(
             step=about["step"],
             cameras=cameras,
             names={int(number): name for number, name in about["names"].items()},
             world_from_object=dict(zip(about["tracked"], arrays.pop("paths"), strict=True)),
-            touched=from_arrays(arrays),
+            interacted_frames=dict(zip(*interacted, strict=True)),
             **{name: arrays[name] for name in PIXELS},
         )
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         why = quote_text(str(error))
-        raise InputError(f"{quote_path(path)} is not a record of perception: {why}.") from error
+        raise InputError(f"{quote_path(path)} is not a perception archive: {why}.") from error

@@ -1,106 +1,155 @@
-"""Perception without network weights: by comparing the clip with what the state predicts.
+"""Classical perception: without network weights, by comparing the clip with the state's prediction.
 
-The cameras are those that the generator was given; what the hands carried is found by trying
-(`carried`); where it was, the surface that it stood on is continued. What agrees with the view of
-the state before teaches nothing: its depth is left unknown, and the state stays as it was there.
+Cameras and hand joints are those that the generator was given. Hands and arms are drawn from the
+joints (`HandMasks`); the motion of a held object is the one that explains the clip's colors best
+(`object_motion.TrackObjects`); where the object was, the surface that it stood on is extended
+(`RevealedSurfaces`). Depth is set only where the clip differs from the view of the state before;
+elsewhere it is unknown, and the state stays as it was.
 
-It sees generated frames, cameras, the state before and the action, never the truth. Limits: things
-must be apart in the state (object ids), a thing is moved by one hand at a time, and what turns on a
-hinge is taken for a rigid body between its ends.
+Limits: objects must be separate instances in the state, an object is moved by one hand at a time,
+and an articulated object is treated as a rigid body between the ends of its motion.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import beside, invert, pixel_rays, project, transform
-from egosim_jax.perception.carried import PALM, Carried, Thing, carried
+from egosim_jax.perception.object_motion import PALM, TrackObjects
+from egosim_jax.perception.pipeline import Observation, Pipeline
+from egosim_jax.perception.registry import register
 from egosim_jax.rendering.reference import render, splat
 from egosim_jax.rendering.skeleton import SKELETONS
-from egosim_jax.types import Action, Cameras, Clip, Perceived, SceneState
+from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState
 
-FINGER_M, ARM_M = 0.013, 0.05
-"""Radius of the flesh around a bone and around an arm."""
-CHEST_M, ARM_SHARE = np.array([0.0, 0.35, 0.05]), 0.8
-"""Where arms come from as the camera sees it: below, straight down from the hand; and how much of
-the way there is covered."""
-NEAR_M, DISCS = 0.05, 25
-"""Flesh nearer to the camera is not drawn, and how many discs make a tube."""
+
+def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
+    """Set cameras and hand joints to those that the generator was given; no new names."""
+    return replace(so_far, cameras=action.cameras, joints_m=action.joints_m, names={})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Classical:
-    """A perception of clips whose cameras are known."""
+class HandMasks:
+    """Stage that sets `object_ids` to the silhouettes of hands and arms, drawn from the joints."""
+
+    finger_radius_m: float = 0.013
+    """Radius of the flesh around a bone in meters."""
+    arm_radius_m: float = 0.05
+    """Radius of a forearm in meters."""
+    shoulder_offset_m: tuple[float, float, float] = (0.0, 0.35, 0.05)
+    """Origin of an arm in camera axes in meters; x is relative to the wrist's."""
+    arm_fraction: float = 0.8
+    """Fraction of the way from the wrist to the arm's origin that is drawn."""
+    near_m: float = 0.05
+    """Flesh nearer to the camera than this is not drawn, in meters."""
+    discs: int = 25
+    """Number of discs that a capsule is drawn with."""
+
+    def __call__(
+        self, clip: Clip, action: Action, state: SceneState, so_far: Observation
+    ) -> Observation:
+        """Set `object_ids`: -1 - n for hand n with its arm, 0 elsewhere."""
+        cameras = so_far.require("cameras", "HandMasks")
+        joints = so_far.require("joints_m", "HandMasks")
+        hands = hand_silhouette(joints, action.kind, cameras, self)
+        return replace(so_far, object_ids=np.where(hands >= 0, -1 - hands, 0).astype(np.int32))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RevealedSurfaces:
+    """Stage that sets depth and ids of moved objects and of the surfaces they stood on."""
 
     point_px: int = 2
-    """Size of the points with which the state is looked at."""
+    """Size in pixels of the points with which the state is rendered."""
 
-    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        """What was carried and what came to light; everything else is unknown."""
-        hands = flesh(action)
-        moved = carried(clip, action, state, hands >= 0)
-        depth, ids = self._changes(action.cameras, state, moved)
-        frames = np.arange(len(clip.frames))
-        return Perceived(
-            step=state.step + 1,
-            frames=clip.frames,
-            cameras=action.cameras,
-            depth_m=np.where(hands >= 0, np.inf, depth).astype(np.float32),
-            object_ids=np.where(hands >= 0, -1 - hands, ids).astype(np.int32),
-            names={},
-            world_from_object={
-                m.thing.number: m.path @ state.world_from_object.get(m.thing.number, np.eye(4))
-                for m in moved
-            },
-            touched={m.thing.number: (frames >= m.grasped) & (frames <= m.released) for m in moved},
+    def __call__(
+        self, clip: Clip, action: Action, state: SceneState, so_far: Observation
+    ) -> Observation:
+        """Set `depth_m`, infinite where the clip agrees with the state or shows hands, and ids."""
+        cameras, hand_ids, motions, planes = (
+            so_far.require(field, "RevealedSurfaces")
+            for field in ("cameras", "object_ids", "motions", "support_planes")
+        )
+        depth, ids = self._changes(cameras, state, motions, planes)
+        hidden = hand_ids < 0
+        return replace(
+            so_far,
+            depth_m=np.where(hidden, np.inf, depth).astype(np.float32),
+            object_ids=np.where(hidden, hand_ids, ids).astype(np.int32),
         )
 
     def _changes(
-        self, cameras: Cameras, state: SceneState, moved: list[Carried]
+        self,
+        cameras: Cameras,
+        state: SceneState,
+        motions: Mapping[int, Float[np.ndarray, "f 4 4"]],
+        planes: Mapping[int, Float[np.ndarray, " 4"]],
     ) -> tuple[Float32[np.ndarray, "f h w"], Int32[np.ndarray, "f h w"]]:
-        """Depth and ids of what moved and of the surfaces it stood on; infinite and 0 elsewhere."""
+        """Return depth and ids of changed pixels; infinite and 0 elsewhere."""
         view = render(state, cameras, point_px=self.point_px)
-        others = ~np.isin(state.object_ids, [m.thing.number for m in moved])
+        others = ~np.isin(state.object_ids, list(motions))
         rest, _ = splat(state.points_m[others], cameras, point_px=self.point_px)
         depth = np.full(rest.shape, np.inf, np.float32)
         ids = np.zeros(rest.shape, np.int32)
-        for m in moved:
-            bared = (view.object_ids == m.thing.number) & ~np.isfinite(rest)
-            depth[bared] = np.minimum(depth, _plane(m.thing, cameras))[bared]
-        for m in moved:
-            there, index = splat(m.thing.points_m, beside(cameras, m.path), point_px=self.point_px)
-            nearer = (index >= 0) & (there < np.minimum(depth, rest))
-            depth[nearer], ids[nearer] = there[nearer], m.thing.number
+        for number in motions:
+            revealed = (view.object_ids == number) & ~np.isfinite(rest)
+            depth[revealed] = np.minimum(depth, plane_depth(planes[number], cameras))[revealed]
+        for number, motion in motions.items():
+            points = state.points_m[state.object_ids == number].astype(float)
+            moved, index = splat(points, beside(cameras, motion), point_px=self.point_px)
+            nearer = (index >= 0) & (moved < np.minimum(depth, rest))
+            depth[nearer], ids[nearer] = moved[nearer], number
         return depth, ids
 
 
-def flesh(action: Action) -> Int32[np.ndarray, "f h w"]:
-    """Which hand covers each pixel, arm included; -1 for none.
+@register("classical")
+@dataclass(frozen=True, kw_only=True)
+class ClassicalConfig:
+    """Perception without network weights, for clips whose cameras and hands are known."""
 
-    Bones with flesh around them, the palm between its knuckles, and an arm from the wrist towards
-    the wearer.
+    hands: HandMasks = field(default_factory=HandMasks)
+    """Drawing of hands and arms."""
+    motion: TrackObjects = field(default_factory=TrackObjects)
+    """Search for the motion of held objects."""
+    surfaces: RevealedSurfaces = field(default_factory=RevealedSurfaces)
+    """Depth of moved objects and of the surfaces behind them."""
+
+    def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
+        """Return the pipeline; the ground truth is not used."""
+        return Pipeline(stages=(take_action, self.hands, self.motion, self.surfaces))
+
+
+def hand_silhouette(
+    joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, cameras: Cameras, config: HandMasks
+) -> Int32[np.ndarray, "f h w"]:
+    """Return the number of the hand that covers each pixel, arm included; -1 for none.
+
+    A hand is its bones with flesh around them, the palm between its knuckles, and an arm from the
+    wrist towards the wearer. One with a joint that is not finite is missing.
     """
     import cv2
 
-    cameras = action.cameras
-    covered = np.full((len(action.joints_m), cameras.height, cameras.width), -1, np.int32)
-    bones = SKELETONS[action.kind].bones.tolist()
+    covered = np.full((len(joints_m), cameras.height, cameras.width), -1, np.int32)
+    bones = SKELETONS[kind].bones.tolist()
     for frame, world_from_camera in enumerate(cameras.world_from_camera):
         canvas = np.zeros((cameras.height, cameras.width), np.uint8)
-        for number, hand in enumerate(action.joints_m[frame]):
+        for number, hand in enumerate(joints_m[frame]):
             if not np.isfinite(hand).all():
                 continue
             joints = transform(invert(world_from_camera), hand)
-            palm = joints[PALM[action.kind]]
-            elbow = palm[0] + ARM_SHARE * (CHEST_M + [palm[0, 0], 0, 0] - palm[0])
+            palm = joints[PALM[kind]]
+            shoulder = np.array(config.shoulder_offset_m) + [palm[0, 0], 0, 0]
+            elbow = palm[0] + config.arm_fraction * (shoulder - palm[0])
             canvas[:] = 0
             for start, end in bones:
-                _tube(canvas, joints[start], joints[end], FINGER_M, cameras)
-            _tube(canvas, palm[0], elbow, ARM_M, cameras)
-            if (palm[:, 2] > NEAR_M).all():
+                radius_m = config.finger_radius_m
+                draw_capsule(canvas, joints[start], joints[end], radius_m, cameras, config)
+            draw_capsule(canvas, palm[0], elbow, config.arm_radius_m, cameras, config)
+            if (palm[:, 2] > config.near_m).all():
                 u, v = project(cameras.intrinsics_px, palm)
                 corners = np.rint(np.stack([u, v], axis=1)).astype(np.int32)
                 cv2.fillConvexPoly(canvas, cv2.convexHull(corners), 1)
@@ -108,32 +157,34 @@ def flesh(action: Action) -> Int32[np.ndarray, "f h w"]:
     return covered
 
 
-def _tube(
+def draw_capsule(
     canvas: UInt8[np.ndarray, "h w"],
     start: Float[np.ndarray, " 3"],
     end: Float[np.ndarray, " 3"],
     radius_m: float,
     cameras: Cameras,
+    config: HandMasks,
 ) -> None:
-    """Draw what a tube covers: discs of its radius along it."""
+    """Draw a capsule between two points in camera coordinates, as discs of its radius."""
     import cv2
 
-    places = start + np.linspace(0, 1, DISCS)[:, None] * (end - start)
-    places = places[places[:, 2] > NEAR_M]
-    far = 10 * cameras.width  # farther out is out of sight, and of the range that can be drawn
-    centers = np.clip(np.stack(project(cameras.intrinsics_px, places), axis=1), -far, far)
-    radii = cameras.intrinsics_px[0, 0] * radius_m / places[:, 2]
+    centers_m = start + np.linspace(0, 1, config.discs)[:, None] * (end - start)
+    centers_m = centers_m[centers_m[:, 2] > config.near_m]
+    limit = 10 * cameras.width  # beyond it a disc is outside the image, and OpenCV's range
+    centers = np.clip(np.stack(project(cameras.intrinsics_px, centers_m), axis=1), -limit, limit)
+    radii = cameras.intrinsics_px[0, 0] * radius_m / centers_m[:, 2]
     for (column, row), radius in zip(np.rint(centers).astype(int), radii, strict=True):
         cv2.circle(canvas, (int(column), int(row)), max(1, round(float(radius))), 1, -1)
 
 
-def _plane(thing: Thing, cameras: Cameras) -> Float32[np.ndarray, "f h w"]:
-    """Depth of the surface that a thing stands on; infinite where there is none."""
+def plane_depth(plane: Float[np.ndarray, " 4"], cameras: Cameras) -> Float32[np.ndarray, "f h w"]:
+    """Return the depth in meters of a plane (a, b, c, d); infinite where a ray does not meet it."""
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    normal, offset = plane[:3], plane[3]
     depths = []
     for pose in cameras.world_from_camera:
-        height = pose[:3, 3] @ thing.normal + thing.offset_m
+        height = pose[:3, 3] @ normal + offset
         with np.errstate(divide="ignore", invalid="ignore"):
-            along = -height / (rays @ pose[:3, :3].T @ thing.normal)
+            along = -height / (rays @ pose[:3, :3].T @ normal)
         depths.append(np.where(along > 0, along, np.inf))
     return np.array(depths, np.float32)

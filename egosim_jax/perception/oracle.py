@@ -1,51 +1,62 @@
-"""Perception that is told the truth: for tests, and as the upper bound of any other."""
+"""Perception that returns the ground truth: for tests, and as the upper bound of any other."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float
 
 from egosim_jax.geometry import invert
-from egosim_jax.perception import Backends
-from egosim_jax.types import Action, Cameras, Clip, SceneState
+from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
+from egosim_jax.perception.registry import register
+from egosim_jax.types import Action, Clip, InputError, SceneState
 
 
-@no_type_check
+@register("oracle")
 @dataclass(frozen=True, kw_only=True)
-class Truth:
-    """All that is true of a clip."""
+class OracleConfig:
+    """Perception that returns the ground truth of each clip and ignores its frames."""
 
-    cameras: Cameras
-    depth_m: Float32[np.ndarray, "f h w"]
-    object_ids: Int32[np.ndarray, "f h w"]
-    """As in `Perceived`."""
-    names: Mapping[int, str]
-    world_from_body: Mapping[int, Float[np.ndarray, "f 4 4"]]
-    """Pose of every thing, in coordinates of its own, whichever they are."""
+    def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
+        """Return the pipeline; raise `InputError` without ground truth."""
+        if ground_truth is None:
+            raise InputError(
+                "Perception pipeline 'oracle' needs ground truth, and there is none here: use "
+                "'classical'. (--perception)"
+            )
+        return Pipeline(stages=(ReadGroundTruth(ground_truth=ground_truth), find_interactions))
 
 
-def oracle(truth: Truth) -> Backends:
-    """A perception that reads every clip of this action as the truth.
+@dataclass(frozen=True, kw_only=True)
+class ReadGroundTruth:
+    """Stage that replaces the observation by the ground truth of the clip."""
 
-    A thing is tracked if it moves at all.
+    ground_truth: Mapping[int, Observation]
+    """Ground truth of each clip, by the state's step before it."""
+
+    def __call__(
+        self, clip: Clip, action: Action, state: SceneState, so_far: Observation
+    ) -> Observation:
+        """Return the ground truth of the clip that follows the state."""
+        if state.step not in self.ground_truth:
+            raise InputError(
+                f"There is no ground truth for the clip after step {state.step}, only after "
+                f"{sorted(self.ground_truth)}."
+            )
+        return self.ground_truth[state.step]
+
+
+def motions_of(
+    world_from_body: Mapping[int, Float[np.ndarray, "f 4 4"]],
+) -> dict[int, Float[np.ndarray, "f 4 4"]]:
+    """Return the motions, relative to the first frame, of all bodies that move at all.
+
+    The poses may be in any coordinates of the body.
     """
-
-    def tracking(clip: Clip, action: Action, state: SceneState) -> dict[int, np.ndarray]:
-        found = {}
-        for number, path in truth.world_from_body.items():
-            if not np.array_equal(path, np.broadcast_to(path[0], path.shape)):
-                before = state.world_from_object.get(number, np.eye(4))
-                found[number] = path @ invert(path[0]) @ before
-        return found
-
-    return Backends(
-        poses=lambda clip, action, state: truth.cameras,
-        depth=lambda clip, action, state: truth.depth_m,
-        segmentation=lambda clip, action, state: truth.object_ids,
-        tracking=tracking,
-        naming=lambda clip, action, state: truth.names,
-    )
+    return {
+        number: path @ invert(path[0])
+        for number, path in world_from_body.items()
+        if not np.array_equal(path, np.broadcast_to(path[0], path.shape))
+    }

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import beside, invert, pixels_of, transform
-from egosim_jax.state.filter import gone
+from egosim_jax.state.filter import disappeared_objects
 from egosim_jax.state.tsdf import Fusion, steady, surface
 from egosim_jax.types import Perceived, SceneState
 
@@ -51,7 +51,9 @@ class _Points:
 
 def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = None) -> SceneState:
     """The state after what was perceived; a clip in which nothing is known leaves its points."""
-    lost = gone(perceived.object_ids, dict(perceived.touched)) - set(perceived.world_from_object)
+    lost = disappeared_objects(perceived.object_ids, dict(perceived.interacted_frames)) - set(
+        perceived.world_from_object
+    )
     sure = steady(perceived.depth_m)
     new = _observed(perceived, sure, lost, fusion or Fusion())
     old = _moved(state, perceived, lost)
@@ -80,7 +82,7 @@ def _observed(
             continue
         seen = trusted & (perceived.object_ids == number)
         path = perceived.world_from_object.get(number)
-        if path is None and number in perceived.touched:
+        if path is None and number in perceived.interacted_frames:
             seen = _last_view(seen)  # it moved, but how is not known
         cameras = perceived.cameras if path is None else beside(perceived.cameras, path)
         depth = np.where(seen, perceived.depth_m, 0).astype(np.float32)

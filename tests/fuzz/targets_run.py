@@ -59,7 +59,7 @@ def _make_perceived(folder: Path) -> None:
         object_ids=rng.integers(0, 3, (FRAMES, *SIZE)).astype(np.int32),
         names={1: "cup", 2: "lid"},
         world_from_object={1: np.tile(np.eye(4), (FRAMES, 1, 1))},
-        touched={1: np.array([True, False])},
+        interacted_frames={1: np.array([True, False])},
     )
     archive.save(folder / "perceived.npz", perceived)
 

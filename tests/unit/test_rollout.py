@@ -4,14 +4,14 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from egosim_jax.io.journal import Journal
-from egosim_jax.perception.oracle import oracle
+from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering.reference import draw_hands
 from egosim_jax.rollout import Rollout
 from egosim_jax.simulator import Simulator
@@ -37,20 +37,16 @@ def clips():
     return tuple(make_sequence(3, spec=SPEC, clips=2))
 
 
-@dataclass
-class SequenceOracle:
-    """The oracle of each clip in turn."""
-
-    truths: list = field(default_factory=lambda: [to_ground_truth(clip) for clip in clips()])
-
-    def __call__(self, clip, action, state):
-        return oracle(self.truths[state.step])(clip, action, state)
+def oracle(of=(0, 1)):
+    """The oracle of clips in that order."""
+    ground_truth = {step: to_ground_truth(clips()[number]) for step, number in enumerate(of)}
+    return OracleConfig().build(ground_truth)
 
 
 def simulator(**changes):
     parts = {
         "generator": paint_the_hands,
-        "perception": SequenceOracle(),
+        "perception": oracle(),
         "fps": SPEC.fps,
         "fusion": Fusion(voxel_m=0.006),
     }
@@ -138,7 +134,7 @@ def test_finished_phases_are_not_run_again(tmp_path):
     for broken in (False, True):
         parts = {
             "generator": Named(paint_the_hands, broken),
-            "perception": Named(SequenceOracle(), broken),
+            "perception": Named(oracle(), broken),
         }
         assert len(run(tmp_path, **parts)) == 2
 
@@ -161,7 +157,7 @@ def with_action(**changes):
         ({"actions": with_action(prompt="another caption")}, "action"),
         ({"actions": with_action(joints_m=to_action(clips()[0]).joints_m + 1e-6)}, "action"),
         ({"generator": noisier}, "generator"),
-        ({"perception": SequenceOracle(list(reversed(SequenceOracle().truths)))}, "perception"),
+        ({"perception": oracle(of=(1, 0))}, "perception"),
         ({"perception": None}, "perception"),
         ({"fusion": Fusion(voxel_m=0.007)}, "fusion"),
     ],

@@ -22,11 +22,12 @@ def clip():
 
 
 def test_step_does_not_change_the_state_it_is_given(clip):
-    from egosim_jax.perception.oracle import oracle
+    from egosim_jax.perception.oracle import OracleConfig
     from egosim_jax.worlds.tabletop import to_ground_truth
 
     before = {f.name: np.array(getattr(clip.state, f.name)) for f in fields(clip.state)}
-    simulator = Simulator(generator=copy_the_view, perception=oracle(to_ground_truth(clip)), fps=8)
+    oracle = OracleConfig().build({0: to_ground_truth(clip)})
+    simulator = Simulator(generator=copy_the_view, perception=oracle, fps=8)
     step = simulator.step(clip.state, to_action(clip), seed=0)
     assert step.state.step == clip.state.step + 1
     for name, value in before.items():

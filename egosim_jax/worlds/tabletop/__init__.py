@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import finer, look_at, pixel_rays, transform
-from egosim_jax.perception.oracle import Truth
+from egosim_jax.perception.oracle import motions_of
+from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.reference import draw_hands, render
 from egosim_jax.types import Action, Cameras, Kind, SceneState, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import actions
@@ -241,13 +242,13 @@ def to_action(clip: TabletopClip) -> Action:
     return Action(cameras=clip.cameras, joints_m=clip.joints_m, kind=clip.kind, prompt=clip.caption)
 
 
-def to_ground_truth(clip: TabletopClip) -> Truth:
-    """Return the ground truth that perception is compared with."""
+def to_ground_truth(clip: TabletopClip) -> Observation:
+    """Return the ground truth of a clip, in the form that perception gives it."""
     ids = np.where(clip.ids >= FIRST_HAND, FIRST_HAND - 1 - clip.ids, clip.ids)
-    return Truth(
+    return Observation(
         cameras=clip.cameras,
         depth_m=clip.depth_m,
         object_ids=np.where((ids > 0) & (ids < FIRST_BODY), 0, ids).astype(np.int32),
         names=clip.state.names,
-        world_from_body={clip.body_ids[n]: path for n, path in clip.world_from_body.items()},
+        motions=motions_of({clip.body_ids[n]: p for n, p in clip.world_from_body.items()}),
     )

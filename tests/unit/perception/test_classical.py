@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from egosim_jax.geometry import transform
-from egosim_jax.perception.classical import Classical, flesh
-from egosim_jax.perception.oracle import oracle
+from egosim_jax.perception.classical import ClassicalConfig, HandMasks, hand_silhouette
+from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Clip, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
@@ -24,17 +24,17 @@ def clip(request):
 
 @pytest.fixture(scope="module")
 def found(clip):
-    return Classical()(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
+    return ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
 
 
-def test_the_thing_that_was_carried_is_found(clip, found):
+def test_the_object_that_was_carried_is_found(clip, found):
     assert set(found.world_from_object) == {clip.body_ids[clip.target]}
 
 
 def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
     target = clip.body_ids[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float)
-    true = oracle(to_ground_truth(clip))(
+    true = OracleConfig().build({0: to_ground_truth(clip)})(
         Clip(frames=clip.frames, fps=8), to_action(clip), clip.state
     )
     here = transform(found.world_from_object[target][-1], points)
@@ -55,8 +55,9 @@ def test_what_agrees_with_the_state_stays_unknown(clip, found):
     assert np.isfinite(found.depth_m).mean() < 0.1
 
 
-def test_flesh_covers_the_hands(clip):
-    covered = flesh(to_action(clip)) >= 0
+def test_the_silhouettes_cover_the_hands(clip):
+    action = to_action(clip)
+    covered = hand_silhouette(action.joints_m, action.kind, action.cameras, HandMasks()) >= 0
     hands = clip.ids >= FIRST_HAND
     assert (covered & hands).sum() / hands.sum() > 0.9
     assert covered.mean() < 3 * hands.mean()
@@ -68,7 +69,7 @@ def test_a_clip_in_which_nothing_moves_changes_nothing(clip):
     action = to_action(clip)
     poses = np.repeat(cameras.world_from_camera[:1], SPEC.frames, axis=0)
     action = replace(action, cameras=replace(cameras, world_from_camera=poses))
-    found = Classical()(Clip(frames=still, fps=8), action, clip.state)
+    found = ClassicalConfig().build()(Clip(frames=still, fps=8), action, clip.state)
     assert not found.world_from_object
     after = fuse(clip.state, found)
     assert len(after.points_m) == len(clip.state.points_m)
@@ -77,7 +78,7 @@ def test_a_clip_in_which_nothing_moves_changes_nothing(clip):
 def test_without_hands_nothing_is_found(clip):
     action = to_action(clip)
     missing = replace(action, joints_m=np.full_like(action.joints_m, np.nan))
-    found = Classical()(Clip(frames=clip.frames, fps=8), missing, clip.state)
+    found = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), missing, clip.state)
     assert not found.world_from_object
     assert not np.isfinite(found.depth_m).any()
 
@@ -87,7 +88,7 @@ def test_of_two_hands_on_one_thing_one_moved_it(clip, found):
     action = to_action(clip)
     beside = action.joints_m + [0.02, 0, 0]
     both = replace(action, joints_m=np.concatenate([beside, action.joints_m], axis=1))
-    twice = Classical()(Clip(frames=clip.frames, fps=8), both, clip.state)
+    twice = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), both, clip.state)
     assert twice.world_from_object.keys() == found.world_from_object.keys()
     target = clip.body_ids[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float).mean(axis=0)

@@ -1,4 +1,4 @@
-"""The oracle tells the truth, in the state's coordinates; archives keep it."""
+"""The oracle returns the ground truth in the state's coordinates; archives store it."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.geometry import look_at
 from egosim_jax.perception import archive
-from egosim_jax.perception.oracle import oracle
+from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.types import Clip, InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
 
@@ -17,12 +17,16 @@ def clips():
     return list(make_sequence(3, spec=VideoSpec(frames=5, height=48, width=80, fps=8), clips=2))
 
 
+def oracle(clip):
+    return OracleConfig().build({clip.number: to_ground_truth(clip)})
+
+
 def asked(clip):
     return Clip(frames=clip.frames, fps=8), to_action(clip), clip.state
 
 
 def test_hands_are_negative_and_the_room_is_background(clips):
-    found = oracle(to_ground_truth(clips[0]))(*asked(clips[0]))
+    found = oracle(clips[0])(*asked(clips[0]))
     assert found.object_ids.min() < 0
     known = set(np.unique(found.object_ids[found.object_ids > 0]).tolist())
     assert known <= set(clips[0].state.names)
@@ -34,7 +38,7 @@ def test_paths_begin_at_the_pose_in_the_state(clips):
     target = clip.body_ids[clip.target]
     before = look_at(np.ones(3), np.zeros(3), up=np.array([0, 0, 1.0]))
     state = replace(clip.state, world_from_object={target: before})
-    found = oracle(to_ground_truth(clip))(Clip(frames=clip.frames, fps=8), to_action(clip), state)
+    found = oracle(clip)(Clip(frames=clip.frames, fps=8), to_action(clip), state)
     assert set(found.world_from_object) == {target}
     path, truth = found.world_from_object[target], clip.world_from_body[clip.target]
     np.testing.assert_allclose(path[0], before, atol=1e-12)
@@ -44,24 +48,36 @@ def test_paths_begin_at_the_pose_in_the_state(clips):
 
 def test_a_clip_of_another_size_is_refused(clips):
     small = Clip(frames=clips[0].frames[:, ::2], fps=8)
-    with pytest.raises(InputError, match="Perception gave depth"):
-        oracle(to_ground_truth(clips[0]))(small, to_action(clips[0]), clips[0].state)
+    with pytest.raises(InputError, match="ReadGroundTruth returned depth_m"):
+        oracle(clips[0])(small, to_action(clips[0]), clips[0].state)
 
 
 def test_an_archive_keeps_everything(clips, tmp_path):
-    found = oracle(to_ground_truth(clips[1]))(*asked(clips[1]))
-    found = replace(found, touched={10: np.array([False, True, True, False, False])})
+    found = oracle(clips[1])(*asked(clips[1]))
+    found = replace(found, interacted_frames={10: np.array([False, True, True, False, False])})
     archive.save(tmp_path / "perceived.npz", found)
     again = archive.load(tmp_path / "perceived.npz")
     for name in ("frames", "depth_m", "object_ids"):
         np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
-    for name in ("world_from_object", "touched"):
+    for name in ("world_from_object", "interacted_frames"):
         one, other = getattr(again, name), getattr(found, name)
         assert one.keys() == other.keys()
         for number in one:
             np.testing.assert_array_equal(one[number], other[number])
     np.testing.assert_array_equal(again.cameras.world_from_camera, found.cameras.world_from_camera)
     assert (again.step, again.names) == (found.step, found.names)
+
+
+def test_an_archive_that_calls_interactions_touched_is_read(clips, tmp_path):
+    found = oracle(clips[1])(*asked(clips[1]))
+    found = replace(found, interacted_frames={10: np.array([False, True, True, False, False])})
+    archive.save(tmp_path / "new.npz", found)
+    with np.load(tmp_path / "new.npz") as file:
+        old = {name.replace("interacted_", "touched_"): file[name] for name in file.files}
+    assert {"touched_ids", "touched_frames"} < old.keys()
+    np.savez(tmp_path / "old.npz", **old)
+    again = archive.load(tmp_path / "old.npz")
+    np.testing.assert_array_equal(again.interacted_frames[10], found.interacted_frames[10])
 
 
 def test_a_file_that_is_no_archive_is_named(tmp_path):

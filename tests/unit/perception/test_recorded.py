@@ -10,7 +10,8 @@ import OpenEXR
 import pytest
 
 from egosim_jax.geometry import look_at, transform
-from egosim_jax.perception.recorded import IDS_A_STEP, Recorded
+from egosim_jax.perception import recorded
+from egosim_jax.perception.recorded import IDS_PER_STEP, RecordedConfig
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
 from tests.fuzz.mutations import BYTES
 
@@ -78,7 +79,7 @@ def write(folder: Path, *, scale=1.0, frames=FRAMES, depth=0.5):
 )
 def test_cameras_and_depth_come_into_the_world(tmp_path, alignment, scale):
     write(tmp_path, scale=scale)
-    found = Recorded(folder=tmp_path, name="clip", alignment=alignment).backends()(*asked())
+    found = RecordedConfig(folder=tmp_path, name="clip", alignment=alignment).build()(*asked())
     np.testing.assert_allclose(found.cameras.world_from_camera, path(), atol=1e-9)
     np.testing.assert_allclose(found.cameras.intrinsics_px, INTRINSICS)
     assert np.isinf(found.depth_m[:, 0, :2]).all()
@@ -87,64 +88,81 @@ def test_cameras_and_depth_come_into_the_world(tmp_path, alignment, scale):
 
 def test_hands_are_negative_and_things_have_numbers_of_their_step(tmp_path):
     write(tmp_path)
-    found = Recorded(folder=tmp_path, name="clip").backends()(*asked(step=2))
-    assert (found.object_ids[:, 2] == 3 * IDS_A_STEP + 1).all()
+    found = RecordedConfig(folder=tmp_path, name="clip").build()(*asked(step=2))
+    assert (found.object_ids[:, 2] == 3 * IDS_PER_STEP + 1).all()
     assert (found.object_ids[:, 3] < 0).all()
     assert (found.object_ids[:, 4] == 0).all()
-    assert found.names[3 * IDS_A_STEP + 1] == "red cup"
+    assert found.names[3 * IDS_PER_STEP + 1] == "red cup"
     assert "left hand" not in found.names.values()
     assert found.step == 3
 
 
+def test_each_file_is_read_once(tmp_path, monkeypatch):
+    write(tmp_path)
+    opened = []
+
+    def counted(read):
+        return lambda path, *args, **options: opened.append(path) or read(path, *args, **options)
+
+    for name in ("read_arrays", "read_bytes", "open_regular"):
+        monkeypatch.setattr(recorded, name, counted(getattr(recorded, name)))
+    RecordedConfig(folder=tmp_path, name="clip").build()(*asked())
+    assert len(opened) == len(set(opened)) == 5
+
+
 def test_what_is_missing_or_damaged_is_named(tmp_path):
     write(tmp_path)
-    read = Recorded(folder=tmp_path, name="clip").backends()
+    read = RecordedConfig(folder=tmp_path, name="clip").build()
     (tmp_path / "depth" / "clip.zip").write_bytes(b"not an archive")
     with pytest.raises(InputError, match=r"clip\.zip is damaged"):
         read(*asked())
     (tmp_path / "pose" / "clip.npz").unlink()
-    with pytest.raises(InputError, match=r"pose/clip\.npz is not there"):
+    with pytest.raises(InputError, match=r"pose/clip\.npz is missing"):
         read(*asked())
 
 
 def test_another_number_of_frames_is_named(tmp_path):
     write(tmp_path, frames=4)
     with pytest.raises(InputError, match="is for 4 frames, the clip has 5"):
-        Recorded(folder=tmp_path, name="clip").backends()(*asked())
+        RecordedConfig(folder=tmp_path, name="clip").build()(*asked())
 
 
 def test_a_phrase_without_an_id_is_named(tmp_path):
     write(tmp_path)
     (tmp_path / "mask" / "clip.txt").write_text("red cup\n")
     with pytest.raises(InputError, match="`id: phrase`"):
-        Recorded(folder=tmp_path, name="clip").backends()(*asked())
+        RecordedConfig(folder=tmp_path, name="clip").build()(*asked())
 
 
 def test_arrays_that_unpack_to_too_much_or_are_of_another_shape_are_refused(tmp_path):
     write(tmp_path)
-    recorded = Recorded(folder=tmp_path, name="clip")
+    read = RecordedConfig(folder=tmp_path, name="clip").build()
     path = tmp_path / "pose" / "clip.npz"
     np.savez_compressed(path, data=np.zeros((3000, 3000)), inds=np.arange(FRAMES))
     with pytest.raises(InputError, match="too large"):
-        recorded.poses(*asked())
+        read(*asked())
     np.savez_compressed(path, data=np.zeros((FRAMES, 3, 3)), inds=np.arange(FRAMES))
     with pytest.raises(InputError, match="not finite numbers"):
-        recorded.poses(*asked())
+        read(*asked())
 
 
 @pytest.mark.parametrize("kind", ["depth", "mask"])
 def test_every_damaged_archive_of_pictures_is_refused_in_one_line(tmp_path, kind):
     write(tmp_path)
-    recorded, random = Recorded(folder=tmp_path, name="clip"), Random(0)
-    read = recorded.depth if kind == "depth" else recorded.segmentation
+    pipeline, random = RecordedConfig(folder=tmp_path, name="clip").build(), Random(0)
+    field = "depth_m" if kind == "depth" else "object_ids"
+
+    def read():
+        return getattr(pipeline(*asked()), field)
+
     path = tmp_path / kind / "clip.zip"
     whole = path.read_bytes()
-    want = read(*asked())
+    want = read()
     for _ in range(150):
         path.write_bytes(random.choice(BYTES)(whole, random))
         messages = []
         try:
-            np.testing.assert_array_equal(read(*asked()), want)
+            np.testing.assert_array_equal(read(), want)
         except InputError as error:
             messages.append(str(error))
         assert not any("\n" in message for message in messages)

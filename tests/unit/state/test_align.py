@@ -1,11 +1,11 @@
-"""Alignment against motions that are known, with wrong pairs among the right ones."""
+"""Alignment against known motions."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from egosim_jax.geometry import transform, umeyama
-from egosim_jax.state.align import align_cameras, align_points, refine
+from egosim_jax.state.align import align_cameras
 from egosim_jax.types import InputError
 
 
@@ -52,37 +52,15 @@ def test_the_scale_of_noisy_points_is_the_best_one():
         assert error(found) < error(other)
 
 
-def test_a_mirror_image_is_answered_with_a_rotation():
+def test_a_mirror_image_is_aligned_by_a_rotation():
     found = umeyama(cloud(), cloud() * [1, 1, -1])
     assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("points", [cloud(2), np.outer(np.arange(5.0), [1, 2, 3])])
-def test_too_few_points_or_points_in_line_are_refused(points):
-    with pytest.raises(InputError, match="three that are not in line"):
+def test_too_few_or_collinear_points_are_refused(points):
+    with pytest.raises(InputError, match="at least three that are non-collinear"):
         umeyama(points, points)
-
-
-@pytest.mark.parametrize(("freedom", "scale"), [("rigid", 1.0), ("similarity", 2.5)])
-def test_a_third_of_wrong_pairs_changes_nothing(freedom, scale):
-    truth, points = motion(scale), cloud(200)
-    targets = transform(truth, points)
-    wrong = np.random.default_rng(4).permutation(200)[:60]
-    targets[wrong] += np.random.default_rng(5).uniform(0.5, 2, (60, 3))
-    found = align_points(points, targets, freedom=freedom, tolerance_m=0.01)
-    np.testing.assert_allclose(found, truth, atol=1e-10)
-
-
-def test_pairs_that_agree_on_nothing_are_refused():
-    with pytest.raises(InputError, match="No motion brings half of 40 points"):
-        align_points(cloud(), cloud(seed=9), tolerance_m=0.01)
-
-
-def test_points_that_are_not_finite_are_named():
-    points = cloud()
-    points[7, 1] = np.nan
-    with pytest.raises(InputError, match="Row 7 is not finite"):
-        align_points(points, cloud(), tolerance_m=0.01)
 
 
 def cameras(count=6):
@@ -107,15 +85,8 @@ def test_one_camera_is_enough_for_a_rigid_alignment_and_leaves_the_scale_at_one(
     np.testing.assert_allclose(found, truth, atol=1e-10)
 
 
-def test_refinement_ends_on_the_surface():
-    truth, points = motion(), cloud(500)
-    off = np.eye(4)
-    off[:3, :3] = Rotation.from_rotvec([0.01, -0.02, 0.01]).as_matrix()
-    off[:3, 3] = [0.01, 0.01, -0.01]
-    found = refine(points, transform(truth, points), start=off @ truth, radius_m=0.1)
-    np.testing.assert_allclose(found, truth, atol=1e-6)
-
-
-def test_refinement_from_too_far_is_refused():
-    with pytest.raises(InputError, match="too far off"):
-        refine(cloud(), cloud() + 100, start=np.eye(4), radius_m=0.1)
+def test_a_camera_that_is_not_finite_is_named():
+    poses = cameras()
+    poses[4, 1] = np.nan
+    with pytest.raises(InputError, match="Camera pose 4 is not finite"):
+        align_cameras(poses, cameras())

@@ -53,7 +53,7 @@ def perceived(plates, *, x=0.0, step=1, **changes):
         "object_ids": ids,
         "names": {1: "plate"},
         "world_from_object": {},
-        "touched": {},
+        "interacted_frames": {},
     }
     return Perceived(**{**whole, **changes})
 
@@ -165,18 +165,18 @@ def test_its_back_that_no_frame_shows_moves_with_it():
 
 
 def test_a_thing_that_moved_unseen_leaves_no_ghost():
-    """It is touched, nothing says how it moved: it is where it was seen last."""
+    """It was interacted with and not tracked: it is where it was seen last."""
     _, plates = path()
-    touched = np.array([False, True, True, True, False, False])
-    state = fuse(start(), perceived(plates, touched={1: touched}), fusion=COARSE)
+    interacted = np.array([False, True, True, True, False, False])
+    state = fuse(start(), perceived(plates, interacted_frames={1: interacted}), fusion=COARSE)
     assert at(state, HERE, lower=0.015) == 0
     assert at(state, THERE) > 100
 
 
 def test_a_thing_that_was_carried_away_is_gone():
     plates = [HERE, HERE, None, None, None, None]
-    touched = np.array([False, True, True, False, False, False])
-    state = fuse(start(), perceived(plates, touched={1: touched}), fusion=COARSE)
+    interacted = np.array([False, True, True, False, False, False])
+    state = fuse(start(), perceived(plates, interacted_frames={1: interacted}), fusion=COARSE)
     assert at(state, HERE) == 0
     assert not (state.object_ids == 1).any()
 
@@ -209,13 +209,13 @@ def test_a_thing_that_leaves_the_view_is_where_it_was_carried():
     assert at(state, HERE + aside) > 100
 
 
-@pytest.mark.parametrize("how", ["tracked", "touched", "neither"])
+@pytest.mark.parametrize("how", ["tracked", "interacted", "neither"])
 def test_an_empty_mask_where_depth_sees_through_takes_the_thing_away(how):
     """No pixel is the thing's, and the table is seen where it was and where it should be now."""
     poses, _ = path()
     moved = {
         "tracked": {"world_from_object": {1: poses}},
-        "touched": {"touched": {1: np.arange(FRAMES) < 3}},
+        "interacted": {"interacted_frames": {1: np.arange(FRAMES) < 3}},
         "neither": {},
     }[how]
     state = fuse(start(), perceived([None] * FRAMES, **moved), fusion=COARSE)
@@ -280,7 +280,7 @@ def test_a_hundred_steps_do_not_make_it_grow():
             object_ids=np.zeros((2, 12, 16), np.int32),
             names={},
             world_from_object={},
-            touched={},
+            interacted_frames={},
         )
         state = fuse(state, clip, fusion=COARSE)
         sizes.append(len(state.points_m))

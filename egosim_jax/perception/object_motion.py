@@ -1,0 +1,244 @@
+"""Motion of held objects, found by analysis by synthesis: the one that explains the colors best.
+
+An object that was grasped moves with the hand. Candidates are every object that a fingertip comes
+near, every pair of frames in which it may have been grasped and released, and three couplings to
+the palm: translation only, translation with rotation about the normal of the supporting surface,
+and the full rigid motion. The cost of a candidate is the mean difference between the object's
+colors and those of the clip where it would be visible. The end of the best candidate is then
+refined by `pose_refinement`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from egosim_jax.geometry import invert, pixels_of, transform, umeyama
+from egosim_jax.perception.pipeline import Observation
+from egosim_jax.perception.pose_refinement import (
+    ColorCost,
+    ObjectModel,
+    ObjectMotion,
+    Refinement,
+    refine_pose,
+)
+from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState
+
+PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
+"""Joints that move as one rigid body: wrist and knuckles; all of a gripper."""
+TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
+"""Joints that grasp: thumb, index and middle finger; both jaws of a gripper."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackObjects:
+    """Stage that sets the motions of held objects, their supporting planes and when they moved."""
+
+    reach_m: float = 0.06
+    """An object is a candidate if a fingertip comes this near to it, in meters."""
+    min_points: int = 30
+    """Fewest points of an object, and of a surface around it."""
+    compared_points: int = 150
+    """About how many points of an object are compared in a trial."""
+    min_visible: float = 0.2
+    """Smallest visible fraction of the compared points."""
+    max_cost_ratio: float = 0.8
+    """A motion is accepted if its cost is at most this fraction of the cost of resting."""
+    min_improvement: float = 5.0
+    """A motion is accepted if it costs less than resting by this much, in 8-bit levels."""
+    prompt_prior: float = 0.9
+    """Factor on the costs of an object that the prompt names."""
+    plane_tolerance_m: float = 0.006
+    """Inlier distance of the supporting plane in meters."""
+    plane_radius_m: float = 0.15
+    """Points within this distance of the object's center determine its plane, in meters."""
+    blur_px: float = 0.7
+    """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
+    color: ColorCost = field(default_factory=ColorCost)
+    """Comparison of colors."""
+    refinement: Refinement = field(default_factory=Refinement)
+    """Refinement of the object's last pose."""
+
+    def __call__(
+        self, clip: Clip, action: Action, state: SceneState, so_far: Observation
+    ) -> Observation:
+        """Set `motions`, `support_planes` and `interacted_frames`; pixels of hands are ignored."""
+        cameras, joints, ids = (
+            so_far.require(name, "TrackObjects") for name in ("cameras", "joints_m", "object_ids")
+        )
+        action = replace(action, cameras=cameras, joints_m=joints)
+        moved = estimate_object_motion(clip, action, state, ids < 0, self)
+        frames = np.arange(len(clip.frames))
+        return replace(
+            so_far,
+            motions={m.model.number: m.path for m in moved},
+            support_planes={m.model.number: m.model.plane for m in moved},
+            interacted_frames={
+                m.model.number: (frames >= m.grasped) & (frames <= m.released) for m in moved
+            },
+        )
+
+
+def estimate_object_motion(
+    clip: Clip,
+    action: Action,
+    state: SceneState,
+    hidden: Bool[np.ndarray, "f h w"],
+    config: TrackObjects,
+) -> list[ObjectMotion]:
+    """Return the motion of the object that each hand moved, if any.
+
+    An object claimed by two hands goes to the one that explains the colors better. `hidden` are the
+    pixels that hands cover. A hand that is missing in any frame is ignored.
+    """
+    shown = _smooth(clip.frames, config.blur_px)
+    found: dict[int, ObjectMotion] = {}
+    for hand in range(action.joints_m.shape[1]):
+        joints = action.joints_m[:, hand]
+        if np.isfinite(joints).all():
+            best = _best(joints, action, state, shown, hidden, config)
+            if best is not None:
+                best = refine_pose(
+                    best, action.cameras, state, shown, hidden, config.refinement, config.color
+                )
+                before = found.get(best.model.number)
+                if before is None or best.cost < before.cost:
+                    found[best.model.number] = best
+    return list(found.values())
+
+
+def _best(
+    joints_m: Float[np.ndarray, "f j 3"],
+    action: Action,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    config: TrackObjects,
+) -> ObjectMotion | None:
+    """Return the cheapest accepted candidate of one hand."""
+    best: ObjectMotion | None = None
+    for number in _near_tips(joints_m, action.kind, state, config):
+        model = _object_model(number, state, config)
+        name = state.names.get(number, "").lower()
+        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
+        still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
+        rest = _cost(model, still, action.cameras, shown, hidden, config)
+        least = min(config.max_cost_ratio * rest, rest - config.min_improvement)
+        for grasped, released, path in _paths(joints_m[:, PALM[action.kind]], model.plane[:3]):
+            cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
+            if cost < least and (best is None or cost < best.cost):
+                best = ObjectMotion(
+                    model=model, grasped=grasped, released=released, path=path, cost=cost
+                )
+    return best
+
+
+def _near_tips(
+    joints_m: Float[np.ndarray, "f j 3"], kind: Kind, state: SceneState, config: TrackObjects
+) -> list[int]:
+    """Return the ids of the objects that a fingertip comes near."""
+    tips = joints_m[:, TIPS[kind]].reshape(-1, 3)
+    near = []
+    for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
+        points = state.points_m[state.object_ids == number]
+        if len(points) >= config.min_points:
+            some = points[:: max(1, len(points) // config.compared_points)]
+            gaps = np.linalg.norm(tips[:, None] - some[None], axis=-1)
+            if gaps.min() <= config.reach_m:
+                near.append(number)
+    return near
+
+
+def _object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
+    """Return the model of an object; without a surface around it, its plane faces up."""
+    own = state.object_ids == number
+    points = state.points_m[own].astype(float)
+    return ObjectModel(
+        number=number,
+        points_m=points,
+        colors=state.colors[own].astype(np.float32),
+        plane=_support_plane(points, state.points_m[~own], config),
+    )
+
+
+def _support_plane(
+    points_m: Float[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], config: TrackObjects
+) -> Float[np.ndarray, " 4"]:
+    """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC)."""
+    import open3d as o3d
+
+    distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
+    near = others_m[distances < config.plane_radius_m]
+    if len(near) < config.min_points:
+        return np.array([0.0, 0.0, 1.0, np.nan])
+    o3d.utility.random.seed(0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
+    plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
+    return np.array(plane)
+
+
+def _paths(
+    palm_m: Float[np.ndarray, "f j 3"], normal: Float[np.ndarray, " 3"]
+) -> Iterator[tuple[int, int, Float[np.ndarray, "f 4 4"]]]:
+    """Yield frame of the grasp, frame of the release, and motion, for each of the couplings."""
+    rigid = np.stack([umeyama(palm_m[0], frame) for frame in palm_m])
+    center = palm_m.mean(axis=1)
+    upright, sliding = rigid.copy(), rigid.copy()
+    for frame, motion in enumerate(rigid):
+        upright[frame, :3, :3] = _twist(motion[:3, :3], normal)
+        sliding[frame, :3, :3] = np.eye(3)
+        for other in (upright, sliding):
+            other[frame, :3, 3] = center[frame] - other[frame, :3, :3] @ center[0]
+    frames = range(len(palm_m))
+    for grasped, released in product(frames, frames):
+        if released - grasped >= 2:
+            when = np.clip(frames, grasped, released)
+            for motion in (sliding, upright, rigid):
+                yield grasped, released, motion[when] @ invert(motion[grasped])
+
+
+def _twist(
+    rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the part of a rotation that is about an axis (swing-twist decomposition)."""
+    import cv2
+
+    vector = cv2.Rodrigues(rotation)[0][:, 0]
+    half = np.linalg.norm(vector) / 2
+    along = np.sinc(half / np.pi) * (vector @ axis) / 2
+    return cv2.Rodrigues(2 * np.arctan2(along, np.cos(half)) * axis)[0]
+
+
+def _cost(
+    model: ObjectModel,
+    path: Float[np.ndarray, "f 4 4"],
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    config: TrackObjects,
+) -> float:
+    """Return the mean difference between the object's colors and the clip's where it projects.
+
+    Points behind a hand are ignored; infinite if too few are visible.
+    """
+    every = max(1, len(model.points_m) // config.compared_points)
+    points, colors = model.points_m[::every], model.colors[::every]
+    local = transform(invert(cameras.world_from_camera) @ path, points)
+    row, column, inside = pixels_of(cameras, local)
+    frame = np.broadcast_to(np.arange(len(path))[:, None], column.shape)
+    pixel = frame[inside], row[inside], column[inside]
+    visible = ~hidden[pixel]
+    if visible.sum() < config.min_visible * column.size:
+        return float("inf")
+    expected = np.broadcast_to(colors, (*column.shape, 3))[inside][visible]
+    return config.color.mean(shown[pixel][visible], expected)
+
+
+def _smooth(frames: UInt8[np.ndarray, "f h w 3"], sigma: float) -> Float32[np.ndarray, "f h w 3"]:
+    import cv2
+
+    return np.stack([cv2.GaussianBlur(f.astype(np.float32), (0, 0), sigma) for f in frames])

@@ -1,0 +1,141 @@
+"""Perception as a pipeline of stages over one growing record.
+
+A stage is called with the clip, the action, the state before the clip, and the observation so far;
+it returns the observation with its own fields added. So each stage sees the results of the stages
+before it: segmentation feeds tracking, tracking feeds depth. After the last stage the observation
+becomes a `Perceived`, which the state is updated with.
+
+A stage knows the generator's inputs and outputs, never the ground truth; the exception is `oracle`,
+for tests and upper bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, no_type_check, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32
+
+from egosim_jax.state.filter import interacted_frames
+from egosim_jax.types import Action, Cameras, Clip, InputError, Perceived, SceneState
+
+
+@runtime_checkable
+class Perception(Protocol):
+    """Reconstruction of a clip in 3D: any callable, for example a `Pipeline`."""
+
+    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
+        """Return everything read from the clip, in world coordinates."""
+        ...
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """Results of a pipeline's stages for one clip; None where no stage has run yet."""
+
+    cameras: Cameras | None = None
+    """Camera of every frame, in the world."""
+    joints_m: Float[np.ndarray, "f n j 3"] | None = None
+    """Hand joints in the world in meters; NaN where a hand is missing."""
+    object_ids: Int32[np.ndarray, "f h w"] | None = None
+    """Object instance of each pixel: 0 background, negative hands and arms, else the state's ids
+    where they are known."""
+    depth_m: Float32[np.ndarray, "f h w"] | None = None
+    """Depth along the camera's z axis in meters; infinite where unknown."""
+    motions: Mapping[int, Float[np.ndarray, "f 4 4"]] | None = None
+    """Rigid motion in the world of each tracked object, relative to its pose before the clip."""
+    support_planes: Mapping[int, Float[np.ndarray, " 4"]] | None = None
+    """Plane (a, b, c, d), a x + b y + c z + d = 0, on which each tracked object stood; d is NaN
+    where there is none."""
+    interacted_frames: Mapping[int, Bool[np.ndarray, " f"]] | None = None
+    """Frames in which hands acted on each object; only objects with at least one."""
+    names: Mapping[int, str] | None = None
+    """Names of object instances by id; those of the state need not be repeated."""
+
+    def require(self, field: str, needed_by: str) -> Any:
+        """Return a field; raise `InputError` naming it and who needs it where it is None."""
+        value = getattr(self, field)
+        if value is None:
+            raise InputError(
+                f"{needed_by} needs {field}, which no stage before it has set: add a stage to the "
+                f"pipeline that sets {field}."
+            )
+        return value
+
+    def finish(self, clip: Clip, state: SceneState) -> Perceived:
+        """Return the `Perceived` of a finished observation.
+
+        Raises `InputError` naming the first required field that no stage has set.
+        """
+        fields = ("cameras", "depth_m", "object_ids", "names", "motions", "interacted_frames")
+        found = {field: self.require(field, "Perceived") for field in fields}
+        depth_m, motions = found["depth_m"], found.pop("motions")
+        return Perceived(
+            step=state.step + 1,
+            frames=clip.frames,
+            world_from_object={
+                number: motion @ state.world_from_object.get(number, np.eye(4))
+                for number, motion in motions.items()
+            },
+            **{
+                **found,
+                "depth_m": np.where(np.isnan(depth_m), np.inf, depth_m).astype(np.float32),
+                "object_ids": found["object_ids"].astype(np.int32),
+            },
+        )
+
+
+@runtime_checkable
+class Stage(Protocol):
+    """One step of a perception pipeline: a function, or a frozen dataclass of its parameters."""
+
+    def __call__(
+        self, clip: Clip, action: Action, state: SceneState, so_far: Observation
+    ) -> Observation:
+        """Return the observation so far with this stage's fields added."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline:
+    """A perception that runs stages in order over one observation."""
+
+    stages: tuple[Stage, ...]
+
+    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
+        """Run the stages; return what they found, in world coordinates.
+
+        Raises `InputError` naming the stage whose depth or ids do not have one value per pixel, and
+        the field that a stage or `Perceived` needs and no stage has set.
+        """
+        so_far = Observation()
+        for stage in self.stages:
+            so_far = stage(clip, action, state, so_far)
+            _check_shapes(so_far, clip, stage)
+        return so_far.finish(clip, state)
+
+
+def find_interactions(
+    clip: Clip, action: Action, state: SceneState, so_far: Observation
+) -> Observation:
+    """Set `interacted_frames` from object ids, depth and names: a stage of any pipeline."""
+    ids, depth, names = (
+        so_far.require(field, "find_interactions") for field in ("object_ids", "depth_m", "names")
+    )
+    found = interacted_frames(ids, depth, {**state.names, **names})
+    return replace(so_far, interacted_frames=found)
+
+
+def _check_shapes(so_far: Observation, clip: Clip, stage: Stage) -> None:
+    shape = clip.frames.shape[:3]
+    for field in ("depth_m", "object_ids"):
+        value = getattr(so_far, field)
+        if value is not None and value.shape != shape:
+            name = getattr(stage, "__name__", type(stage).__name__)
+            raise InputError(
+                f"Perception stage {name} returned {field} of shape {value.shape} for a clip of "
+                f"shape {shape}: it must have one value per pixel of each frame."
+            )

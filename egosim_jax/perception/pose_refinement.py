@@ -1,0 +1,188 @@
+"""Refinement of an object's pose by comparing a rendering of it with the clip.
+
+The pose at the end of a motion is changed by small translations, and rotations about the normal of
+the supporting surface, as long as object and background, drawn together, come to look more like
+the clip (coordinate descent with shrinking steps).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from egosim_jax.geometry import beside, transform
+from egosim_jax.rendering.reference import splat
+from egosim_jax.state.fuse import widened
+from egosim_jax.types import Cameras, SceneState
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColorCost:
+    """Difference of colors under the light that makes it least: a held object may be in shadow."""
+
+    max_residual: float = 90.0
+    """Larger differences are clipped to this, in 8-bit levels."""
+    unknown_residual: float = 40.0
+    """Difference that counts where no color is predicted, in 8-bit levels."""
+    min_light: float = 0.45
+    """Least light on the object relative to the state's."""
+    max_light: float = 1.2
+    """Greatest light on the object relative to the state's."""
+
+    def mean(
+        self, shown: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
+    ) -> float:
+        """Return the mean difference in 8-bit levels; an expected color of NaN is unknown."""
+        strength = np.maximum((expected**2).sum(axis=1), 1)
+        light = np.clip((shown * expected).sum(axis=1) / strength, self.min_light, self.max_light)
+        gaps = np.sqrt(np.square(shown - light[:, None] * expected).mean(axis=1))
+        gaps = np.where(np.isnan(gaps), self.unknown_residual, gaps)
+        return float(np.minimum(gaps, self.max_residual).mean())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """Parameters of `refine_pose`."""
+
+    steps_m: tuple[float, ...] = (0.012, 0.006, 0.003)
+    """Translation step of each round in meters."""
+    steps_deg: tuple[float, ...] = (12.0, 6.0, 3.0)
+    """Rotation step of each round in degrees."""
+    min_frames: int = 3
+    """Fewest frames at the end of the clip that are compared."""
+    margin: float = 0.03
+    """Border around the object that is compared, as a fraction of the image width."""
+    point_px: int = 2
+    """Size of the drawn points in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectModel:
+    """An object instance of the state and the plane that supports it."""
+
+    number: int
+    """Id of the object instance."""
+    points_m: Float[np.ndarray, "n 3"]
+    colors: Float32[np.ndarray, "n 3"]
+    plane: Float[np.ndarray, " 4"]
+    """Supporting plane a x + b y + c z + d = 0; d is NaN where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectMotion:
+    """Motion of an object that a hand held between two frames."""
+
+    model: ObjectModel
+    grasped: int
+    """Frame of the grasp."""
+    released: int
+    """Frame of the release."""
+    path: Float[np.ndarray, "f 4 4"]
+    """Motion in the world relative to the pose before the clip, frame by frame."""
+    cost: float
+    """Mean difference of colors in 8-bit levels."""
+
+
+def refine_pose(
+    best: ObjectMotion,
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    config: Refinement,
+    color: ColorCost,
+) -> ObjectMotion:
+    """Return the motion with its end changed as far as that explains the clip better.
+
+    Unchanged where hands cover the object to the end.
+    """
+    frames = np.arange(len(best.path))[min(best.released, len(best.path) - config.min_frames) :]
+    scene = _Neighborhood.of(best, cameras, state, frames, shown, hidden, config)
+    if not scene.compared.any():
+        return best
+    share = np.clip(
+        (np.arange(len(best.path)) - best.grasped) / (best.released - best.grasped), 0, 1
+    )
+    change, least = np.zeros(4), scene.cost(best.path[frames], color)
+    for meters, degrees in zip(config.steps_m, config.steps_deg, strict=True):
+        steps = np.diag([meters, meters, meters, np.radians(degrees)])
+        improved = True
+        while improved:
+            improved = False
+            for step in (*steps, *-steps):
+                cost = scene.cost(perturb(best, change + step, share)[frames], color)
+                if cost < least:
+                    change, least, improved = change + step, cost, True
+    return replace(best, path=perturb(best, change, share))
+
+
+def perturb(
+    best: ObjectMotion, change: Float[np.ndarray, " 4"], share: Float[np.ndarray, " f"]
+) -> Float[np.ndarray, "f 4 4"]:
+    """Return the path with a share of a change applied at each frame.
+
+    The change is a translation in meters and an angle about the plane's normal in radians; the
+    rotation is about the object's center.
+    """
+    import cv2
+
+    center = transform(best.path, best.model.points_m.mean(axis=0)[None])[:, 0]
+    changes = np.repeat(np.eye(4)[None], len(best.path), axis=0)
+    for matrix, part, point in zip(changes, share, center, strict=True):
+        matrix[:3, :3] = cv2.Rodrigues(part * change[3] * best.model.plane[:3])[0]
+        matrix[:3, 3] = point + part * change[:3] - matrix[:3, :3] @ point
+    return changes @ best.path
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Neighborhood:
+    """Pixels around an object's end in some frames, and the background behind it."""
+
+    model: ObjectModel
+    cameras: Cameras
+    shown: Float32[np.ndarray, "f h w 3"]
+    background: Float32[np.ndarray, "f h w 3"]
+    """Colors; NaN where the state has none."""
+    background_m: Float32[np.ndarray, "f h w"]
+    """Depth in meters; infinite where the state has none."""
+    compared: Bool[np.ndarray, "f h w"]
+    point_px: int
+
+    @classmethod
+    def of(
+        cls,
+        best: ObjectMotion,
+        cameras: Cameras,
+        state: SceneState,
+        frames: Int[np.ndarray, " g"],
+        shown: Float32[np.ndarray, "f h w 3"],
+        hidden: Bool[np.ndarray, "f h w"],
+        config: Refinement,
+    ) -> _Neighborhood:
+        """Return what is needed to compare poses near the path's."""
+        cameras = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
+        others = state.object_ids != best.model.number
+        depth, index = splat(state.points_m[others], cameras, point_px=config.point_px)
+        colors = state.colors[others].astype(np.float32)
+        background = np.append(colors, np.full((1, 3), np.nan, np.float32), axis=0)[index]
+        local = beside(cameras, best.path[frames])
+        _, drawn = splat(best.model.points_m, local, point_px=config.point_px)
+        return cls(
+            model=best.model,
+            cameras=cameras,
+            shown=shown[frames],
+            background=background,
+            background_m=depth,
+            compared=widened(drawn >= 0, config.margin) & ~hidden[frames],
+            point_px=config.point_px,
+        )
+
+    def cost(self, path: Float[np.ndarray, "f 4 4"], color: ColorCost) -> float:
+        """Return the mean difference between the clip and a rendering with the object there."""
+        local = beside(self.cameras, path)
+        depth, index = splat(self.model.points_m, local, point_px=self.point_px)
+        nearer = (index >= 0) & (depth < self.background_m)
+        drawn = np.where(nearer[..., None], self.model.colors[index], self.background)
+        return color.mean(self.shown[self.compared], drawn[self.compared])

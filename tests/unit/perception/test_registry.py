@@ -1,0 +1,81 @@
+"""Pipelines by name: configured from a command line, hashed into a run, extended by users."""
+
+import sys
+from dataclasses import FrozenInstanceError, dataclass
+
+import pytest
+
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.perception import Pipeline, registry
+from egosim_jax.types import InputError
+
+BUILT_IN = {"classical": "", "oracle": "", "recorded": " --folder x --name clip"}
+
+
+@pytest.fixture(autouse=True)
+def clean(monkeypatch):
+    for name in BUILT_IN:
+        registry.get(name)
+    monkeypatch.setattr(registry, "_CONFIGS", dict(registry._CONFIGS))
+
+
+@pytest.mark.parametrize(("name", "options"), BUILT_IN.items())
+def test_every_pipeline_is_built_from_a_command_line(name, options):
+    config = registry.parse(name + options)
+    assert isinstance(config, registry.get(name))
+    assert isinstance(config.build({}), Pipeline)
+    with pytest.raises(FrozenInstanceError):
+        config.anything = 1
+
+
+def test_each_threshold_is_an_option():
+    config = registry.parse("classical --motion.reach-m 0.05 --hands.discs 9")
+    assert (config.motion.reach_m, config.hands.discs) == (0.05, 9)
+
+
+def test_a_changed_threshold_changes_the_fingerprint_of_the_pipeline():
+    texts = ["classical", "classical --motion.color.max-residual 91", "classical --hands.discs 9"]
+    prints = [fingerprint(registry.parse(text).build()) for text in texts]
+    assert len(set(prints)) == 3
+    assert prints[0] == fingerprint(registry.parse("classical").build())
+
+
+def test_the_oracle_needs_ground_truth():
+    with pytest.raises(InputError, match="'oracle' needs ground truth"):
+        registry.parse("oracle").build()
+
+
+@pytest.mark.parametrize("text", ["clasical", "", "nowhere_to_be_found:mine"])
+def test_an_unknown_pipeline_is_named_with_those_that_exist(text):
+    with pytest.raises(InputError, match=r"classical, oracle, recorded|cannot be imported"):
+        registry.parse(text)
+
+
+def test_a_pipeline_of_a_user_is_found_by_name():
+    @registry.register("mine")
+    @dataclass(frozen=True, kw_only=True)
+    class MyConfig:
+        """Nothing but an example."""
+
+        threshold: float = 0.5
+
+        def build(self, ground_truth=None):
+            return Pipeline(stages=())
+
+    assert "mine" in registry.names()
+    assert registry.parse("mine --threshold 0.7") == MyConfig(threshold=0.7)
+
+
+def test_a_module_that_registers_a_pipeline_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "their_perception.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from egosim_jax.perception.registry import register\n"
+        "@register('theirs')\n"
+        "@dataclass(frozen=True)\n"
+        "class Theirs:\n"
+        "    size: int = 3\n"
+        "    def build(self, ground_truth=None): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert registry.parse("their_perception:theirs --size 4").size == 4
+    del sys.modules["their_perception"]
