@@ -1,10 +1,10 @@
-"""Where a run's numbers go: the console and metrics.jsonl always, other places on request."""
+"""Metric writers: the console, metrics.jsonl, TensorBoard and Weights & Biases."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.atomic import append_line
+from egosim_jax.io.renamed import upgrade_metrics
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted import read_lines
 from egosim_jax.types import InputError
@@ -19,19 +20,19 @@ from egosim_jax.types import InputError
 
 @runtime_checkable
 class Writer(Protocol):
-    """Something that takes a step's numbers."""
+    """The interface of a metric writer."""
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record `values` after `step` finished updates."""
+        """Write the metrics of `step`, the number of finished updates."""
         ...
 
     def close(self) -> None:
-        """Record what has not been yet."""
+        """Flush and release what the writer holds."""
         ...
 
 
 class Console:
-    """Numbers on stderr: a live line below the last ones on a terminal, plain lines otherwise."""
+    """Metrics on stderr: a live line with a progress bar on a terminal, plain lines otherwise."""
 
     def __init__(self, steps: int):
         from rich.console import Console as Terminal
@@ -45,7 +46,7 @@ class Console:
             self._live.start()
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Print the numbers; those of validations stay on a terminal."""
+        """Print the metrics; on a terminal only those of validations stay."""
         numbers = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         if self._live is None:
             print(f"step {step:>6}  {numbers}", file=sys.stderr, flush=True)
@@ -55,34 +56,34 @@ class Console:
             self._live.print(f"step {step:>6}  {numbers}")
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """End the live line."""
         if self._live is not None:
             self._live.stop()
 
 
 class JsonLines:
-    """One JSON object a line, appended; a resumed run first drops what it is going to repeat."""
+    """A file of one JSON object per line; a resumed run first drops the steps that it repeats."""
 
     def __init__(self, path: Path, *, resume_after: int = 0):
         self.path = path
         kept = []
         for number, line in read_lines(path) if path.exists() else ():
             if not isinstance(line, dict) or type(line.get("step")) is not int:
-                raise InputError(f"{path}, line {number} is of no step. Restore or remove it.")
+                raise InputError(f"{path}, line {number} has no step. Restore or remove it.")
             if line["step"] <= resume_after:
-                kept.append(json.dumps(line))
+                kept.append(json.dumps(upgrade_metrics(line)))
         write_text(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Append the numbers."""
+        """Append a line."""
         append_line(self.path, {"step": step, **values})
 
     def close(self) -> None:
-        """Nothing is left: every line is written at once."""
+        """Do nothing: every line is on disk."""
 
 
 class TensorBoard:
-    """Scalars for TensorBoard, by tensorboardX; a resumed run hides what it is going to repeat."""
+    """Scalars for TensorBoard, by tensorboardX; a resumed run hides the steps that it repeats."""
 
     def __init__(self, folder: Path, *, resume_after: int = 0):
         self._writer = _package("tensorboard").SummaryWriter(
@@ -90,19 +91,19 @@ class TensorBoard:
         )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Add a scalar for each number."""
+        """Add a scalar for each metric."""
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
     def close(self) -> None:
-        """Write out."""
+        """Flush the event file."""
         self._writer.close()
 
 
 class WandB:
-    """A run of Weights & Biases; its id lies in the run's folder, so that resuming goes on in it.
+    """A run of Weights & Biases, whose id in the run folder lets a resumed run continue it.
 
-    Where it goes and how one logs in is for W&B's own environment variables to say.
+    Server and login are configured by W&B's environment variables.
     """
 
     def __init__(self, folder: Path, *, project: str, name: str):
@@ -116,7 +117,7 @@ class WandB:
         )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Log the numbers."""
+        """Log the metrics."""
         self._run.log(dict(values), step=step)
 
     def close(self) -> None:
@@ -124,25 +125,8 @@ class WandB:
         self._run.finish()
 
 
-class Writers:
-    """Several writers as one."""
-
-    def __init__(self, writers: Sequence[Writer]):
-        self.writers = writers
-
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Pass the numbers on to each."""
-        for writer in self.writers:
-            writer.write(step, values)
-
-    def close(self) -> None:
-        """Close each."""
-        for writer in self.writers:
-            writer.close()
-
-
 EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}
-"""Places that need a package of an extra of the same name."""
+"""Packages of the writers that need an extra, by the extra's name."""
 
 
 def check_installed(extra: str) -> None:

@@ -1,10 +1,14 @@
-"""How a training is run: its settings, its optimizer, and what all recipes have in common."""
+"""Settings of a training: hyper-parameters, optimizer, the base of all recipes.
+
+The optimizer is optax's: a learning-rate schedule, gradient clipping, and AdamW or Muon.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
@@ -22,57 +26,60 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
-    """Update rule and learning rate."""
+    """Optimizer, learning-rate schedule and guard against bad gradients."""
 
-    rule: Literal["adamw", "muon"] = "adamw"
-    """`muon` orthogonalises the updates of matrices and convolutions and uses Adam for the rest."""
+    name: Literal["adamw", "muon"] = "adamw"
+    """Optimizer; `muon` orthogonalizes the updates of matrices and convolutions and uses Adam for
+    the rest."""
     learning_rate: float = 1e-5
     """Peak learning rate."""
-    warmup: int = 0
-    """Steps of linear warm-up from zero."""
-    decay: Literal["constant", "cosine"] = "constant"
-    """After the warm-up: constant, or a cosine down to a twentieth of the peak."""
+    warmup_steps: int = 0
+    """Updates of linear warm-up from zero."""
+    schedule: Literal["constant", "cosine"] = "constant"
+    """Learning rate after the warm-up: constant, or a cosine down to a twentieth of the peak."""
     weight_decay: float = 0.0
-    """Decoupled weight decay, on matrices and kernels alone."""
+    """Decoupled weight decay, of matrices and kernels only."""
     b1: float = 0.9
     """Adam's decay of the first moment."""
     b2: float = 0.999
     """Adam's decay of the second moment."""
-    clip: float = 1.0
-    """Largest global norm of the gradient."""
-    spike: float | None = None
-    """Leave an update out whose gradient is so many times as long as usual; None: none."""
-    average: float | None = None
-    """Decay of a moving average of the weights, for instance 0.9999, which is then what is
-    validated and kept; None: no average, which saves its memory."""
+    clip_grad_norm: float = 1.0
+    """Maximum global norm of the gradient, to which longer gradients are scaled."""
+    skip_grad_norm_factor: float | None = None
+    """Skip an update whose gradient norm exceeds this multiple of its running mean; None: skip
+    none."""
+    ema_decay: float | None = None
+    """Decay of the moving average of the weights (EMA), for instance 0.9999, which is then
+    validated and kept; None: no EMA, which saves its memory."""
 
     def __post_init__(self) -> None:
-        """Check that rates are positive, and that what limits or decays does."""
-        for name in ("learning_rate", "clip"):
+        """Check the range of each number."""
+        for name in ("learning_rate", "clip_grad_norm"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
-        if self.spike is not None and self.spike <= 1:
-            raise InputError(f"spike must be above 1, the usual length, not {self.spike}.")
-        if self.average is not None and not 0 < self.average < 1:
-            raise InputError(f"average must be between 0 and 1, not {self.average}.")
+        factor, decay = self.skip_grad_norm_factor, self.ema_decay
+        if factor is not None and factor <= 1:
+            raise InputError(f"skip_grad_norm_factor must be above 1, not {factor}.")
+        if decay is not None and not 0 < decay < 1:
+            raise InputError(f"ema_decay must be between 0 and 1, not {decay}.")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training:
-    """How long, how fast and how often."""
+class TrainConfig:
+    """Training hyper-parameters."""
 
     steps: int
-    """Updates in all."""
+    """Total number of updates."""
     batch_size: int = 32
     """Examples per update, over all devices."""
-    accumulate: int = 1
-    """Parts in which an update takes its batch, one after the other, to save memory."""
+    grad_accum_steps: int = 1
+    """Parts of a batch whose gradients are accumulated one after the other, to save memory."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    """Update rule and learning rate."""
+    """Optimizer and learning rate."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
-    """Layout of the devices."""
+    """Device mesh."""
     seed: int = 0
-    """Seed of the initial weights, the order of the data and the noise."""
+    """Seed of the initial weights, of the order of the data and of the noise."""
     log_every: int = 10
     """Updates between lines of the log."""
     save_every: int = 500
@@ -80,58 +87,71 @@ class Training:
     validate_every: int = 500
     """Updates between validations."""
     sample_every: int | None = None
-    """Updates between sample clips; None: none are made."""
+    """Updates between sample clips; None: no sample clips."""
     keep: int = 2
-    """Checkpoints to keep, the newest ones."""
+    """Number of newest checkpoints to keep."""
     keep_every: int | None = None
     """Also keep the checkpoints whose step is a multiple of this."""
     fallback: bool = False
-    """If the newest checkpoint is damaged, go on from the one before it."""
+    """If the newest checkpoint is damaged, resume from the one before it."""
     workers: int = 0
-    """Processes that prepare data; part of the data's order, so keep it when resuming."""
-    patience: float = 300.0
-    """Seconds without a finished step, and ten times what one takes, after which a run counts as
-    hung and ends with exit code 70."""
+    """Processes that load data. They determine the order of the data, so a resumed run needs the
+    same number."""
+    hang_timeout_s: float = 300.0
+    """Seconds without a finished update, if also ten times the usual, after which the run is
+    considered hung and exits with code 70."""
     tensorboard: bool = False
-    """Also write for TensorBoard, to OUT/tensorboard."""
+    """Also write metrics for TensorBoard, to OUT/tensorboard."""
     wandb: str | None = None
-    """Project of Weights & Biases to log to, too."""
+    """Project of Weights & Biases to log metrics to as well."""
 
     def __post_init__(self) -> None:
-        """Check that every count is positive and the seed in range."""
-        counts = ("steps", "batch_size", "accumulate", "log_every", "save_every", "validate_every")
-        optional = ("sample_every", "keep", "keep_every")
-        check_counts({name: getattr(self, name) for name in (*counts, *optional)})
+        """Check that every count is positive and that the seed is in range."""
+        counts = ("steps", "batch_size", "grad_accum_steps")
+        every = ("log_every", "save_every", "validate_every", "sample_every", "keep_every")
+        check_counts({name: getattr(self, name) for name in (*counts, *every, "keep")})
         check_seed(self.seed)
 
     def check_packages(self) -> None:
-        """Raise `InputError` if a place that numbers should go to needs a package to install."""
+        """Raise `InputError` if a metric writer needs a package that is not installed."""
         for extra in EXTRAS:
             if getattr(self, extra):
                 check_installed(extra)
 
 
-MAY_DIFFER = (
-    "mesh", "accumulate", "log_every", "save_every", "validate_every", "sample_every", "keep",
-    "keep_every", "fallback", "patience", "tensorboard", "wandb",
+RESUME_MUTABLE = (
+    "mesh", "grad_accum_steps", "log_every", "save_every", "validate_every", "sample_every", "keep",
+    "keep_every", "fallback", "hang_timeout_s", "tensorboard", "wandb",
 )  # fmt: skip
-"""Fields of `Training` that a resumed run may change: they do not change what is computed."""
-HOW_COMPUTED = tuple(f"task.model.dit.{name}" for name in ("dtype", "remat", "attention"))
-"""Fields of a task that change how it is computed."""
+"""Fields of `TrainConfig` that may change on resume: they do not affect the result."""
 
 
-def may_differ(*names: str) -> tuple[str, ...]:
-    """What a resumed run may change, in fields of these names that are a `Training`."""
-    return tuple(f"{name}.{free}" for name in names for free in MAY_DIFFER)
+def resume_mutable(*names: str) -> tuple[str, ...]:
+    """Return the dotted paths of `RESUME_MUTABLE` below fields of these names."""
+    return tuple(f"{name}.{free}" for name in names for free in RESUME_MUTABLE)
+
+
+def numerics_only(value: Any, path: str) -> Iterator[str]:
+    """Yield the dotted paths, below `path`, of fields that change only how values are computed.
+
+    They may change on resume, too. A config class lists its own in a class variable
+    `numerics_only`: dtype, rematerialization, kernel.
+    """
+    if is_dataclass(value):
+        yield from (f"{path}.{name}" for name in getattr(value, "numerics_only", ()))
+        for part in fields(value):
+            yield from numerics_only(getattr(value, part.name), f"{path}.{part.name}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe(ABC):
-    """A training that one command runs."""
+    """A training that one command runs, in one or several stages."""
 
+    out: Path | None = None
+    """Run folder."""
     preflight: str | None = None
-    """Train nothing, but compile each stage's update for a machine that need not be there, as in
-    h200:8, v5p:2x2x2 or cpu:1, and say whether it fits. Needs no other option."""
+    """Do not train. Compile each stage's update for a machine that need not be present, such as
+    h200:8, v5p:2x2x2 or cpu:1, and report whether it fits. Needs no other option."""
     json: bool = False
     """With --preflight: print JSON."""
     search: bool = True
@@ -139,7 +159,7 @@ class Recipe(ABC):
     minutes."""
 
     def run(self) -> int:
-        """Train, unless a preflight was asked for."""
+        """Train, or run the preflight, and return the exit code."""
         if self.preflight is None:
             for stage in self.stages().values():
                 stage.training.check_packages()
@@ -148,19 +168,26 @@ class Recipe(ABC):
 
         return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
 
+    def require(self, *names: str) -> list[Path]:
+        """Return paths that only a training needs. Raises `InputError` if one is not given."""
+        if missing := [name for name in names if getattr(self, name) is None]:
+            options = ", ".join(f"--{name}" for name in missing)
+            raise InputError(f"Missing {options}: required to train. Only --preflight needs none.")
+        return [getattr(self, name) for name in names]
+
     @abstractmethod
     def train(self) -> int:
-        """Train to the end, or go on."""
+        """Train to the end, resuming an interrupted run, and return the exit code."""
 
     @abstractmethod
     def stages(self) -> Mapping[str, Stage]:
-        """What is trained, by the names of the recipe's options."""
+        """Return the trainings by the names of the recipe's options."""
 
 
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
-    """The learning rate by finished updates."""
-    peak, warmup = config.learning_rate, config.warmup
-    if config.decay == "cosine":
+    """Return the learning rate as a function of the number of finished updates."""
+    peak, warmup = config.learning_rate, config.warmup_steps
+    if config.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(
             0.0 if warmup else peak, peak, warmup, max(steps, warmup + 1), end_value=peak / 20
         )
@@ -170,9 +197,9 @@ def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
-    """The transformation for a run of `steps` updates."""
+    """Return the optax transformation of a run of `steps` updates."""
     rate = learning_rate(config, steps)
-    if config.rule == "muon":
+    if config.name == "muon":
         rule = muon(
             rate,
             weight_decay=config.weight_decay,
@@ -189,7 +216,7 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
             weight_decay=config.weight_decay,
             mask=lambda params: _map(lambda leaf: _dimensions(leaf) is not None, params),
         )
-    return optax.chain(optax.clip_by_global_norm(config.clip), rule)
+    return optax.chain(optax.clip_by_global_norm(config.clip_grad_norm), rule)
 
 
 def _matrices(params: Any) -> Any:
@@ -197,7 +224,7 @@ def _matrices(params: Any) -> Any:
 
 
 def _dimensions(leaf: nnx.Variable) -> MuonDimensionNumbers | None:
-    """Inputs and outputs of a kernel `[layers?, ..., in, out]`, or None for anything else."""
+    """Return the input and output axes of a kernel `[layers?, ..., in, out]`; None for the rest."""
     if isinstance(leaf.get_value(), optax.MaskedNode):  # optax asks again for its own part
         return None
     axes = leaf.get_metadata().get("axes", ())

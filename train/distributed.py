@@ -1,12 +1,12 @@
-"""One process or many: every run has jax's coordination service, which is what hears SIGTERM.
+"""Processes of a run: one or many, all with jax's coordination service, which handles SIGTERM.
 
 Slurm, Open MPI and TPU pods are recognized by jax. Anywhere else, give every process
 
     JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
 
-and with none of these a process is on its own. The service has no authentication. With an address
-of this machine's loopback it listens there alone; with any other it listens on all interfaces, or
-on `JAX_COORDINATOR_BIND_ADDRESS`, and a firewall has to keep others out (docs/security.md).
+and with none of these a run has one process. The service has no authentication. With an address of
+this machine's loopback it listens on the loopback only; with any other it listens on all
+interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall (docs/security.md).
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ from jax._src import xla_bridge
 from egosim_jax.types import InputError
 
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+"""Environment variables that describe a run of several processes."""
 
 FOREVER_S = 10**8
-"""A process on its own may be suspended for long: nobody waits for its heartbeat."""
+"""Heartbeat timeout of a run of one process, which may be suspended for long, in seconds."""
 
 
 @contextmanager
-def joined() -> Iterator[None]:
-    """Join the other processes of the run, before any device is used; leave them at the end."""
+def distributed_context() -> Iterator[None]:
+    """Join the processes of the run before any device is used, and leave them at the end."""
     given = {name: os.environ[name] for name in NAMES if name in os.environ}
     if given:
         if missing := [name for name in NAMES if name not in given]:
             raise InputError(
                 f"{', '.join(given)} is set and {', '.join(missing)} is not: a run of several "
-                "processes needs all three, a run of one process none."
+                "processes needs all three variables, a run of one process none."
             )
         address, count, index = given.values()
         _check_numbers(count, index)
@@ -47,7 +48,7 @@ def joined() -> Iterator[None]:
         try:
             jax.distributed.initialize()
         except ValueError:  # no cluster
-            _initialize(own_address(), 1, 0)
+            _initialize(free_local_address(), 1, 0)
     try:
         yield
     finally:
@@ -55,11 +56,11 @@ def joined() -> Iterator[None]:
 
 
 def _initialize(address: str, count: int, index: int) -> None:
-    """Join the service at an address; on the loopback, neither it nor gloo listens elsewhere."""
+    """Join the service at an address; on the loopback, it and gloo listen on the loopback only."""
     bind = None
     if _is_loopback(address.rpartition(":")[0]):
         bind = address
-        # Else gloo listens where the machine's own name leads; jax has no public way to say it.
+        # Gloo would listen at the address of the hostname; jax has no public option for it.
         gloo = xla_bridge._jax.make_gloo_tcp_collectives
         xla_bridge._jax.make_gloo_tcp_collectives = partial(gloo, hostname="127.0.0.1")
     options: dict[str, Any] = {"coordinator_bind_address": bind}
@@ -69,7 +70,7 @@ def _initialize(address: str, count: int, index: int) -> None:
 
 
 def _is_loopback(host: str) -> bool:
-    """Return whether a host name or address is of this machine's loopback."""
+    """Return whether a host name or address belongs to the loopback."""
     host = host.strip("[]")
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
@@ -85,17 +86,17 @@ def _check_numbers(count: str, index: str) -> None:
         )
 
 
-def own_address() -> str:
-    """A free port of this machine, heard by it alone."""
+def free_local_address() -> str:
+    """Return a free port of the loopback, as host:port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"127.0.0.1:{free.getsockname()[1]}"
 
 
-def check_alone(recipe: str) -> None:
+def require_single_process(recipe: str) -> None:
     """Raise `InputError` in a run of several processes."""
     if jax.process_count() > 1:
         raise InputError(
-            f"{recipe} makes its data as it goes, in one process, not in {jax.process_count()}: it "
-            "is a small model. Several processes train on latents that were encoded before."
+            f"{recipe} makes its own data and trains in one process, not in {jax.process_count()}. "
+            "Several processes can only train on latents encoded before (egosim data encode)."
         )

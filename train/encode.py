@@ -1,11 +1,11 @@
-"""Encode clips once, so that training steps read latents and embeddings instead of videos.
+"""Encoding of clips, done once, so that updates read latents and embeddings instead of videos.
 
-Every window of a clip is a record of its own, since the causal VAE encodes a window's first frame
-alone. The windows are cut into parts of equal number. A part becomes one shard in a folder of its
-own, OUT/parts/00000, ..., which is whole or is not there; process p of n writes parts p, p + n, ...
-and leaves alone what is there already. When all parts are there, the first process renames their
-shards into OUT and writes the manifest. Its provenance names the config, the source's fingerprint
-and the hashes of the networks that made the arrays.
+Every window of a clip is a separate record, since the causal VAE encodes a window's first frame
+alone. The windows are split into parts of equal size. A part is written atomically as one shard in
+its folder, OUT/parts/00000, ...; process p of n writes parts p, p + n, ... and skips those that
+exist. When all parts exist, the first process renames their shards into OUT and writes the
+manifest. Its provenance names the config, the source's fingerprint and the hashes of the networks
+that made the arrays.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from egosim_jax.progress import track
 from egosim_jax.sharding import check_batch
 from egosim_jax.types import InputError, Triplet, check_counts
 
-MOST_PARTS = 100_000
-"""Shards whose names have five digits."""
-THREADS = min(8, os.cpu_count() or 1)
-"""Read clips while others are encoded."""
+MAX_PARTS = 100_000
+"""Maximum number of shards, whose names have five digits."""
+READ_THREADS = min(8, os.cpu_count() or 1)
+"""Threads that read clips while others are encoded."""
 
 Window = tuple[int, int]
-"""Record number and first frame."""
+"""Record number and first frame of a window."""
 
 
 class Encoding:
-    """Clips to the arrays of latents shards, on one device or on those of a mesh."""
+    """The encoding of clips to the arrays of latents records, on one device or on a mesh."""
 
     def __init__(self, config: ModelConfig, encoders: Networks, mesh: Mesh | None = None):
         self.config = config
         self._encode = Program(_encode, place(encoders, mesh), mesh=mesh)
 
     def __call__(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
-        """What training needs of each triplet.
+        """Return the arrays of each triplet's record.
 
-        With frozen encoders these are their embeddings; with joint ones, the encoders' inputs.
+        With frozen encoders they hold embeddings; with joint ones, the encoders' inputs.
         """
         inputs = Inputs.of(triplets, self.config)
         arrays = {"mask": inputs.mask, **self._encode(inputs, truths(triplets))}
@@ -69,9 +69,9 @@ class Encoding:
         return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
 
 
-def _encode(encoders: Networks, inputs: Inputs, truth: jax.Array) -> dict[str, jax.Array]:
-    """One video after the other, so that the VAE is compiled once and needs little memory."""
-    videos = jnp.stack([truth, jnp.asarray(inputs.prior), jnp.asarray(inputs.hands)])
+def _encode(encoders: Networks, inputs: Inputs, target: jax.Array) -> dict[str, jax.Array]:
+    """Encode one video after the other: the VAE is compiled once and needs little memory."""
+    videos = jnp.stack([target, jnp.asarray(inputs.prior), jnp.asarray(inputs.hands)])
     latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), videos)
     arrays = {"target": latents[0], "prior": latents[1], "hands": latents[2]}
     if encoders.text is not None:
@@ -82,12 +82,12 @@ def _encode(encoders: Networks, inputs: Inputs, truth: jax.Array) -> dict[str, j
 
 
 def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeStruct]:
-    """What a batch of records that were encoded for a model holds, before any are."""
+    """Return the shapes of a batch of a model's latents records."""
     inputs, video = Inputs.shapes(batch, config), config.video
-    truth = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
+    target = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
     graph, params = nnx.split(Networks.abstract(config, only=config.cached_networks))
     encoded = jax.eval_shape(
-        lambda params, *given: _encode(nnx.merge(graph, params), *given), params, inputs, truth
+        lambda params, *given: _encode(nnx.merge(graph, params), *given), params, inputs, target
     )
     given = {"mask": inputs.mask}
     if config.encoders == "joint":
@@ -96,16 +96,16 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
 
 
 def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
-    """Record number and first frame of every window of `frames` frames, `stride` apart.
+    """Return every window of `frames` frames, `stride` apart.
 
     Reads every record of encoded videos. Raises `InputError` if a clip is shorter than a window, or
-    if the records are no clips with their truth.
+    if the records are not clips with their target video.
     """
     manifest = source.manifest
     if manifest.kind == "latents" or "target" not in manifest.arrays:
         raise InputError(
-            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}: to be encoded "
-            "there must be videos or frames, with their truth. (--shards)"
+            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}; expected "
+            "videos or frames with their target. (--shards)"
         )
     known = manifest.arrays["prior"].shape[0] if manifest.kind == "frames" else None
     found = []
@@ -119,7 +119,7 @@ def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     return found
 
 
-def cache(
+def encode_shards(
     config: ModelConfig,
     folder: Path,
     *,
@@ -134,13 +134,13 @@ def cache(
     process_count: int | None = None,
     verb: str = "encoding",
 ) -> None:
-    """Write the latents shards of every window of `source`, or go on where a run was interrupted.
+    """Write the latents shards of every window of `source`, resuming an interrupted run.
 
-    `folder` holds the weights, of which `config.cached_networks` are read. Each batch is dealt out
-    over `mesh`, which holds devices of this process. All processes call this alike and have `out`
-    in common; it is whole when they return. `decoding` is recorded in the manifest; that of frames
-    was chosen when they were packed. Raises `InputError` if `out` was begun with another config,
-    source, stride or number of windows in a shard, or with other encoders.
+    `folder` holds the weights, of which `config.cached_networks` are read. Each batch is split over
+    `mesh`, which has devices of this process only. All processes call this with the same arguments
+    and share `out`, which is complete when they return. `decoding` is recorded in the manifest;
+    that of frames was chosen when they were packed. Raises `InputError` if `out` was started with
+    another config, source, stride or number of windows per shard, or with other encoders.
     """
     check_counts({"--stride": stride, "--batch-size": batch_size, "--shard-windows": shard_windows})
     if mesh is not None:
@@ -158,15 +158,15 @@ def cache(
     _open(
         out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
     )
-    _wait_for_all("opened")  # early, since what is shared first has to be shared soon
+    _wait_for_all("opened")  # early: the first collective must not come late
     if (out / MANIFEST).exists():
         shutil.rmtree(out / "parts", ignore_errors=True)
         return
     todo = list(batches(windows(source, frames=config.video.frames, stride=stride), shard_windows))
-    if len(todo) > MOST_PARTS:
+    if len(todo) > MAX_PARTS:
         raise InputError(
-            f"{len(todo)} shards of {shard_windows} windows are too many: there can be "
-            f"{MOST_PARTS}. (--shard-windows, --stride)"
+            f"{len(todo)} shards of {shard_windows} windows are too many: the maximum is "
+            f"{MAX_PARTS}. (--shard-windows, --stride)"
         )
     parts = [out / "parts" / f"{number:05d}" for number in range(len(todo))]
     missing = {
@@ -175,9 +175,8 @@ def cache(
         if not (parts[number] / MANIFEST).exists()
     }
     if missing:
-        encode = Encoding(
-            config, Networks.load(config, folder, only=config.cached_networks, mesh=mesh), mesh
-        )
+        networks = Networks.load(config, folder, only=config.cached_networks, mesh=mesh)
+        encode = Encoding(config, networks, mesh)
         progress = _write(encode, missing, source, batch_size, provenance, decoding)
         for _ in track(progress, verb, total=sum(map(len, missing.values()))):
             pass
@@ -192,21 +191,21 @@ def _packed_decoding(source: ShardReader, decoding: Decoding) -> Decoding:
     packed = source.manifest.provenance.get("decoding", "accurate")
     if decoding not in ("accurate", packed):
         raise InputError(
-            f"{source.folder} holds frames whose decoding is {quote(packed)}, not {decoding}. Pack "
-            "the clips again. (--decoding)"
+            f"{source.folder} holds frames decoded as {quote(packed)}, not {decoding}. Pack the "
+            "clips again. (--decoding)"
         )
     return packed
 
 
 def _open(out: Path, settings: Mapping[str, Any]) -> None:
     if (out / MANIFEST).exists() and not (out / "config.json").exists():
-        raise InputError(f"{out} already holds shards that were not encoded here. (--out)")
+        raise InputError(f"{out} already holds other shards. (--out)")
     open_folder(out, settings)
 
 
 def _wait_for_all(what: str) -> None:
     if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(f"cache {what}")
+        multihost_utils.sync_global_devices(f"encode {what}")
 
 
 def _write(
@@ -217,7 +216,7 @@ def _write(
     provenance: Mapping[str, Any],
     decoding: Decoding,
 ) -> Iterator[Window]:
-    """Write part after part; yields each window once it is encoded."""
+    """Write part after part, yielding each window once it is encoded."""
     jobs = [(part, batch) for part, todo in parts.items() for batch in batches(todo, batch_size)]
     spec = encode.config.video
     for part, group in groupby(_read(source, jobs, encode.config, decoding), key=itemgetter(0)):
@@ -241,8 +240,8 @@ def _read(
     config: ModelConfig,
     decoding: Decoding,
 ) -> Iterator[tuple[Path, list[Example]]]:
-    """The clips of each job, read while the one before is encoded."""
-    with ThreadPoolExecutor(THREADS) as pool:
+    """Yield the clips of each job, read while the job before is encoded."""
+    with ThreadPoolExecutor(READ_THREADS) as pool:
         before: tuple[Path, list[Future[Example]]] | None = None
         for part, batch in jobs:
             now = part, [pool.submit(_clip, source, window, config, decoding) for window in batch]
@@ -268,21 +267,21 @@ def _clip(source: ShardReader, window: Window, config: ModelConfig, decoding: De
 
 
 def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> None:
-    """Raise `InputError` unless latents shards were encoded for a model, by a weights folder's VAE.
+    """Raise `InputError` unless latents shards were encoded for a model, by the given weights.
 
-    Compares config and video with the manifest in `shards`, and the hashes of the networks that
-    encoded with those of the same networks in the folder, of which only the VAE must be there;
-    without a folder, config and video alone.
+    Compares config and video with the manifest in `shards`, and the hashes of the encoders with
+    those of the weights folder, in which only the VAE is required; without a folder, only config
+    and video.
     """
     manifest = read_manifest(shards)
     encoders = manifest.provenance.get("encoders")
     if manifest.kind != "latents" or not isinstance(encoders, Mapping) or "vae" not in encoders:
         raise InputError(
-            f"{shards} holds {manifest.kind} and does not say which encoders made them. Encode "
-            "again. (egosim data encode)"
+            f"{shards} holds {manifest.kind} without the hashes of their encoders. Encode again. "
+            "(egosim data encode)"
         )
     problems = [
-        f"{what}: the shards have {have}, this training {want}"
+        f"{what}: the shards have {have}, this training has {want}"
         for what, have, want in (
             ("config", manifest.provenance.get("config"), config.name),
             ("video", manifest.spec, config.video),
@@ -292,13 +291,13 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
     if weights is not None:
         ours = {"vae": "none", **hashes(weights, only=encoders)}
         problems += [
-            f"{name}: the shards have {str(encoders[name])[:16]}, {weights} {ours[name][:16]}"
+            f"{name}: the shards have {str(encoders[name])[:16]}, {weights} has {ours[name][:16]}"
             for name in sorted(encoders.keys() & ours.keys())
             if encoders[name] != ours[name]
         ]
     if problems:
         raise InputError(
             f"{shards} was not encoded for this training: {listing(problems)}. Encode again with "
-            "these weights (egosim data encode), or take those that it was encoded with. "
+            "these weights (egosim data encode), or use those that it was encoded with. "
             "(--weights)"
         )

@@ -1,4 +1,4 @@
-"""Training the denoiser of a large model further, on latents that `egosim data encode` made."""
+"""Fine-tuning: a denoiser of given weights, trained on latents that `egosim data encode` wrote."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from egosim_jax.command import DONE
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.models.wan.config import Remat
-from egosim_jax.train.config import Recipe, Training
+from egosim_jax.train.config import Recipe, TrainConfig
 from egosim_jax.train.update import Stage
+from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.networks import ModelConfig, Networks
@@ -20,45 +21,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class FineTuning(Recipe):
-    """Train a denoiser from weights, all of it or a LoRA, on cached latents.
+    """Train a denoiser from given weights, all of it or a LoRA, on cached latents.
 
-    Writes OUT/weights, a folder that is complete, or OUT/lora.safetensors; beside it the log,
-    checkpoints and sample clips. The same command, started again, resumes, on other devices, too.
+    Writes OUT/weights, a complete weights folder, or OUT/lora.safetensors, with the log,
+    checkpoints and sample clips. The same command resumes an interrupted run, also on other
+    devices.
     """
 
-    latents: Path
-    """Folder of latents shards."""
-    weights: Path
-    """Weights folder to start from; its encoders must be those that made the latents."""
-    out: Path
-    """Folder of the run."""
     config: str
     """Name of the model."""
-    training: Training
-    """How long, how fast and how often."""
+    training: TrainConfig
+    """Training hyper-parameters."""
+    latents: Path | None = None
+    """Folder of latents shards."""
+    weights: Path | None = None
+    """Weights folder to start from, with the encoders that the latents were encoded by."""
     validation: Path | None = None
-    """Folder of latents shards to validate on, and to make sample clips of."""
+    """Folder of latents shards to validate on, and to generate sample clips of."""
     rank: int | None = None
-    """Train a LoRA of this rank on the blocks' linear layers; the weights stay."""
+    """Rank of a LoRA, which is then trained instead of the weights."""
     times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
-    """How noise levels are drawn and weighted."""
+    """Distribution and weighting of the noise levels."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
-    """How often each condition is hidden."""
+    """Dropout rate of each condition."""
     remat: Remat | None = None
-    """What the backward pass computes again, if not what the model says."""
+    """Rematerialization in the backward pass, if not the model's."""
     attention: Kernel | None = None
     """Attention kernel, if not the model's."""
     dtype: Literal["float32", "bfloat16"] | None = None
-    """Dtype to compute in, if not the model's; weights and moments are float32 in any case."""
+    """Compute dtype, if not the model's; trained weights and moments are float32 in any case."""
     samples: int = 2
-    """Clips of the validation that are generated every `sample_every` updates."""
+    """Validation clips to generate every `sample_every` updates."""
 
     def stages(self) -> Mapping[str, Stage]:
-        """The denoiser's only."""
+        """Return the training of the denoiser."""
         from egosim_jax.diffusion.objective import Objective
         from egosim_jax.train.tasks.denoising import Denoising
 
-        model = self._model()
+        model = self.model()
         task = Denoising(
             model=model,
             objective=Objective(schedule=model.schedule, times=self.times),
@@ -68,41 +68,50 @@ class FineTuning(Recipe):
         return {"training": Stage(task, self.training)}
 
     def train(self) -> int:
-        """Check the latents, train, write the weights."""
+        """Check the latents, train, and write the weights."""
+        out, latents, weights = self.require("out", "latents", "weights")
         from egosim_jax.train.encode import check_encoders
         from egosim_jax.train.loop import train
         from egosim_jax.train.monitor import Samples
 
-        model = self._model()
-        for shards in (self.latents, self.validation):
+        model = self.model()
+        for shards in (latents, self.validation):
             if shards is not None:
-                check_encoders(shards, model, self.weights)
+                check_encoders(shards, model, weights)
         trained = train(
             *self.stages()["training"],
-            data=self.latents,
+            data=latents,
             validation=self.validation,
-            out=self.out,
-            weights=self.weights,
+            out=out,
+            weights=weights,
             samples=self.validation
-            and Samples(model=model, latents=self.validation, vae=self.weights, count=self.samples),
+            and Samples(model=model, latents=self.validation, vae=weights, count=self.samples),
         )
-        print(write_trained(trained, self.out, model=model, start=self.weights))
+        print(write_trained(trained, out, model=model, start=weights))
         return DONE
 
-    def _model(self) -> ModelConfig:
+    def model(self) -> ModelConfig:
+        """Return the model's config with the options of this recipe.
+
+        Raises `InputError` for an option that the model's denoiser does not have.
+        """
         from egosim_jax import configs
 
+        model = configs.get(self.config)
+        model = model if self.weights is None else model.at(self.weights)
         changes = {"remat": self.remat, "attention": self.attention, "dtype": self.dtype}
-        model = configs.get(self.config).at(self.weights)
         given = {name: value for name, value in changes.items() if value is not None}
+        if unknown := sorted(given.keys() - set(model.dit.numerics_only)):
+            options = ", ".join(f"--{name}" for name in unknown)
+            raise InputError(f"The denoiser of {model.name} has no {options}: omit it.")
         return replace(model, dit=replace(model.dit, **given))
 
 
 def write_trained(trained: Networks, out: Path, *, model: ModelConfig, start: Path) -> Path:
-    """Write OUT/lora.safetensors, if that was trained, or OUT/weights, which is then complete.
+    """Write OUT/lora.safetensors, if a LoRA was trained, or the complete OUT/weights.
 
-    `start` is the weights folder that a LoRA is for, or that has the networks that stayed. All
-    processes call this alike.
+    `start` is the weights folder that the LoRA belongs to, or that has the networks that were not
+    trained. All processes of the training call it with the same arguments.
     """
     import jax
 

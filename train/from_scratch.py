@@ -1,130 +1,246 @@
-"""A small model from nothing: the autoencoder, then the denoiser with its encoders on its latents.
+"""Training from scratch: a small model's autoencoder, then its denoiser with its encoders.
 
-Or from weights: then the autoencoder is theirs. Every stage lies in a folder of its own under the
-run's and resumes.
+    clips -> frames -> autoencoder -> latents -> denoiser and encoders -> weights
+
+Each stage has its own folder in the run folder, and resumes. With given weights the autoencoder is
+theirs and the denoiser is trained further.
 """
 
 from __future__ import annotations
 
+import os
+import sys
+from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from egosim_jax import configs
+from egosim_jax.command import DONE
 from egosim_jax.conditioning.dropout import ConditionDropout
-from egosim_jax.data.manifest import MANIFEST
-from egosim_jax.data.shards import ShardReader
-from egosim_jax.data.transforms import record_length
-from egosim_jax.diffusion.objective import Objective
-from egosim_jax.io import weights
-from egosim_jax.models import abstract
-from egosim_jax.models.wan.vae import WanVAE, standardise_latents
-from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.train.config import Training
-from egosim_jax.train.encode import cache
-from egosim_jax.train.loop import train
-from egosim_jax.train.tasks.autoencoding import Autoencoding, latent_statistics
-from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.progress import track
+from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
+from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.update import Stage
 
-BATCH = 8
+if TYPE_CHECKING:
+    from egosim_jax.models.wan.vae import WanVAE
+
+ENCODE_BATCH = 8
 """Clips that are encoded together."""
+SYNTHETIC_CLIPS = Path("clips") / "metadata.csv"
+"""Metadata of the synthetic clips, in the run folder."""
+FIRST_TRAINED = 1000
+"""Seed of the first tabletop scene to train on; those below are held out."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromScratch:
-    """The stages of a model that trains its own encoders."""
+class FromScratch(Recipe):
+    """Train a small model from random weights: its autoencoder, its denoiser and its encoders.
 
-    config: ModelConfig
-    """The model."""
-    frames: Mapping[str, Path]
-    """Folders of decoded clips: those to train on, `train`, and those to validate on, `test`."""
-    out: Path
-    """Folder of the run; the networks go to OUT/weights."""
-    vae: Training
-    """Training of the autoencoder."""
-    denoiser: Training
-    """Training of the denoiser and its encoders."""
+    Writes OUT/weights, with the shards, logs and checkpoints of each stage next to it.
+    """
+
+    config: str
+    """Name of the model, which must train its own encoders."""
+    vae: TrainConfig
+    """Hyper-parameters of the autoencoder's training."""
+    denoiser: TrainConfig
+    """Hyper-parameters of the training of the denoiser and its encoders."""
     crop: tuple[int, int] = (48, 64)
-    """Rows and columns of the pieces that the autoencoder is trained on."""
+    """Rows and columns in pixels of the crops that the autoencoder is trained on."""
     stride: int = 1
     """Frames between the windows of a clip that the denoiser is trained on."""
-    dtype: str = "float32"
-    """Of the weights that are written."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
-    """How often each condition is hidden from the denoiser."""
-    change: float = 0.0
-    """How much more a place counts for the denoiser where the clip is unlike its prior."""
+    """Dropout rate of each condition of the denoiser."""
+    change_loss_weight: float = 0.0
+    """Additional loss weight of the denoiser where the clip differs from its prior: at hands and at
+    what they move."""
+    weights_dtype: str = "float32"
+    """Dtype of the weights that are written."""
     weights: Path | None = None
-    """Weights folder to start from: its autoencoder stays, its denoiser is trained further."""
+    """Weights folder to start from: its autoencoder is kept, its denoiser is trained further."""
+
+    @abstractmethod
+    def frames(self, out: Path) -> Mapping[str, Path]:
+        """Make shards of decoded clips, `train` and `test`, in OUT, and return their folders."""
 
     def stages(self) -> Mapping[str, Stage]:
-        """The autoencoder's, unless it comes with the weights, and the denoiser's."""
-        # Pieces as long as the model's clips: a VAE that has only seen shorter ones drifts later.
-        vae = Autoencoding(vae=self.config.vae, video=self.config.video, crop=self.crop)
+        """Return the training of the denoiser, and that of the autoencoder unless it is given."""
+        from egosim_jax.diffusion.objective import Objective
+        from egosim_jax.train.tasks.autoencoding import Autoencoding
+        from egosim_jax.train.tasks.denoising import Denoising
+
+        model = configs.get(self.config)
+        # Crops as long as the model's clips: a VAE trained on shorter ones drifts afterwards.
+        vae = Autoencoding(vae=model.vae, video=model.video, crop=self.crop)
         denoiser = Denoising(
-            model=self.config,
-            objective=Objective(schedule=self.config.schedule),
+            model=model,
+            objective=Objective(schedule=model.schedule),
             dropout=self.dropout,
-            change=self.change,
+            change_loss_weight=self.change_loss_weight,
         )
         stages = {"vae": Stage(vae, self.vae), "denoiser": Stage(denoiser, self.denoiser)}
         return {name: stages[name] for name in stages if name == "denoiser" or not self.weights}
 
-    def run(self) -> Path:
-        """Autoencoder, latents, denoiser; the folder of the weights."""
-        networks = Networks.random(self.config, seed=0)
-        networks.vae = self._autoencoder()
-        latents = {split: self._encode(split) for split in self.frames}
+    def train(self) -> int:
+        """Make the clips, train stage after stage, and write the weights."""
+        (out,) = self.require("out")
+        from egosim_jax.io.run import open_folder
+        from egosim_jax.networks import Networks
+        from egosim_jax.train.loop import train
+
+        require_single_process(self.config)
+        mutable = [*resume_mutable("vae", "denoiser"), "preflight", "json", "search", "clips"]
+        open_folder(out, self, mutable=mutable)
+        frames = self.frames(out)
+        networks = Networks.random(configs.get(self.config), seed=0)
+        networks.vae = self._autoencoder(frames, out)
+        latents = {split: self._encode(split, frames[split], out) for split in frames}
         trained = train(
             *self.stages()["denoiser"],
             data=latents["train"],
             validation=latents["test"],
-            out=self.out / "denoiser",
+            out=out / "denoiser",
             weights=self.weights,
         )
         networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
-        networks.save(self.out / "weights", dtype=self.dtype)
-        return self.out / "weights"
+        networks.save(out / "weights", dtype=self.weights_dtype)
+        print(out / "weights")
+        return DONE
 
-    def _autoencoder(self) -> WanVAE:
-        """The VAE, trained, with latents of mean 0 and deviation 1."""
-        path = self.out / "weights" / "vae.safetensors"
-        vae = abstract(self.config.vae)
+    def _autoencoder(self, frames: Mapping[str, Path], out: Path) -> WanVAE:
+        """Return the trained VAE, with latents of mean 0 and standard deviation 1."""
+        from egosim_jax.io import weights
+        from egosim_jax.models import abstract
+
+        path = out / "weights" / "vae.safetensors"
+        vae = abstract(configs.get(self.config).vae)
         if not path.exists() and self.weights is not None:
             weights.load(self.weights / path.name, vae)
             weights.save(path, vae)
         elif not path.exists():
-            weights.save(path, self._train_autoencoder(), dtype=self.dtype)
-        # What was written is what encodes, in a run that was interrupted and in one that was not.
+            weights.save(path, self._train_autoencoder(frames, out), dtype=self.weights_dtype)
+        # The written weights encode, in a run that was interrupted and in one that was not.
         weights.load(path, vae)
         return vae
 
-    def _train_autoencoder(self) -> WanVAE:
+    def _train_autoencoder(self, frames: Mapping[str, Path], out: Path) -> WanVAE:
+        from egosim_jax.data.shards import ShardReader
+        from egosim_jax.models.wan.vae import standardise_latents
+        from egosim_jax.train.loop import train
+        from egosim_jax.train.tasks.autoencoding import latent_statistics
+
         vae = train(
             *self.stages()["vae"],
-            data=self.frames["train"],
-            validation=self.frames["test"],
-            out=self.out / "vae",
+            data=frames["train"],
+            validation=frames["test"],
+            out=out / "vae",
         )
-        videos = (record.arrays["target"] for record in ShardReader(self.frames["train"]))
+        videos = (record.arrays["target"] for record in ShardReader(frames["train"]))
         standardise_latents(vae, *latent_statistics(vae, videos))
         return vae
 
-    def _encode(self, split: str) -> Path:
-        """Cache the latents of every window of a split."""
-        out = self.out / "latents" / split
-        if not (out / MANIFEST).exists():
-            source = ShardReader(self.frames[split])
-            # To validate, a clip's first window and, if it is longer, its last.
-            last = record_length(source[0].arrays) - self.config.video.frames
-            every = self.stride if split == "train" else max(1, last)
-            cache(
-                self.config,
-                self.out / "weights",
+    def _encode(self, split: str, frames: Path, out: Path) -> Path:
+        """Encode every window of a split."""
+        from egosim_jax.data.manifest import MANIFEST
+        from egosim_jax.data.shards import ShardReader
+        from egosim_jax.data.transforms import record_length
+        from egosim_jax.train.encode import encode_shards
+
+        latents, model = out / "latents" / split, configs.get(self.config)
+        if not (latents / MANIFEST).exists():
+            source = ShardReader(frames)
+            # To validate: a clip's first window and, if the clip is longer, its last.
+            last = record_length(source[0].arrays) - model.video.frames
+            encode_shards(
+                model,
+                out / "weights",
                 source=source,
-                out=out,
-                stride=every,
-                batch_size=BATCH,
+                out=latents,
+                stride=self.stride if split == "train" else max(1, last),
+                batch_size=ENCODE_BATCH,
                 verb=f"encoding {split}",
             )
-        return out
+        return latents
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromClips(FromScratch):
+    """Train a small model from scratch on clips of a metadata file, or on a few synthetic ones."""
+
+    metadata: Path | None = None
+    """CSV or JSONL in EgoSim's columns, with video and split."""
+    clips: int = 0
+    """Synthetic clips to make instead, of the tabletop world; every fourth is for testing."""
+    clip_frames: int = 61
+    """Frames of every clip, from which windows are cut."""
+
+    def train(self) -> int:
+        """Train on the clips. Raises `InputError` if there are none."""
+        if not self.clips:
+            self.require("out", "metadata")
+        return super().train()
+
+    def frames(self, out: Path) -> Mapping[str, Path]:
+        """Decode the clips of both splits at the model's size."""
+        metadata = self.metadata or out / SYNTHETIC_CLIPS
+        if self.metadata is None and not metadata.exists():
+            self._make_clips(metadata.parent)
+        return {split: self._pack(metadata, split, out) for split in ("train", "test")}
+
+    def _make_clips(self, folder: Path) -> None:
+        from egosim_jax.data.clips import write_clips
+        from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+
+        spec = replace(configs.get(self.config).video, frames=self.clip_frames)
+        made = (to_triplet(next(make_sequence(seed, spec=spec))) for seed in range(self.clips))
+        splits = ({"split": "test" if n % 4 == 3 else "train"} for n in range(self.clips))
+        clips = (replace(clip, extra=extra) for clip, extra in zip(made, splits, strict=True))
+        write_clips(folder, clips, fps=spec.fps)
+
+    def _pack(self, metadata: Path, split: str, out: Path) -> Path:
+        from egosim_jax.data.manifest import MANIFEST
+        from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.data.pack import pack
+
+        frames = out / "frames" / split
+        if not (frames / MANIFEST).exists():
+            items = select(read_metadata(metadata), where=f"split={split}")
+            spec = replace(configs.get(self.config).video, frames=self.clip_frames)
+            provenance = {"metadata": str(metadata)}
+            progress = pack(items, out=frames, spec=spec, provenance=provenance)
+            for problem in track(progress, f"packing {split}", total=len(items)):
+                if problem:
+                    print(f"skipped: {problem}", file=sys.stderr)
+        return frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromTabletop(FromScratch):
+    """Train a small model from scratch on scenes of the tabletop world, a quarter with a robot."""
+
+    scenes: int = 1000
+    """Scenes to train on, two clips of each."""
+    held_out: int = 48
+    """Scenes to validate on, one clip of each."""
+
+    def frames(self, out: Path) -> Mapping[str, Path]:
+        """Make the clips of both splits."""
+        train = range(FIRST_TRAINED, FIRST_TRAINED + self.scenes)
+        return {
+            "train": self._make("train", train, 2, out),
+            "test": self._make("test", range(self.held_out), 1, out),
+        }
+
+    def _make(self, split: str, seeds: range, clips: int, out: Path) -> Path:
+        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
+
+        spec = configs.get(self.config).video
+        plan = DatasetConfig(seeds=tuple(seeds), clips=clips, spec=spec, kind="mixed")
+        frames = out / "frames" / split
+        scenes = make_shards(plan, out=frames, workers=os.cpu_count() or 1)
+        for _ in track(scenes, f"making {split}", total=len(seeds)):
+            pass
+        return frames

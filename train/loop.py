@@ -1,20 +1,21 @@
-"""The training script, from top to bottom: mesh, data, step, state, loop.
+"""The training loop, read from top to bottom: `train`, then the `Run` whose actions it calls.
 
 Resuming restores the state and the data iterator together, in this order: the data iterator is
 made as for a new run, the newest checkpoint is read straight into the shardings of the mesh, the
 iterator is set to the saved position, and the log is cut back to the restored step. A resumed run
 therefore repeats the losses of the run that was not interrupted bit for bit.
 
-The step is compiled before weights are read, so that a batch or a head count that the mesh does
-not divide is refused at once. The numbers of a step are looked at when the next one is under way,
-so that the devices never wait for the host.
+The update is compiled before weights are read, so that a batch or a head count that the mesh does
+not divide is refused at once. The metrics of an update are read while the next one runs, so that
+the devices never wait for the host.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,32 +25,25 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import FAILED, RESUBMIT, CommandExit
+from egosim_jax.command import RESUBMIT, CommandExit
 from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
-from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writers
+from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.models.layers import initialize
-from egosim_jax.sharding import (
-    batch_sharding,
-    make_mesh,
-    parts,
-)
-from egosim_jax.train.config import HOW_COMPUTED, Training, learning_rate, may_differ
-from egosim_jax.train.monitor import Clock, Samples, Watchdog
+from egosim_jax.sharding import batch_sharding, make_mesh, parts
+from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
+from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog, average, mean_metrics
 from egosim_jax.train.update import Programs, Task, TrainState
 from egosim_jax.types import InputError
-
-MOST_LEFT_OUT = 3
-"""Updates in a row that may be left out: then the run stops."""
 
 
 def train(
     task: Task,
-    training: Training,
+    training: TrainConfig,
     *,
     data: Path,
     validation: Path | None,
@@ -57,136 +51,229 @@ def train(
     weights: Path | None = None,
     samples: Samples | None = None,
 ) -> Any:
-    """Train `task` on the shards in `data`, resuming what `out` holds; the trained networks.
+    """Train `task` on the shards in `data`, resuming the run in `out`, and return the networks.
 
-    `validation` names shards whose loss is measured at fixed times and with fixed noise; `weights`
-    a folder to start from instead of random weights. The run folder holds config.json,
-    environment.json, metrics.jsonl, checkpoints/ and samples/. Several processes call it alike, and
-    the first one writes.
+    `validation` is a folder of shards whose metrics are measured with fixed noise; `weights` a
+    folder to start from instead of random weights. The run folder gets config.json,
+    environment.json, metrics.jsonl, checkpoints/ and samples/. All processes of a run call this
+    with the same arguments, and the first one writes.
     """
     training.check_packages()
     digests = None if weights is None else hashes(weights)
     settings = {"task": task, "training": training, "weights": digests}
-    open_folder(out, settings, may_differ=[*may_differ("training"), *HOW_COMPUTED])
+    mutable = [*resume_mutable("training"), *numerics_only(task, "task")]
+    open_folder(out, settings, mutable=mutable)
     share_with_jax()
-    mesh = make_mesh(training.mesh)
-    placed = batch_sharding(mesh)
-    source = ShardReader(data)
-    load = partial(_load, task=task, placed=placed)
-    clock = Clock(flops=float("nan"))
-
+    mesh, source = make_mesh(training.mesh), ShardReader(data)
     programs = Programs.of(task, training, mesh)
-    graph, abstract, sharding = programs.graph, programs.state, programs.state_sharding
-    frozen, update, validate = programs.frozen, programs.update, programs.validate
-    if weights is None and jax.tree.leaves(frozen):
-        raise InputError("Weights that stay as they are have to come from somewhere. (--weights)")
+    if weights is None and jax.tree.leaves(programs.frozen):
+        raise InputError("Frozen weights cannot be random: give a weights folder. (--weights)")
 
-    with jax.set_mesh(mesh), ExitStack() as opened:
-        batches = opened.enter_context(closing(load(source, training)))
-        checkpoints = Checkpoints(
+    with jax.set_mesh(mesh), ExitStack() as stack:
+        run = Run(task, training, programs, source, out, stack)
+        run.compile()
+        state = run.start(weights)
+        log0(startup_message(state, training, out))
+        for name, digest in (digests or {}).items():
+            log0(f"{out}: from {name} sha256 {digest[:16]}")
+        run.open_log(int(state.step))
+        hooks = [Every(training.log_every, run.log)]
+        if validation is not None:
+            hooks.append(Every(training.validate_every, partial(run.validate, validation)))
+        if samples is not None and training.sample_every is not None:
+            hooks.append(Every(training.sample_every, partial(run.sample, samples)))
+        if validation is not None and int(state.step) == 0:
+            run.validate(validation, 0, state)
+        state = run.loop(state, hooks)
+        log0(f"time spent:\n{run.clock.table()}")
+    return run.networks(state)
+
+
+@dataclass(frozen=True)
+class Every:
+    """An action of the loop with its interval."""
+
+    steps: int
+    """Updates between two calls."""
+    action: Callable[[int, TrainState], None]
+    """Function of the number of finished updates and the state."""
+
+    def __call__(self, step: int, state: TrainState, *, last: bool) -> None:
+        """Run the action if it is due, which it also is after the last update."""
+        if last or step % self.steps == 0:
+            self.action(step, state)
+
+
+class Run:
+    """A training in progress: its data, checkpoints and metrics, and the actions of its loop."""
+
+    def __init__(
+        self,
+        task: Task,
+        training: TrainConfig,
+        programs: Programs,
+        source: ShardReader,
+        out: Path,
+        stack: ExitStack,
+    ):
+        """Open data and checkpoints, which `stack` closes. Call it under the training's mesh."""
+        self.task, self.training, self.programs, self.out = task, training, programs, out
+        self.stack, self.sharding = stack, batch_sharding(jax.sharding.get_mesh())
+        self.source, self.frozen, self.update = source, programs.frozen, programs.update
+        self.clock, self.skips = Clock(flops=float("nan")), SkipMonitor(source)
+        self.learning_rate = learning_rate(training.optimizer, training.steps)
+        self.pending: dict[int, Mapping[str, jax.Array]] = {}
+        self.writers: list[Writer] = []
+        self.batches = stack.enter_context(closing(self._batches(source)))
+        self.checkpoints = Checkpoints(
             out / "checkpoints", keep=training.keep, keep_every=training.keep_every
         )
-        opened.callback(checkpoints.close)
-        if max(checkpoints.steps, default=0) < training.steps:
-            with clock.phase("data"), closing(load(source, training, peek=True)) as peek:
-                example = _to_devices(next(peek), placed)
-            clock.flops = task.flops(training.batch_size)
-            with clock.phase("compile"):
-                update = update.lower(abstract, frozen, example).compile()
-            _say(f"compiled in {clock.seconds['compile']:.1f} s{_need(update)}")
-        checkpoints.check_room(abstract)
-        with clock.phase("start"):
+        stack.callback(self.checkpoints.close)
+
+    def compile(self) -> None:
+        """Compile the update, unless the run is at its end, and check the room for checkpoints."""
+        if max(self.checkpoints.steps, default=0) < self.training.steps:
+            with self.clock.phase("data"), closing(self._batches(self.source, peek=True)) as peek:
+                example = self._to_devices(next(peek))
+            self.clock.flops = self.task.flops(self.training.batch_size)
+            with self.clock.phase("compile"):
+                self.update = self.update.lower(self.programs.state, self.frozen, example).compile()
+            seconds = self.clock.seconds["compile"]
+            log0(f"compiled in {seconds:.1f} s{memory_summary(self.update)}")
+        self.checkpoints.check_room(self.programs.state)
+
+    def start(self, weights: Path | None) -> TrainState:
+        """Return the state of the newest checkpoint, or the initial state."""
+        with self.clock.phase("start"):
             if weights is not None:
-                frozen = place(weights, frozen, programs.frozen_sharding)
-            if checkpoints.steps:
-                state = checkpoints.restore(
-                    _placed(abstract, sharding), batches, fallback=training.fallback
-                )
-            elif weights is None or jax.tree.leaves(frozen):
-                state = initialize(programs.create, out_shardings=sharding)
-            else:
-                params = place(weights, abstract.params, sharding.params)
-                begin = partial(TrainState.create, config=training.optimizer, steps=training.steps)
-                state = jax.jit(begin, out_shardings=sharding, donate_argnums=0)(params)
-        start = int(state.step)
-        _say(_greeting(state, start, training, out))
-        for name, digest in (digests or {}).items():
-            _say(f"{out}: from {name} sha256 {digest[:16]}")
+                self.frozen = place(weights, self.frozen, self.programs.frozen_sharding)
+            if not self.checkpoints.steps:
+                return self._initial_state(weights)
+            state = _placed(self.programs.state, self.programs.state_sharding)
+            return self.checkpoints.restore(state, self.batches, fallback=self.training.fallback)
 
-        writer = opened.enter_context(closing(_writers(training, out, start)))
-        watchdog = opened.enter_context(closing(Watchdog(training.patience)))
-        rate = learning_rate(training.optimizer, training.steps)
+    def open_log(self, step: int) -> None:
+        """Start metric writers and watchdog of a run that has finished `step` updates."""
+        self.writers = make_writers(self.training, self.out, step) if is_first() else []
+        for writer in self.writers:
+            self.stack.callback(writer.close)
+        self.watchdog = self.stack.enter_context(closing(Watchdog(self.training.hang_timeout_s)))
 
-        def measure(state: TrainState, shards: Path) -> dict[str, float]:
-            """Validation numbers, means over batches."""
-            with clock.phase("validate"), closing(load(shards, training)) as some:
-                rows = [
-                    jax.device_get(validate(state.best, frozen, _to_devices(batch, placed)))
-                    for batch in some
-                ]
-            return {f"validation_{name}": _average(rows, name) for name in rows[0]}
-
-        if validation is not None and start == 0:
-            writer.write(0, measure(state, validation))
-        pending: dict[int, Mapping[str, jax.Array]] = {}
-        before: _LeftOut | None = None
-        clock.begin(start)
-        for step in range(start + 1, training.steps + 1):
-            last = step == training.steps
-            with clock.phase("data"):
-                examples = next(batches)
-            with clock.phase("step"):
-                state, metrics = update(state, frozen, _to_devices(examples, placed))
-                pending[step] = metrics
-                if before is not None:
-                    before.check()
-                before = _LeftOut(step, metrics, examples["record"], source)
-            watchdog.beat()
-            if step % training.log_every == 0 or last:
-                with clock.phase("step"):
-                    before.check()
-                    numbers = _mean(pending)
-                pending = {}
-                if batches.skipped:
-                    numbers["skipped"] = float(len(batches.skipped))
-                numbers["rate"] = float(np.asarray(rate(step - 1)))
-                writer.write(step, {**numbers, **clock.tick(step, training.steps)})
-            if validation is not None and (step % training.validate_every == 0 or last):
-                watchdog.rest()
-                writer.write(step, measure(state, validation))
-            every = training.sample_every
-            if samples is not None and every is not None and (step % every == 0 or last):
-                watchdog.rest()
-                with clock.phase("sample"):
-                    networks = nnx.merge(graph, state.best, frozen)
-                    samples.write(networks, out / "samples", step)
+    def loop(self, state: TrainState, hooks: list[Every]) -> TrainState:
+        """Update to the end, running the hooks; stop with a checkpoint on SIGTERM."""
+        self.clock.begin(int(state.step))
+        for step in range(int(state.step) + 1, self.training.steps + 1):
+            state = self.step(step, state)
+            last = step == self.training.steps
+            for hook in hooks:
+                hook(step, state, last=last)
             preempted = multihost_utils.reached_preemption_sync_point(step)
-            if step % training.save_every == 0 or last or preempted:
-                watchdog.rest()
-                with clock.phase("save"):
-                    checkpoints.save(step, state, batches)
-                    if last or preempted:
-                        checkpoints.wait()
+            if step % self.training.save_every == 0 or last or preempted:
+                self.save(step, state, wait=last or preempted)
             if preempted and not last:
-                _say(f"where the time went:\n{clock.table()}")
+                log0(f"time spent:\n{self.clock.table()}")
                 raise CommandExit(
-                    f"{out}: stopped and saved after step {step}; run it again", RESUBMIT
+                    f"{self.out}: stopped and saved after step {step}; run it again", RESUBMIT
                 )
-        _say(f"where the time went:\n{clock.table()}")
-    return nnx.merge(graph, state.best, frozen)
+        return state
+
+    def step(self, step: int, state: TrainState) -> TrainState:
+        """Return the state after one more update, and check the one before."""
+        with self.clock.phase("data"):
+            examples = next(self.batches)
+        with self.clock.phase("step"):
+            state, metrics = self.update(state, self.frozen, self._to_devices(examples))
+            self.pending[step] = metrics
+            self.skips.watch(step, metrics, examples["record"])
+        self.watchdog.beat()
+        return state
+
+    def log(self, step: int, state: TrainState) -> None:
+        """Write the mean metrics since the last line, and the speed."""
+        with self.clock.phase("step"):
+            self.skips.check()
+            metrics = mean_metrics(list(self.pending.values()))
+        self.pending = {}
+        if self.batches.skipped:
+            metrics["skipped_records"] = float(len(self.batches.skipped))
+        metrics["lr"] = float(np.asarray(self.learning_rate(step - 1)))
+        self.write(step, {**metrics, **self.clock.tick(step, self.training.steps)})
+
+    def validate(self, shards: Path, step: int, state: TrainState) -> None:
+        """Write the validation metrics, means over the batches of `shards`."""
+        self.watchdog.rest()
+        with self.clock.phase("validate"), closing(self._batches(shards)) as batches:
+            rows = [
+                jax.device_get(
+                    self.programs.validate(state.eval_params, self.frozen, self._to_devices(batch))
+                )
+                for batch in batches
+            ]
+        self.write(step, {f"validation_{name}": average(rows, name) for name in rows[0]})
+
+    def sample(self, samples: Samples, step: int, state: TrainState) -> None:
+        """Generate and write sample clips."""
+        self.watchdog.rest()
+        with self.clock.phase("sample"):
+            samples.write(self.networks(state), self.out / "samples", step)
+
+    def save(self, step: int, state: TrainState, *, wait: bool) -> None:
+        """Write a checkpoint in the background, or wait until it is on disk."""
+        self.watchdog.rest()
+        with self.clock.phase("save"):
+            self.checkpoints.save(step, state, self.batches)
+            if wait:
+                self.checkpoints.wait()
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Pass metrics to every writer."""
+        for writer in self.writers:
+            writer.write(step, metrics)
+
+    def networks(self, state: TrainState) -> Any:
+        """Return the networks with the weights of a state."""
+        return nnx.merge(self.programs.graph, state.eval_params, self.frozen)
+
+    def _initial_state(self, weights: Path | None) -> TrainState:
+        sharding = self.programs.state_sharding
+        if weights is None or jax.tree.leaves(self.frozen):
+            return initialize(self.programs.create, out_shardings=sharding)
+        params = place(weights, self.programs.state.params, sharding.params)
+        create = partial(
+            TrainState.create, config=self.training.optimizer, steps=self.training.steps
+        )
+        return jax.jit(create, out_shardings=sharding, donate_argnums=0)(params)
+
+    def _batches(self, source: ShardReader | Path, *, peek: bool = False) -> Loader:
+        return make_batches(source, self.task, self.training, self.sharding, peek=peek)
+
+    def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
+        return {
+            name: jax.make_array_from_process_local_data(self.sharding, value)
+            for name, value in batch.items()
+        }
 
 
-def _load(
-    source: ShardReader | Path, training: Training, *, task: Task, placed: Any, peek: bool = False
+def make_batches(
+    source: ShardReader | Path,
+    task: Task,
+    training: TrainConfig,
+    sharding: Any,
+    *,
+    peek: bool = False,
 ) -> Loader:
-    """This process's part of each batch; of validation shards, those that fill a batch, once."""
+    """Return an iterator over this process's shard of each batch.
+
+    Of a folder, which holds validation shards, it makes one pass in order, over the records that
+    fill a batch. With `peek` it starts no worker processes.
+    """
     once = isinstance(source, Path)
     reader = ShardReader(source) if isinstance(source, Path) else source
     size = training.batch_size
     if once:
-        devices = parts("batch", placed.mesh)
+        devices = parts("batch", sharding.mesh)
         size = min(size, max(devices, len(reader) // devices * devices))
-    index, count = _part(placed, size)
+    index, count = process_shard(sharding, size)
     return make_loader(
         reader,
         batch_size=size,
@@ -200,63 +287,59 @@ def _load(
     )
 
 
-def _part(placed: Any, size: int) -> tuple[int, int]:
-    """Which part of a batch this process's devices hold, and of how many.
+def process_shard(sharding: Any, size: int) -> tuple[int, int]:
+    """Return the index of this process's shard of a batch, and the number of shards.
 
-    Processes that share samples, along the context axis, hold the same part.
+    Processes that share samples, along the context axis, hold the same shard.
     """
     rows = {
         index[0].indices(size)[:2]
-        for index in placed.addressable_devices_indices_map((size,)).values()
+        for index in sharding.addressable_devices_indices_map((size,)).values()
     }
     first, end = min(rows)[0], max(rows)[1]
     return first // (end - first), size // (end - first)
 
 
-class _LeftOut:
-    """Whether an update was left out, and of which records, looked at once it is done."""
-
-    def __init__(
-        self, step: int, metrics: Mapping[str, jax.Array], records: np.ndarray, source: ShardReader
-    ):
-        self.step, self.metrics, self.records, self.source = step, metrics, records, source
-        self.looked = False
-
-    def check(self) -> None:
-        """Name the records of an update that was left out; stop the run after several."""
-        count = 0 if self.looked else int(self.metrics["left_out"])
-        self.looked = True
-        if not count:
-            return
-        names = ", ".join(str(self.source[int(i)].metadata["video_id"]) for i in self.records)
-        loss, norm = float(self.metrics["loss"]), float(self.metrics["gradient_norm"])
-        said = f"step {self.step} left out: loss {loss:.4g}, gradient norm {norm:.4g}, of {names}"
-        print(said, file=sys.stderr, flush=True)
-        if count >= MOST_LEFT_OUT:
-            raise CommandExit(
-                f"{count} updates in a row were left out, so the run stops. The weights are those "
-                "before them: look at the clips above, or lower the learning rate.",
-                FAILED,
-            )
-
-
-def _writers(training: Training, out: Path, start: int) -> Writers:
-    if jax.process_index() != 0:
-        return Writers([])
-    writers: list[Any] = [
+def make_writers(training: TrainConfig, out: Path, step: int) -> list[Writer]:
+    """Return the metric writers of a run that starts or resumes after `step` updates."""
+    writers: list[Writer] = [
         Console(training.steps),
-        JsonLines(out / "metrics.jsonl", resume_after=start),
+        JsonLines(out / "metrics.jsonl", resume_after=step),
     ]
     if training.tensorboard:
-        writers.append(TensorBoard(out / "tensorboard", resume_after=start))
+        writers.append(TensorBoard(out / "tensorboard", resume_after=step))
     if training.wandb is not None:
         writers.append(WandB(out, project=training.wandb, name=out.name))
-    return Writers(writers)
+    return writers
 
 
-def _say(text: str) -> None:
-    if jax.process_index() == 0:
+def is_first() -> bool:
+    """Return whether this is the first process of the run, the one that writes."""
+    return jax.process_index() == 0
+
+
+def log0(text: str) -> None:
+    """Print to stderr in the first process only."""
+    if is_first():
         print(text, file=sys.stderr, flush=True)
+
+
+def memory_summary(program: Any) -> str:
+    """Describe the memory of a compiled program; empty if the compiler does not report it."""
+    analysis = program.memory_analysis()
+    if analysis is None:
+        return ""
+    gigabytes = (analysis.argument_size_in_bytes + analysis.temp_size_in_bytes) / 1e9
+    return f", needs {gigabytes:.2f} GB per device"
+
+
+def startup_message(state: TrainState, training: TrainConfig, out: Path) -> str:
+    """Describe the start of a run: step, trained weights and devices."""
+    step = int(state.step)
+    weights = sum(leaf.size for leaf in jax.tree.leaves(state.params))
+    verb = f"resuming at step {step}" if step else "starting"
+    devices = f"{jax.device_count()} x {jax.devices()[0].device_kind}"
+    return f"{out}: {verb} of {training.steps}, {weights:,} weights to train, {devices}"
 
 
 def _placed(abstract: Any, sharding: Any) -> Any:
@@ -264,42 +347,3 @@ def _placed(abstract: Any, sharding: Any) -> Any:
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where)
 
     return jax.tree.map(place, abstract, sharding)
-
-
-def _need(program: Any) -> str:
-    """Memory of a compiled program, if the compiler says."""
-    found = program.memory_analysis()
-    if found is None:
-        return ""
-    gigabytes = (found.argument_size_in_bytes + found.temp_size_in_bytes) / 1e9
-    return f", needs {gigabytes:.2f} GB a device"
-
-
-def _greeting(state: TrainState, start: int, training: Training, out: Path) -> str:
-    weights = sum(leaf.size for leaf in jax.tree.leaves(state.params))
-    verb = f"resuming at step {start}" if start else "starting"
-    devices = f"{jax.device_count()} x {jax.devices()[0].device_kind}"
-    return f"{out}: {verb} of {training.steps}, {weights:,} weights to train, {devices}"
-
-
-def _to_devices(batch: Mapping[str, np.ndarray], sharding: Any) -> dict[str, jax.Array]:
-    return {
-        name: jax.make_array_from_process_local_data(sharding, value)
-        for name, value in batch.items()
-    }
-
-
-def _mean(pending: Mapping[int, Mapping[str, jax.Array]]) -> dict[str, float]:
-    """Means over the steps since the last line, fetched from the devices once.
-
-    Updates that were left out count as such alone.
-    """
-    rows = jax.device_get(list(pending.values()))
-    kept = [row for row in rows if not row["left_out"]]
-    numbers = {name: _average(kept, name) for name in rows[0] if name != "left_out" and kept}
-    left_out = len(rows) - len(kept)
-    return {**numbers, "left_out": float(left_out)} if left_out else numbers
-
-
-def _average(rows: list[Mapping[str, np.ndarray]], name: str) -> float:
-    return float(np.mean([row[name] for row in rows]))

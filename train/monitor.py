@@ -1,4 +1,4 @@
-"""What watches over a run: the clock, the watchdog, and sample clips."""
+"""Monitoring of a run: clock, watchdog, skipped updates, sample clips."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,13 +23,11 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import HUNG
+from egosim_jax.command import FAILED, HUNG, CommandExit
 from egosim_jax.conditioning.video import to_uint8
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.generator import denoise
-from egosim_jax.io.video import write_video
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.targets import peak
 from egosim_jax.sharding import batch_sharding, parts
@@ -48,10 +46,10 @@ PHASES: dict[Phase, str] = {
 
 
 class Clock:
-    """Adds up seconds by phase, and says how fast the steps are."""
+    """Wall-clock seconds of a run by phase, and the speed of its updates."""
 
     def __init__(self, *, flops: float):
-        """`flops` are the model's in an update, over all devices."""
+        """Start the clock; `flops` are the model FLOPs of an update, over all devices."""
         self.flops = flops
         self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
         self._before = dict(self.seconds)
@@ -60,7 +58,7 @@ class Clock:
 
     @contextmanager
     def phase(self, name: Phase) -> Iterator[None]:
-        """Count what is done here."""
+        """Add the time spent in the context to a phase."""
         then = time.monotonic()
         try:
             yield
@@ -68,14 +66,14 @@ class Clock:
             self.seconds[name] += time.monotonic() - then
 
     def begin(self, step: int) -> None:
-        """Count steps from this one on."""
+        """Start an interval of updates at `step`."""
         self._step, self._before = step, dict(self.seconds)
 
     def tick(self, step: int, steps: int) -> dict[str, float]:
-        """The numbers of the steps since the last call: how fast they were, and what is left.
+        """Return the speed over the interval that ends at `step` of `steps`, and start the next.
 
-        `seconds` a step has the wait for data in it, of which `waiting` is the share; TFLOP/s and
-        MFU are per device, and left out where FLOPs or the device's peak are not known.
+        `step_time_s` includes the wait for data, whose share is `data_wait_frac`. TFLOP/s and MFU
+        are per device, and omitted where FLOPs or the device's peak are unknown.
         """
         count = max(1, step - self._step)
         waited, worked = (self.seconds[name] - self._before[name] for name in ("data", "step"))
@@ -83,28 +81,28 @@ class Clock:
         seconds = (waited + worked) / count
         rate = self.flops / jax.device_count() / seconds
         numbers = {
-            "seconds": seconds,
-            "waiting": waited / (waited + worked),
+            "step_time_s": seconds,
+            "data_wait_frac": waited / (waited + worked),
             "tflops": rate / 1e12,
             "mfu": rate / peak(jax.devices()[0].device_kind),
-            "gigabytes": memory() / 1e9,
-            "minutes_left": seconds * (steps - step) / 60,
+            "peak_mem_gb": peak_memory() / 1e9,
+            "eta_min": seconds * (steps - step) / 60,
         }
         return {name: value for name, value in numbers.items() if value == value}
 
     def table(self) -> str:
-        """Seconds and share of each phase, a line each."""
-        whole = time.monotonic() - self._began
+        """Return seconds and share of each phase, one per line."""
+        total = time.monotonic() - self._began
         rows = {PHASES[name]: self.seconds[name] for name in PHASES if self.seconds[name]}
-        rows["the rest"] = whole - sum(rows.values())
+        rows["other"] = total - sum(rows.values())
         return "\n".join(
-            f"  {name:<24}{seconds:>10.1f} s {seconds / whole:>7.1%}"
-            for name, seconds in {**rows, "in all": whole}.items()
+            f"  {name:<24}{seconds:>10.1f} s {seconds / total:>7.1%}"
+            for name, seconds in {**rows, "total": total}.items()
         )
 
 
-def memory() -> float:
-    """Bytes at most in use: of the first device's memory, or, on a CPU, of the process."""
+def peak_memory() -> float:
+    """Return the peak memory in bytes of the first device or, on a CPU, of the process."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "peak_bytes_in_use" in stats:
         return float(stats["peak_bytes_in_use"])
@@ -112,35 +110,35 @@ def memory() -> float:
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale)
 
 
-SLOWEST = 10
-"""Times the median of the last intervals: longer is a hang."""
+HANG_FACTOR = 10
+"""Multiple of the median update time beyond which an update counts as hung."""
 
 
 class Watchdog:
-    """A thread that expects a sign of life.
+    """A thread that ends the process when updates stop coming.
 
-    Without one for `SLOWEST` times the usual interval, and at least for `patience` seconds, it
-    prints the stacks of all threads and ends the process with exit code 70: a supervisor can then
-    start the run again, which resumes. It sleeps until the first `beat`, since compiling may take
-    long, and between `rest` and the next one.
+    Without a `beat` for `HANG_FACTOR` times the median interval, and for at least `timeout_s`
+    seconds, it prints the stacks of all threads and ends the process with exit code 70: a
+    supervisor can then start the run again, which resumes. It is idle until the first `beat`, since
+    compiling may take long, and between `rest` and the next one.
     """
 
-    def __init__(self, patience: float):
-        self.patience = patience
+    def __init__(self, timeout_s: float):
+        self.timeout_s = timeout_s
         self._intervals: deque[float] = deque(maxlen=100)
         self._last: float | None = None
         self._ended = threading.Event()
         threading.Thread(target=self._watch, daemon=True, name="watchdog").start()
 
     def beat(self) -> None:
-        """Say that a step was finished."""
+        """Report a finished update."""
         now = time.monotonic()
         if self._last is not None:
             self._intervals.append(now - self._last)
         self._last = now
 
     def rest(self) -> None:
-        """Expect nothing until the next beat."""
+        """Pause until the next beat."""
         self._last = None
 
     def close(self) -> None:
@@ -148,58 +146,122 @@ class Watchdog:
         self._ended.set()
 
     def _watch(self) -> None:
-        while not self._ended.wait(min(self.patience / 10, 10.0)):
+        while not self._ended.wait(min(self.timeout_s / 10, 10.0)):
             last = self._last
             if last is None:
                 continue
             usual = median(self._intervals) if self._intervals else 0.0
-            limit, waited = max(self.patience, SLOWEST * usual), time.monotonic() - last
+            limit, waited = max(self.timeout_s, HANG_FACTOR * usual), time.monotonic() - last
             if waited > limit:
                 print(
-                    f"no step was finished for {waited:.0f} s, where one takes {usual:.1f} s. "
-                    "Every thread's stack:",
+                    f"no update finished for {waited:.0f} s; the median is {usual:.1f} s. Stacks "
+                    "of all threads:",
                     file=sys.stderr,
                 )
                 faulthandler.dump_traceback(all_threads=True)
                 os._exit(HUNG)
 
 
-MOMENTS = 6
+MAX_CONSECUTIVE_SKIPS = 3
+"""Number of updates skipped in a row at which the run stops."""
+
+
+class SkipMonitor:
+    """Reports skipped updates with their records, once they are done.
+
+    An update is checked while the next one runs, so that the devices never wait for the host.
+    """
+
+    def __init__(self, source: ShardReader):
+        self.source = source
+        self._last: tuple[int, Mapping[str, jax.Array], np.ndarray] | None = None
+
+    def watch(self, step: int, metrics: Mapping[str, jax.Array], records: np.ndarray) -> None:
+        """Check the update before, and note this one."""
+        self.check()
+        self._last = step, metrics, records
+
+    def check(self) -> None:
+        """Name the records of the last update if it was skipped; stop the run after several."""
+        if self._last is None:
+            return
+        (step, metrics, records), self._last = self._last, None
+        count = int(metrics["consecutive_skips"])
+        if not count:
+            return
+        names = ", ".join(str(self.source[int(i)].metadata["video_id"]) for i in records)
+        loss, norm = float(metrics["loss"]), float(metrics["grad_norm"])
+        print(
+            f"step {step} skipped: loss {loss:.4g}, grad_norm {norm:.4g}, records {names}",
+            file=sys.stderr,
+            flush=True,
+        )
+        if count >= MAX_CONSECUTIVE_SKIPS:
+            raise CommandExit(
+                f"{count} updates in a row were skipped, so the run stops. The weights are those "
+                "before them: inspect the records above, or lower the learning rate.",
+                FAILED,
+            )
+
+
+def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
+    """Return the means over updates, fetched from the devices at once.
+
+    Skipped updates are only counted, as `skipped_updates`.
+    """
+    fetched = jax.device_get(list(rows))
+    kept = [row for row in fetched if not row["consecutive_skips"]]
+    names = [name for name in fetched[0] if name != "consecutive_skips"]
+    metrics = {name: average(kept, name) for name in names if kept}
+    skipped = len(fetched) - len(kept)
+    return {**metrics, "skipped_updates": float(skipped)} if skipped else metrics
+
+
+def average(rows: Sequence[Mapping[str, np.ndarray]], name: str) -> float:
+    """Return the mean of one metric over rows."""
+    return float(np.mean([row[name] for row in rows]))
+
+
+SHEET_FRAMES = 6
 """Frames of a clip on the contact sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """The first records of a folder of latents, generated from the same noise each time."""
+    """Clips generated during training from the same noise each time, next to the ground truth."""
 
     model: ModelConfig
-    """The model that is trained."""
+    """Model that is trained."""
     latents: Path
-    """Shards, as a rule those of the validation."""
+    """Folder of latents shards, usually those of the validation, whose first records are used."""
     vae: Path
-    """Weights folder with the autoencoder that made them."""
+    """Weights folder with the autoencoder of the latents."""
     count: int = 2
-    """How many clips."""
+    """Number of clips."""
 
     def write(self, networks: nnx.Module, out: Path, step: int) -> None:
-        """Write OUT/step_N.mp4 and .png: each clip generated and, beside it, its truth.
+        """Write OUT/step_N.mp4 and .png: each generated clip next to its ground truth.
 
-        Called under the mesh of the training, by all of its processes.
+        All processes of the training call it, under its mesh.
         """
+        from egosim_jax.data.sheet import SheetClip, draw_sheet
+        from egosim_jax.io.video import write_video
+
         graph, params = nnx.split(networks)
         generated = self._frames(_generate(graph, params, self._batch, self.model))
-        truth = self._truth
+        targets = self._targets
         if jax.process_index() != 0:
             return
-        pairs = [np.concatenate(pair, axis=2) for pair in zip(generated, truth, strict=True)]
+        pairs = [np.concatenate(pair, axis=2) for pair in zip(generated, targets, strict=True)]
         path = out / f"step_{step:06d}.mp4"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_video(path, np.concatenate(pairs, axis=1), self.model.video.fps)
-        moments = np.linspace(0, self.model.video.frames - 1, MOMENTS).round().astype(int).tolist()
+        frames = self.model.video.frames
+        moments = np.linspace(0, frames - 1, SHEET_FRAMES).round().astype(int).tolist()
         names = [record.metadata["video_id"] for record in self._records]
         blocks = [
-            SheetClip(f"{name}, step {step}: generated, truth", list(pair))
-            for name, *pair in zip(names, generated, truth, strict=True)
+            SheetClip(f"{name}, step {step}: generated, ground truth", list(pair))
+            for name, *pair in zip(names, generated, targets, strict=True)
         ]
         draw_sheet(blocks, path.with_suffix(".png"), moments=moments)
 
@@ -208,13 +270,12 @@ class Samples:
         return multihost_utils.process_allgather(frames, tiled=True)[: len(self._records)]
 
     @cached_property
-    def _truth(self) -> np.ndarray:
+    def _targets(self) -> np.ndarray:
         return self._frames(self._batch["target"])
 
     @cached_property
     def _vae(self) -> tuple[nnx.GraphDef, nnx.State]:
-        networks = Networks.load(self.model, self.vae, only=["vae"])
-        return nnx.split(networks.vae)
+        return nnx.split(Networks.load(self.model, self.vae, only=["vae"]).vae)
 
     @cached_property
     def _records(self) -> list[Record]:
@@ -223,7 +284,7 @@ class Samples:
 
     @cached_property
     def _batch(self) -> dict[str, jax.Array]:
-        """The records, repeated until the devices can share them."""
+        """Return the records, repeated to a batch that the devices can share."""
         found = [record.arrays for record in self._records]
         size = -(-len(found) // parts("batch")) * parts("batch")
         where = batch_sharding(jax.sharding.get_mesh())

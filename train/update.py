@@ -1,4 +1,10 @@
-"""One update of a training: its state, its pure functions and the programs they compile to."""
+"""One update of a training: its task, its state, its pure functions and their compiled form.
+
+    (state, frozen weights, batch)  ->  loss and gradients  ->  guard  ->  optimizer  ->  state
+
+The guard skips an update whose loss or gradient norm is not finite or, on request, whose gradient
+norm is far above its running mean; a skipped update changes no weight.
+"""
 
 from __future__ import annotations
 
@@ -15,136 +21,136 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Key
 
 from egosim_jax.sharding import batch_sharding, check_batch, constrain, state_sharding
-from egosim_jax.train.config import OptimizerConfig, Training, make_optimizer
+from egosim_jax.train.config import OptimizerConfig, TrainConfig, make_optimizer
 
 Batch = Mapping[str, jax.Array]
 Metrics = dict[str, jax.Array]
 
-SETTLED = 50
-"""Updates before a gradient can be said to be unusual."""
-NORM_DECAY = 0.98
-"""Of the running mean of gradient norms: it looks back some 50 updates."""
+GUARD_WARMUP = 50
+"""Updates before the guard compares a gradient norm with the running mean."""
+GRAD_NORM_DECAY = 0.98
+"""Decay of the running mean of gradient norms, which averages over some 50 updates."""
+
+
+@runtime_checkable
+class Task(Protocol):
+    """The networks that are trained, their examples and their loss."""
+
+    @property
+    def trained(self) -> Any:
+        """The nnx filter of the trained weights; the others are frozen."""
+        ...
+
+    @property
+    def frozen_dtype(self) -> str:
+        """The dtype in which the frozen weights are stored."""
+        ...
+
+    def networks(self, rngs: nnx.Rngs) -> nnx.Module:
+        """Return the networks with random weights."""
+        ...
+
+    def examples(self) -> Any:
+        """Return the Grain transform from a shard's record to an example, a dict of arrays."""
+        ...
+
+    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
+        """Return the shapes of a batch of examples, to compile for before there is one."""
+        ...
+
+    def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " *keys"]:
+        """Return the random keys of each sample of a batch."""
+        ...
+
+    def loss(
+        self, networks: Any, batch: Batch, keys: Key[Array, " *keys"]
+    ) -> tuple[jax.Array, Metrics]:
+        """Return the mean loss over a batch, and further numbers to log."""
+        ...
+
+    def validate(self, networks: Any, batch: Batch) -> Metrics:
+        """Return deterministic metrics of a batch: fixed noise, the same at every call."""
+        ...
+
+    def flops(self, samples: int) -> float:
+        """Return the model FLOPs of an update on `samples` samples; NaN if they are unknown."""
+        ...
+
+
+class Stage(NamedTuple):
+    """One training of a recipe: its task and its hyper-parameters."""
+
+    task: Task
+    """Networks, examples and loss."""
+    training: TrainConfig
+    """Training hyper-parameters."""
 
 
 @no_type_check
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """Everything that an update changes."""
+    """All arrays that an update changes."""
 
     step: jax.Array
-    """Finished updates, with those that were left out, int32."""
+    """Number of finished updates, skipped ones included, int32."""
     params: nnx.State
     """Trained weights in float32."""
-    moments: Any
+    opt_state: Any
     """State of the optax transformation."""
-    usual_norm: jax.Array
-    """Geometric mean of the gradient norms of the last updates that were not left out, float32; 0
-    before any."""
-    left_out: jax.Array
-    """Updates left out in a row, int32."""
-    average: nnx.State | None
-    """Exponential moving average of the weights, if there is one."""
+    grad_norm_ema: jax.Array
+    """Running geometric mean of the gradient norms, skipped updates excluded, float32; 0 at the
+    start."""
+    consecutive_skips: jax.Array
+    """Number of updates skipped in a row, int32."""
+    ema_params: nnx.State | None
+    """Exponential moving average of `params`; None without `ema_decay`."""
 
     @classmethod
     def create(cls, params: nnx.State, config: OptimizerConfig, steps: int) -> TrainState:
-        """The state before the first update of a run of `steps`."""
+        """Return the state before the first update of a run of `steps` updates."""
         return cls(
             step=jnp.int32(0),
             params=params,
-            moments=make_optimizer(config, steps).init(params),
-            usual_norm=jnp.float32(0),
-            left_out=jnp.int32(0),
-            average=None if config.average is None else jax.tree.map(jnp.copy, params),
+            opt_state=make_optimizer(config, steps).init(params),
+            grad_norm_ema=jnp.float32(0),
+            consecutive_skips=jnp.int32(0),
+            ema_params=None if config.ema_decay is None else jax.tree.map(jnp.copy, params),
         )
 
-    def apply(
+    def apply_gradients(
         self,
         gradients: nnx.State,
         norm: jax.Array,
         config: OptimizerConfig,
         optimizer: optax.GradientTransformation,
     ) -> TrainState:
-        """The state after one more update by gradients of this norm."""
-        updates, moments = optimizer.update(gradients, self.moments, self.params)
+        """Return the state after an update by gradients of global norm `norm`."""
+        updates, opt_state = optimizer.update(gradients, self.opt_state, self.params)
         params: Any = optax.apply_updates(self.params, updates)
-        average: Any = self.average
-        if average is not None and config.average is not None:
-            average = optax.incremental_update(params, average, 1 - config.average)
-        # Geometric, so that the spikes that are to be told from it do not move it much.
+        ema_params: Any = self.ema_params
+        if ema_params is not None and config.ema_decay is not None:
+            ema_params = optax.incremental_update(params, ema_params, 1 - config.ema_decay)
+        # Geometric, so that a spike hardly moves the mean that it is compared with.
         norm = jnp.maximum(norm, jnp.finfo(norm.dtype).tiny)
-        mixed = self.usual_norm**NORM_DECAY * norm ** (1 - NORM_DECAY)
+        mixed = self.grad_norm_ema**GRAD_NORM_DECAY * norm ** (1 - GRAD_NORM_DECAY)
         return TrainState(
             step=self.step + 1,
             params=params,
-            moments=moments,
-            usual_norm=jnp.where(self.usual_norm == 0, norm, mixed),
-            left_out=jnp.int32(0),
-            average=average,
+            opt_state=opt_state,
+            grad_norm_ema=jnp.where(self.grad_norm_ema == 0, norm, mixed),
+            consecutive_skips=jnp.int32(0),
+            ema_params=ema_params,
         )
 
-    def leave_out(self) -> TrainState:
-        """The state after an update that changes no weight."""
-        return replace(self, step=self.step + 1, left_out=self.left_out + 1)
+    def skip_update(self) -> TrainState:
+        """Return the state after an update that changes no weight."""
+        return replace(self, step=self.step + 1, consecutive_skips=self.consecutive_skips + 1)
 
     @property
-    def best(self) -> nnx.State:
-        """The weights to validate and to keep: the average, if there is one."""
-        return self.params if self.average is None else self.average
-
-
-@runtime_checkable
-class Task(Protocol):
-    """What is trained, on what, and by which loss."""
-
-    @property
-    def trained(self) -> Any:
-        """The nnx filter of the weights that are trained; the others stay as they are."""
-        ...
-
-    @property
-    def frozen_dtype(self) -> str:
-        """The dtype in which those others are kept."""
-        ...
-
-    def networks(self, rngs: nnx.Rngs) -> nnx.Module:
-        """The networks with random weights."""
-        ...
-
-    def examples(self) -> Any:
-        """The Grain transform from a shard's record to an example of arrays."""
-        ...
-
-    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
-        """The arrays of a batch of examples, to compile for before there is one."""
-        ...
-
-    def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " *keys"]:
-        """The random keys of each sample of a batch."""
-        ...
-
-    def loss(
-        self, networks: Any, batch: Batch, keys: Key[Array, " *keys"]
-    ) -> tuple[jax.Array, Metrics]:
-        """The mean loss of some samples, and numbers worth logging."""
-        ...
-
-    def validate(self, networks: Any, batch: Batch) -> Metrics:
-        """Numbers that depend on nothing random, the same at every call."""
-        ...
-
-    def flops(self, samples: int) -> float:
-        """Model FLOPs of an update on so many samples; NaN if nobody counted them."""
-        ...
-
-
-class Stage(NamedTuple):
-    """A training of a recipe."""
-
-    task: Task
-    """What is trained."""
-    training: Training
-    """How long, how fast and how often."""
+    def eval_params(self) -> nnx.State:
+        """Weights to validate and to keep: the moving average, if there is one."""
+        return self.params if self.ema_params is None else self.ema_params
 
 
 def make_update(
@@ -154,13 +160,14 @@ def make_update(
     *,
     steps: int,
     seed: int,
-    accumulate: int = 1,
+    grad_accum_steps: int = 1,
 ) -> Callable[[TrainState, nnx.State, Batch], tuple[TrainState, Metrics]]:
-    """The update function of state, frozen weights and a batch.
+    """Return the update, a function of state, frozen weights and batch.
 
-    Its randomness is a function of seed and step alone. The batch is taken in `accumulate` parts,
-    one after the other, which gives the same gradient. An update whose loss or gradient is not
-    finite, or whose gradient is `config.spike` times as long as usual, changes no weight.
+    Its randomness is a function of seed and step alone. With `grad_accum_steps` the batch is split
+    into so many parts, taken one after the other, which gives the same gradient. The update is
+    skipped if its loss or gradient norm is not finite, or if its gradient norm exceeds
+    `config.skip_grad_norm_factor` times the running mean.
     """
     optimizer = make_optimizer(config, steps)
 
@@ -171,28 +178,29 @@ def make_update(
         key = jax.random.fold_in(jax.random.key(seed), state.step)
         keys = task.keys(key, next(iter(batch.values())).shape[0])
         gradient = jax.value_and_grad(loss, has_aux=True)
-        if accumulate > 1:
-            gradient = in_parts(gradient, accumulate)
+        if grad_accum_steps > 1:
+            gradient = accumulate_gradients(gradient, grad_accum_steps)
         (value, metrics), gradients = gradient(state.params, batch, keys)
 
         norm = optax.tree.norm(gradients)
-        sound = jnp.isfinite(value) & jnp.isfinite(norm)
-        if config.spike is not None:
-            usual = (state.step < SETTLED) | (norm <= config.spike * state.usual_norm)
-            sound &= usual
-        changed = state.apply(gradients, norm, config, optimizer)
+        valid = jnp.isfinite(value) & jnp.isfinite(norm)
+        if config.skip_grad_norm_factor is not None:
+            limit = config.skip_grad_norm_factor * state.grad_norm_ema
+            valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
+        changed = state.apply_gradients(gradients, norm, config, optimizer)
         state = jax.tree.map(
-            lambda new, old: jnp.where(sound, new, old), changed, state.leave_out()
+            lambda new, old: jnp.where(valid, new, old), changed, state.skip_update()
         )
-        return state, {"loss": value, "gradient_norm": norm, "left_out": state.left_out, **metrics}
+        skips = state.consecutive_skips
+        return state, {"loss": value, "grad_norm": norm, "consecutive_skips": skips, **metrics}
 
     return update
 
 
-def in_parts(gradient: Callable[..., Any], parts: int) -> Callable[..., Any]:
-    """The mean of `gradient(params, batch, keys)` over parts of a batch, one after the other.
+def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[..., Any]:
+    """Return the mean of `gradient(params, batch, keys)` over parts of a batch, taken in turn.
 
-    Part i takes every `parts`-th sample from the i-th on, so that each device's samples stay on it.
+    Part i has every `parts`-th sample from the i-th on, so that each device's samples stay on it.
     """
 
     def split(x: jax.Array) -> jax.Array:
@@ -217,7 +225,7 @@ def in_parts(gradient: Callable[..., Any], parts: int) -> Callable[..., Any]:
 def make_validation(
     task: Task, graph: nnx.GraphDef
 ) -> Callable[[nnx.State, nnx.State, Batch], Metrics]:
-    """The validation function of trained weights, frozen weights and a batch."""
+    """Return the validation, a function of trained weights, frozen weights and batch."""
 
     def validate(params: nnx.State, frozen: nnx.State, batch: Batch) -> Metrics:
         return task.validate(nnx.merge(graph, params, frozen), batch)
@@ -227,29 +235,35 @@ def make_validation(
 
 @dataclass(frozen=True, kw_only=True)
 class Programs:
-    """The update and the validation of a task, and the shapes and shardings that they take."""
+    """The jitted update and validation of a task, with the shapes and shardings of their arguments.
+
+    Needs no weights and no data, and no devices either if the mesh is abstract.
+    """
 
     graph: nnx.GraphDef
-    """Of the networks."""
+    """Graph of the task's networks."""
     create: Callable[[], TrainState]
-    """What makes the first state, from random weights."""
+    """Function that returns the initial state, from random weights."""
     state: TrainState
-    """The state's shapes."""
+    """Shapes of the state."""
     state_sharding: Any
-    """Where the state lies."""
+    """Shardings of the state."""
     frozen: Any
-    """Shapes of the weights that stay as they are."""
+    """Shapes of the frozen weights."""
     frozen_sharding: Any
-    """Where those lie."""
+    """Shardings of the frozen weights."""
     update: Any
-    """The jitted `step.make_update`."""
+    """Jitted `make_update`, which donates the state."""
     validate: Any
-    """The jitted `step.make_validation`."""
+    """Jitted `make_validation`."""
 
     @classmethod
-    def of(cls, task: Task, training: Training, mesh: Mesh) -> Programs:
-        """Those of a task on a mesh. Raises `InputError` if the mesh does not divide the batch."""
-        check_batch(training.batch_size, mesh, training.accumulate)
+    def of(cls, task: Task, training: TrainConfig, mesh: Mesh) -> Programs:
+        """Return the programs of a task on a mesh.
+
+        Raises `InputError` if the mesh does not divide the batch.
+        """
+        check_batch(training.batch_size, mesh, training.grad_accum_steps)
         graph, _, frozen = nnx.split(
             nnx.eval_shape(lambda: task.networks(nnx.Rngs(0))), task.trained, ...
         )
@@ -271,7 +285,7 @@ class Programs:
             training.optimizer,
             steps=training.steps,
             seed=training.seed,
-            accumulate=training.accumulate,
+            grad_accum_steps=training.grad_accum_steps,
         )
         return cls(
             graph=graph,

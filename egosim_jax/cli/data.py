@@ -110,12 +110,12 @@ class Encode:
 
     def run(self) -> int:
         """Encode shard after shard."""
-        from egosim_jax.train.distributed import NAMES, joined
+        from egosim_jax.train.distributed import NAMES, distributed_context
 
         counts = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
         tasks = [os.environ.get(name, "1") for name in counts]
         several = os.environ.keys() & {*NAMES} or any(number != "1" for number in tasks)
-        with joined() if several else contextlib.nullcontext():
+        with distributed_context() if several else contextlib.nullcontext():
             self._encode()
         print(self.out)
         return DONE
@@ -126,10 +126,10 @@ class Encode:
         from egosim_jax import configs
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.sharding import make_mesh
-        from egosim_jax.train.encode import cache
+        from egosim_jax.train.encode import encode_shards
 
         mesh = make_mesh(MeshConfig(data=-1, fsdp=1), jax.local_devices())
-        cache(
+        encode_shards(
             configs.get(self.config).at(self.weights),
             self.weights,
             source=ShardReader(self.shards),

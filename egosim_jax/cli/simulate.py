@@ -81,7 +81,7 @@ class Simulate:
             "weights": hashes(weights),
             "image": None if self.first_frame is None else sha256(self.first_frame),
         }
-        open_folder(folder, made_of, may_differ=["simulate.weights", "simulate.first_frame"])
+        open_folder(folder, made_of, mutable=["simulate.weights", "simulate.first_frame"])
         kind = "robot" if self.robot else "human"
         truth = list(make_sequence(self.seed, spec=config.video, clips=self.clips, kind=kind))
         simulator = Simulator(

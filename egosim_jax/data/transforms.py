@@ -69,6 +69,25 @@ class DecodeWindow(grain.transforms.RandomMap):
         return decode_record(element, self.spec, start=start)
 
 
+@dataclass(frozen=True)
+class RandomCrop(grain.transforms.RandomMap):
+    """A random crop, `rows x columns`, of a random window of one of a record's color videos."""
+
+    spec: VideoSpec
+    size: tuple[int, int]
+    probs: tuple[float, float, float]
+    """Probabilities of the videos in `COLORS`."""
+
+    def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
+        """Return the crop as `video`."""
+        stream = str(rng.choice(COLORS, p=self.probs))
+        video = DecodeWindow(self.spec).random_map(element, rng)[stream]
+        rows, columns = self.size
+        top = int(rng.integers(0, self.spec.height - rows + 1))
+        left = int(rng.integers(0, self.spec.width - columns + 1))
+        return {"video": video[:, top : top + rows, left : left + columns]}
+
+
 def record_length(arrays: Mapping[str, np.ndarray]) -> int:
     """Return the number of frames of a record's prior, encoded or decoded."""
     prior = arrays.get("prior")

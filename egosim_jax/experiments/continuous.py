@@ -59,7 +59,7 @@ class Continuous:
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         made_of = {"experiment": self, "weights": hashes(weights)}
-        open_folder(self.out, made_of, may_differ=["experiment.weights"])
+        open_folder(self.out, made_of, mutable=["experiment.weights"])
         generator = Generator(config.at(weights), Networks.load(config, weights))
         seeds = range(self.first_scene, self.first_scene + self.sequences)
         jobs = [(method, seed) for seed in seeds for method in METHODS]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from egosim_jax.experiments.real_tiny import Comparison
@@ -22,18 +21,19 @@ class Debug:
 
     def run(self) -> int:
         """Train, generate, compare, draw."""
-        from egosim_jax.train.recipes import Debug as Recipe
+        from egosim_jax.train.from_scratch import SYNTHETIC_CLIPS
+        from egosim_jax.train.recipes import DEBUG
 
-        plan = Recipe(out=self.out)
-        recipe = dataclasses.replace(
-            plan,
-            vae=dataclasses.replace(plan.vae, steps=self.steps),
-            denoiser=dataclasses.replace(plan.denoiser, steps=self.steps),
+        recipe = replace(
+            DEBUG,
+            out=self.out,
+            vae=replace(DEBUG.vae, steps=self.steps),
+            denoiser=replace(DEBUG.denoiser, steps=self.steps),
         )
         recipe.run()
         return Comparison(
             config="debug",
-            metadata=recipe.metadata,
+            metadata=self.out / SYNTHETIC_CLIPS,
             out=self.out,
             start=(0,),
             seed=self.seed,

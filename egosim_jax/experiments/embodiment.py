@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from egosim_jax.generator import Generator
     from egosim_jax.networks import ModelConfig
-    from egosim_jax.train.config import Training
+    from egosim_jax.train.config import TrainConfig
     from egosim_jax.types import Kind
 
 Videos = Mapping[str, Sequence["np.ndarray"]]
@@ -75,19 +75,19 @@ class Stage:
     seed: int = 0
     """Seed of the initial weights, the order of the clips and the noise."""
 
-    def training(self) -> Training:
+    def training(self) -> TrainConfig:
         """The same for the training script, with eight validations and checkpoints."""
-        from egosim_jax.train.config import OptimizerConfig, Training
+        from egosim_jax.train.config import OptimizerConfig, TrainConfig
 
         every = max(1, self.steps // 8)
-        return Training(
+        return TrainConfig(
             steps=self.steps,
             batch_size=self.batch_size,
             optimizer=OptimizerConfig(
-                rule=self.rule,
+                name=self.rule,
                 learning_rate=self.learning_rate,
-                warmup=self.warmup,
-                decay="cosine",
+                warmup_steps=self.warmup,
+                schedule="cosine",
             ),
             seed=self.seed,
             save_every=every,
@@ -150,7 +150,7 @@ class Embodiment:
         for stage in (self.people, self.full, self.lora, self.scratch):
             stage.training()  # refuses what cannot be, before there is work to lose
         settings = {"experiment": self, "weights": hashes(self._origin)}
-        open_folder(self.out, settings, may_differ=["experiment.out", "experiment.weights"])
+        open_folder(self.out, settings, mutable=["experiment.out", "experiment.weights"])
         made = self._train_all()
         scenes = [
             Scene.make(seed, self._model.video, "robot")
@@ -209,7 +209,7 @@ class Embodiment:
     def _encode(self, split: str, seeds: range, kind: Kind) -> Path:
         """Make the clips of a split, and cache their latents."""
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.train.encode import cache
+        from egosim_jax.train.encode import encode_shards
         from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         model = self._model
@@ -218,7 +218,7 @@ class Embodiment:
         scenes = make_shards(plan, out=frames, workers=os.cpu_count() or 1)
         for _ in track(scenes, f"making {split}", total=len(seeds)):
             pass
-        cache(
+        encode_shards(
             model,
             self._origin,
             source=ShardReader(frames),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,9 +37,9 @@ class RealTiny:
 
     def run(self) -> int:
         """Train, generate, compare, draw."""
-        from egosim_jax.train.recipes import RealTiny as Recipe
+        from egosim_jax.train.recipes import REAL_TINY
 
-        Recipe(metadata=self.metadata, out=self.out).run()
+        replace(REAL_TINY, metadata=self.metadata, out=self.out).run()
         return Comparison(
             config="real_tiny",
             metadata=self.metadata,

@@ -80,7 +80,7 @@ class Tabletop:
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         made_of = {"experiment": self, "weights": hashes(weights)}
-        open_folder(self.out, made_of, may_differ=["experiment.weights"])
+        open_folder(self.out, made_of, mutable=["experiment.weights"])
         generator = Generator(config.at(weights), Networks.load(config, weights))
         kinds: tuple[Kind, ...] = ("human", "robot")
         tables = {kind: self._compare(kind, generator) for kind in kinds}

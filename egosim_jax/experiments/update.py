@@ -71,7 +71,7 @@ class Update:
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         made_of = {"experiment": self, "weights": hashes(weights)}
-        open_folder(self.out, made_of, may_differ=["experiment.weights"])
+        open_folder(self.out, made_of, mutable=["experiment.weights"])
         generator = Generator(config.at(weights), Networks.load(config, weights))
         table: dict[str, list[dict[str, float]]] = {}
         for seed in track(self._seeds(config.video), "scenes", total=self.scenes):

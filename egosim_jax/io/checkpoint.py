@@ -1,14 +1,14 @@
 """Training checkpoints: the only file that knows Orbax.
 
-A checkpoint holds the training state and the position of the data iterator together, is written
-in the background, and is whole or absent: a run that was killed while saving resumes from the
-checkpoint before. Once it is whole, the hashes of its files are written into it, because Orbax
-reads a changed byte as if nothing were wrong; they are compared before it is read.
+A checkpoint holds the training state and the position of the data iterator together, and is
+written atomically in the background: a run that was killed while saving resumes from the checkpoint
+before. Once it is complete, the hashes of its files are written into it, because Orbax does not
+notice a changed byte; they are compared before it is read.
 """
 
 from __future__ import annotations
 
-import logging
+import dataclasses
 import shutil
 import sys
 from collections.abc import Iterator
@@ -23,24 +23,24 @@ from orbax.checkpoint import v1 as ocp
 
 from egosim_jax.io.atomic import TEMPORARY
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.renamed import STATE as STATE_NAMES
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import listing, quote_text, read_json
 from egosim_jax.types import InputError
 
 STATE, DATA = "state", "data"
 HASHES = "sha256.json"
-"""In the folder of a checkpoint: the hash of every other file in it."""
+"""File in a checkpoint's folder with the hash of every other file in it."""
 
 
 class Checkpoints:
-    """The checkpoints of one run folder: the newest `keep`, and those of every `keep_every` steps.
+    """The checkpoints of one run folder: the newest `keep`, and one every `keep_every` steps.
 
-    Close it, also after an error: saving goes on in a thread. Raises `InputError` if what Orbax
-    has to know of a checkpoint before it reads any is damaged.
+    Close it, also after an error: saving continues in a thread. Raises `InputError` if the metadata
+    that Orbax reads first is damaged.
     """
 
     def __init__(self, folder: Path, *, keep: int = 2, keep_every: int | None = None):
-        logging.getLogger("absl").setLevel(logging.CRITICAL)  # what goes wrong is raised, too
         self.folder, self.keep = folder.absolute(), keep
         policies = ocp.training.preservation_policies
         preserve: Any = [policies.LatestN(keep)]
@@ -48,7 +48,7 @@ class Checkpoints:
             preserve.append(policies.EveryNSteps(keep_every))
         always = ocp.training.save_decision_policies.FixedIntervalPolicy(1)
         try:
-            # Orbax declares protocols that its own policies and pathlib do not meet to the letter.
+            # Orbax declares protocols that its policies and pathlib do not satisfy exactly.
             self._checkpointer = ocp.training.Checkpointer(
                 self.folder,  # pyright: ignore[reportArgumentType]
                 preservation_policy=policies.AnyPreservationPolicy(preserve),  # pyright: ignore[reportArgumentType]
@@ -60,23 +60,23 @@ class Checkpoints:
             damage = [line for step in steps for line in self._damage(step)]
             raise InputError(
                 f"The checkpoints in {self.folder} cannot be listed: "
-                f"{listing(damage) or quote_text(str(error))}. Bring the files back, or move the "
+                f"{listing(damage) or quote_text(str(error))}. Restore the files, or move the "
                 "damaged checkpoint away."
             ) from error
         self._thread = ThreadPoolExecutor(1)
         self._saving: tuple[int, Future[None]] | None = None
         if self.steps and not (self.folder / str(self.steps[-1]) / HASHES).exists():
-            self._write_hashes(self.steps[-1])  # it was killed just then
+            self._write_hashes(self.steps[-1])  # the run was killed before it did
 
     @property
     def steps(self) -> list[int]:
-        """Finished updates in each checkpoint, oldest first."""
+        """Steps of the checkpoints, ascending."""
         return sorted(checkpoint.step for checkpoint in self._checkpointer.checkpoints)
 
     def check_room(self, state: Any) -> None:
         """Raise `InputError` unless the disk has room for the checkpoints that will be kept."""
         sizes = [leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)]
-        # The newest one is whole before the oldest one goes.
+        # The newest one is complete before the oldest one is deleted.
         need = sum(sizes) * (self.keep + 1 - min(self.keep, len(self.steps)))
         free = shutil.disk_usage(self.folder).free
         if free < need:
@@ -87,9 +87,9 @@ class Checkpoints:
             )
 
     def save(self, step: int, state: Any, data: Any) -> None:
-        """Start saving; waits only for a save that is still running.
+        """Start saving, after waiting for a save that is still running.
 
-        Raises what `wait` raises, of the save before.
+        Raises the error of that save, as `wait` does.
         """
         self.wait()
         with self._explained(step):
@@ -107,24 +107,24 @@ class Checkpoints:
 
     @contextmanager
     def _explained(self, step: int) -> Iterator[None]:
-        """Say of a full disk what was not saved, and what stands."""
+        """Raise `InputError` for a full disk, naming the step and the newest checkpoint."""
         try:
             yield
         except Exception as error:
             if not any("No space left" in str(cause) for cause in _causes(error)):
                 raise
             kept = max((kept for kept in self.steps if kept < step), default=None)
-            stands = "there is none before it" if kept is None else f"that of step {kept} stands"
+            newest = "there is no other" if kept is None else f"the newest is that of step {kept}"
             raise InputError(
                 f"The disk of {self.folder} is full: the checkpoint of step {step} was not saved, "
-                f"{stands}. Free space and run the same command again. (--out)"
+                f"{newest}. Free space and run the same command again. (--out)"
             ) from error
 
     def restore(self, state: Any, data: Any, *, fallback: bool = False) -> Any:
-        """The newest state, placed as the shardings of the abstract `state` say.
+        """Return the newest state, with the shardings of the abstract `state`.
 
-        `data` is set to the saved position in place. With `fallback` a damaged checkpoint is set
-        aside and the one before it taken. Raises `InputError` naming the damaged files, or listing
+        `data` is set to the saved position in place. With `fallback` a damaged checkpoint is moved
+        away and the one before it used. Raises `InputError` naming the damaged files, or listing
         the paths that differ when the checkpoint was made by another model or optimizer.
         """
         for step in reversed(self.steps):
@@ -135,15 +135,15 @@ class Checkpoints:
             message += f": {listing(damage)}."
             if not fallback:
                 raise InputError(
-                    f"{message} Bring the files back, or take the checkpoint before it. "
+                    f"{message} Restore the files, or use the checkpoint before it. "
                     "(--training.fallback)"
                 )
             print(message, file=sys.stderr)
             self._set_aside(step)
-        raise InputError(f"There is no sound checkpoint in {self.folder}.")
+        raise InputError(f"There is no valid checkpoint in {self.folder}.")
 
     def close(self) -> None:
-        """Wait until everything is on disk."""
+        """Wait until all saves are on disk, and end the thread."""
         try:
             self.wait()
         finally:
@@ -152,7 +152,7 @@ class Checkpoints:
                 self._checkpointer.close()
 
     def _seal(self, step: int, response: Any) -> None:
-        """Once the checkpoint is whole, write the hashes of its files into it."""
+        """Write the hashes of a checkpoint's files into it, once it is complete."""
         response.result()
         self._write_hashes(step)
 
@@ -163,9 +163,9 @@ class Checkpoints:
             write_json(folder / HASHES, digests)
 
     def _damage(self, step: int) -> list[str]:
-        """Which files of a checkpoint are not as they were written.
+        """Return a line for each file of a checkpoint that differs from its hash.
 
-        A run that was killed before the hashes were there left a checkpoint that is whole.
+        Without hashes there is none: the run was killed between the checkpoint and its hashes.
         """
         folder = self.folder / str(step)
         if not (folder / HASHES).exists():
@@ -175,20 +175,20 @@ class Checkpoints:
         except InputError as error:
             return [str(error).removesuffix(".")]
         if not isinstance(wanted, dict):
-            return [f"{folder / HASHES} holds no hashes"]
+            return [f"{folder / HASHES} has no hashes"]
         files = _files(folder)
         missing = [
             f"{folder / quote_text(name)} is missing"
             for name in sorted(wanted.keys() - files.keys())
         ]
         return missing + [
-            f"{files[name]} is not what was written"
+            f"{files[name]} differs from its hash"
             for name in sorted(wanted.keys() & files.keys())
             if sha256(files[name]) != wanted[name]
         ]
 
     def _set_aside(self, step: int) -> None:
-        multihost_utils.sync_global_devices(f"damaged {step}")  # all have looked at it
+        multihost_utils.sync_global_devices(f"damaged {step}")  # all have checked it
         if jax.process_index() == 0:
             aside = self.folder.with_name("damaged") / str(step)
             shutil.rmtree(aside, ignore_errors=True)
@@ -198,27 +198,31 @@ class Checkpoints:
         self._checkpointer.reload()
 
     def _load(self, step: int, state: Any, data: Any) -> Any:
+        kind = type(state)
         try:
-            self._check_shapes(step, state)
+            saved = self._checkpointer.metadata(step).metadata
+            fields = _saved_fields(saved, state)
+            state = {name: getattr(state, field) for name, field in fields.items()} or state
+            self._check_shapes(step, saved, state)
             loaded = self._checkpointer.load_checkpointables(step, {STATE: state, DATA: data})
         except InputError:
             raise
         except Exception as error:
-            # Orbax wraps what the data iterator says about a position of other data.
+            # Orbax wraps the data iterator's error about a position in other data.
             if isinstance(error.__cause__, InputError):
                 raise error.__cause__ from error
             raise InputError(
                 f"The checkpoint of step {step} in {self.folder} cannot be read, although its "
-                f"files are those of {HASHES}: {quote_text(str(error))}. Move it away to take the "
+                f"files match {HASHES}: {quote_text(str(error))}. Move it away to resume from the "
                 "one before it."
             ) from error
-        return loaded[STATE]
+        values = loaded[STATE]
+        return kind(**{field: values[name] for name, field in fields.items()}) if fields else values
 
-    def _check_shapes(self, step: int, state: Any) -> None:
-        saved = _shapes(self._checkpointer.metadata(step).metadata)
-        wanted = _shapes(state)
+    def _check_shapes(self, step: int, metadata: Any, state: Any) -> None:
+        saved, wanted = _shapes(metadata), _shapes(state)
         if not saved:
-            raise ValueError("it lists no arrays")
+            raise ValueError("its metadata lists no arrays")
         problems = [
             f"{path}: checkpoint has {saved.get(path, 'nothing')}, "
             f"config expects {wanted.get(path, 'nothing')}"
@@ -227,7 +231,7 @@ class Checkpoints:
         ]
         if problems:
             raise InputError(
-                f"The checkpoint of step {step} in {self.folder} is of another model or "
+                f"The checkpoint of step {step} in {self.folder} was made by another model or "
                 f"optimizer. Use its config, or another --out: {listing(problems)}."
             )
 
@@ -238,14 +242,22 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _is_ours(path: Path) -> bool:
-    """Whether it is the file of hashes, or what a kill left of it."""
+def _is_hashes(path: Path) -> bool:
+    """Return whether a path is the file of hashes, or its temporary file of a killed run."""
     return path.name == HASHES or (path.name.startswith(".sha256.") and TEMPORARY in path.name)
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    found = (path for path in folder.rglob("*") if path.is_file() and not _is_ours(path))
+    found = (path for path in folder.rglob("*") if path.is_file() and not _is_hashes(path))
     return {str(path.relative_to(folder)): path for path in sorted(found)}
+
+
+def _saved_fields(saved: Any, state: Any) -> dict[str, str]:
+    """Return the fields of `state` by their old names, if a checkpoint has those; else nothing."""
+    if not dataclasses.is_dataclass(state) or not STATE_NAMES.keys() & set(saved):
+        return {}
+    old = {field: name for name, field in STATE_NAMES.items()}
+    return {old.get(field.name, field.name): field.name for field in dataclasses.fields(state)}
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:

@@ -1,4 +1,4 @@
-"""The folder of a run: its config, its environment, and files that are whole or absent."""
+"""Run folders: their config, their environment, and atomic writing of text and JSON."""
 
 from __future__ import annotations
 
@@ -14,28 +14,29 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
+from egosim_jax.io.renamed import upgrade
 from egosim_jax.io.untrusted import listing, quote, quote_text, read_json
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
-PLACE = "out"
-"""Name of fields that say where to write."""
+OUTPUT = "out"
+"""Name of fields that hold an output folder, which are not compared."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "av")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write dataclasses, mappings, sequences, numbers and paths as JSON, whole or not at all."""
+    """Write dataclasses, mappings, sequences, numbers and paths as JSON, atomically."""
     write_text(path, json.dumps(plain(value), indent=2) + "\n")
 
 
 def plain(value: Any) -> Any:
-    """The JSON form of a value; dataclasses carry their class name so that unions stay readable."""
+    """Return the JSON form of a value; dataclasses get their class name as `type`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"type": type(value).__name__, **fields}
@@ -51,7 +52,7 @@ def plain(value: Any) -> Any:
 
 
 def environment() -> dict[str, Any]:
-    """Versions, devices and the commit: an allow-list, so that no secret is ever recorded."""
+    """Return versions, devices and the commit: an allow-list, so that no secret is recorded."""
     import jax
 
     return {
@@ -66,23 +67,23 @@ def environment() -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout this package runs from, if it is one."""
+    """Return the commit of the checkout that this package runs from, if it is one."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)  # noqa: S603
+        result = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
-    return answer.stdout.strip()
+    return result.stdout.strip()
 
 
-def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) -> None:
-    """Make a run folder and record config and environment, or continue in one of equal config.
+def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> None:
+    """Create a run folder with config and environment, or resume in one with an equal config.
 
-    The folder is locked until the process ends. Fields named `out` are places, not settings: a
-    folder that was moved stays the same run. Fields whose dotted paths are in `may_differ`, with
-    all below them, may differ, too. Of several processes the first one locks and writes. Raises
-    `InputError` when the folder cannot be written, is in use, lost its record, or holds a run of
-    another config, naming the fields that differ.
+    The folder is locked until the process ends. Fields named `out` are not compared, so that a
+    folder can be moved, and neither are fields whose dotted paths are in `mutable`, or below them.
+    A config of an earlier version is compared under today's names. Of several processes the first
+    one locks and writes. Raises `InputError` when the folder cannot be written, is in use, lost its
+    config, or holds a run of another config, naming the fields that differ.
     """
     import jax
 
@@ -95,16 +96,16 @@ def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) 
         raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
     if recorded is None and (folder / ENVIRONMENT).exists():
         raise InputError(
-            f"{path} is missing, although {folder} holds a run: without it nobody knows of which "
-            "config. Restore it, or choose another --out."
+            f"{path} is missing, although {folder} holds a run: its config is unknown. Restore the "
+            "file, or choose another --out."
         )
     if recorded is not None:
         if not isinstance(recorded, dict):
-            raise InputError(f"{path} is not the record of a config. Restore it. (--out)")
+            raise InputError(f"{path} is not a config. Restore it. (--out)")
         differing = [
             f"{field}: {what}"
-            for field, what in sorted(_differences(recorded, wanted).items())
-            if not any(f"{field}.".startswith(f"{free}.") for free in may_differ)
+            for field, what in sorted(_differences(upgrade(recorded), wanted).items())
+            if not any(f"{field}.".startswith(f"{free}.") for free in mutable)
         ]
         if differing:
             raise InputError(
@@ -117,11 +118,11 @@ def open_folder(folder: Path, config: Any, *, may_differ: Collection[str] = ()) 
 
 
 def _differences(have: Any, want: Any, path: str = "") -> dict[str, str]:
-    """Return what differs by the dotted path of its field; places to write to are not compared."""
+    """Return the differences by dotted path, `out` fields excluded."""
     if isinstance(have, dict) and isinstance(want, dict):
         found = {}
         for key in have.keys() | want.keys():
-            if key != PLACE:
+            if key != OUTPUT:
                 below = f"{path}.{quote_text(key)}" if path else quote_text(key)
                 found |= _differences(have.get(key), want.get(key), below)
         return found

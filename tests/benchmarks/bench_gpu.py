@@ -281,9 +281,9 @@ def _model(options: argparse.Namespace, kernel: Any, remat: Any) -> ModelConfig:
 
 
 def _stage(model: ModelConfig, clips: int) -> Stage:
-    paths = {name: Path() for name in ("latents", "weights", "out")}
-    task, training = recipes.Egosim14B(**paths).stages()["training"]
-    return Stage(replace(task, model=model), replace(training, batch_size=clips, accumulate=1))
+    task, training = recipes.EGOSIM_14B.stages()["training"]
+    training = replace(training, batch_size=clips, grad_accum_steps=1)
+    return Stage(replace(task, model=model), training)
 
 
 def _forward_flops(config: ModelConfig) -> float:

@@ -183,7 +183,7 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
 
     task = Denoising(model=config, objective=Objective(schedule=config.schedule))
     graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)
-    optimizer = OptimizerConfig(rule="muon")
+    optimizer = OptimizerConfig(name="muon")
     update = jax.jit(make_update(task, graph, optimizer, steps=steps, seed=0), donate_argnums=0)
     state = TrainState.create(params, optimizer, steps)
     with closing(make_loader(source, batch_size=BATCH, seed=0)) as batches:

@@ -151,7 +151,7 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
         fill(network, translate(tensors, rules, ignore=ignored))
     graph, params, frozen = nnx.split(networks, task.trained, ...)
 
-    optimizer = OptimizerConfig(rule="muon", learning_rate=LEARNING_RATE)
+    optimizer = OptimizerConfig(name="muon", learning_rate=LEARNING_RATE)
     update = jax.jit(make_update(task, graph, optimizer, steps=1, seed=0), donate_argnums=0)
     state = TrainState.create(params, optimizer, steps=1)
     placed = {name: jnp.asarray(array) for name, array in batch.items()}
@@ -160,7 +160,7 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
         nonlocal state
         state, metrics = update(state, frozen, placed)
         jax.block_until_ready(state)
-        return float(metrics["loss"]), float(metrics["gradient_norm"])
+        return float(metrics["loss"]), float(metrics["grad_norm"])
 
     return step
 

@@ -26,7 +26,6 @@ from egosim_jax.preflight.report import Report, plain
 from egosim_jax.preflight.targets import find
 from egosim_jax.sharding import make_mesh, parts
 from egosim_jax.train import recipes
-from egosim_jax.train.config import Recipe
 from egosim_jax.train.preflight import compile_step
 from egosim_jax.types import MeshConfig
 
@@ -37,13 +36,7 @@ REMATS = ("full", "attention", "projections", "products", "none", "offload")
 SHARES = (("h200:8", (1, 2, 4)), ("h100:8", (1, 2, 4)), ("v5p:2x2x2", (1,)), ("v6e:8x8", (1,)))
 """Where all of the 14B is trained, and with how many clips on a device at a time."""
 TARGETS = ("h200:8", "h100:8", "h200:1", "h100:1", "b200:8", "v5p:2x2x2", "v6e:4x4", "v6e:8x8")
-RECIPES: dict[str, type[Recipe]] = {
-    "egosim_14b": recipes.Egosim14B,
-    "egosim_1_3b": recipes.Egosim1B,
-    "egosim_14b_robot": recipes.Egosim14BRobot,
-    "egosim_14b_fewshot": recipes.Egosim14BFewshot,
-    "egosim_14b_lora": recipes.Egosim14BLora,
-}
+RECIPES = ("egosim_14b", "egosim_1_3b", "egosim_14b_robot", "egosim_14b_fewshot", "egosim_14b_lora")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,18 +49,17 @@ class Training:
     remat: str | None = None
 
     def measure(self) -> dict[str, Any]:
-        paths = {name: Path() for name in ("latents", "weights", "out")}
-        recipe: Any = RECIPES[self.recipe](**paths, remat=self.remat)
+        recipe: Any = replace(recipes.get(self.recipe), remat=self.remat)
         (stage,) = recipe.stages().values()
         target = find(self.target)
         groups = parts("batch", make_mesh(stage.training.mesh, target.devices))
         batch = max(stage.training.batch_size, groups)  # one clip a device at least
-        accumulate = stage.training.accumulate
+        accumulate = stage.training.grad_accum_steps
         if self.clips is not None:
             accumulate = max(1, batch // groups // self.clips)
         elif batch % (groups * accumulate):
             accumulate = batch // groups
-        training = replace(stage.training, batch_size=batch, accumulate=accumulate)
+        training = replace(stage.training, batch_size=batch, grad_accum_steps=accumulate)
         report = compile_step(stage._replace(training=training), target)
         return {**plain(report), "clips": batch // groups // accumulate, "batch": batch}
 

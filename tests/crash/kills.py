@@ -28,7 +28,7 @@ IGNORED = {
     "the log and the weights, is compared",
 }
 """Files, and folders with all that is in them, that two runs without a kill do not share."""
-TOLD = ("seconds", "chain", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
+TOLD = ("step_time_s", "chain", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min")
 """Fields of a log's lines that a clock tells, or that are a hash over such fields."""
 MODEL = "--config debug --weights ../weights"
 OF_A_CLIP = "--frames 9 --height 64 --width 96 --fps 16 --workers 1"

@@ -193,8 +193,8 @@ def _journal(place: Path, inputs: Path, version: int) -> None:
 
 
 def _config(place: Path, inputs: Path, version: int) -> None:
-    may_differ = ["version"]
-    open_folder(place / "run", {"version": version, "clips": 3}, may_differ=may_differ)
+    mutable = ["version"]
+    open_folder(place / "run", {"version": version, "clips": 3}, mutable=mutable)
 
 
 def _read_config(place: Path) -> Read:
@@ -247,7 +247,7 @@ def _encode(place: Path, inputs: Path, version: int) -> None:
 
     encode.Encoding = Encoding
     Networks.load = lambda *_, **__: None
-    encode.cache(
+    encode.encode_shards(
         configs.get("debug"), inputs / "weights", source=ShardReader(inputs / "frames0"),
         out=place / "shards", stride=1, batch_size=1, shard_windows=1,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from egosim_jax.cli import view
-from egosim_jax.train.distributed import own_address
+from egosim_jax.train.distributed import free_local_address
 from tests import flags
 from tests.training.line import write_points
 
@@ -69,7 +69,7 @@ def test_what_listens_everywhere_would_be_seen():
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_training_listens_on_the_loopback_alone(tmp_path, count):
-    data, address = write_points(tmp_path), own_address()
+    data, address = write_points(tmp_path), free_local_address()
     settings = json.dumps({"steps": 20, "save_every": 10, "pause": 0.05})
     processes = []
     for index in range(count):
@@ -130,7 +130,7 @@ def test_the_viewer_is_told_to_listen_on_the_loopback_unless_an_address_is_named
 
 
 def test_rerun_listens_where_it_is_told():
-    port = own_address().rpartition(":")[2]
+    port = free_local_address().rpartition(":")[2]
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--serve-grpc"]
     process = subprocess.Popen([*command, "--port", port], stderr=subprocess.DEVNULL)
     try:

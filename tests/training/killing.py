@@ -9,19 +9,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from egosim_jax.train.distributed import own_address
+from egosim_jax.train.distributed import free_local_address
 from tests.flags import QUICK
 
 ROOT = Path(__file__).parents[2]
 
 
 def logged(out: Path) -> list[dict[str, float]]:
-    """The log of a run, without what is told by a clock; a line that is cut off is not one yet."""
+    """Return the log of a run without timings; a last line that is cut off is omitted."""
     path = out / "metrics.jsonl"
-    told = ("seconds", "waiting", "tflops", "mfu", "gigabytes", "minutes_left")
+    timings = ("step_time_s", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min")
     text = path.read_text("utf-8") if path.exists() else ""
     return [
-        {name: value for name, value in json.loads(line).items() if name not in told}
+        {name: value for name, value in json.loads(line).items() if name not in timings}
         for line in text.splitlines(keepends=True)
         if line.endswith("\n")
     ]
@@ -37,9 +37,9 @@ class Run:
         self.command = [*program, str(data), str(out), str(steps), str(save_every)]
 
     def start(self) -> list[subprocess.Popen]:
-        """Start it, or let it go on."""
-        address = own_address()
-        started, self._left = [], self._half_written()
+        """Start or resume it."""
+        address = free_local_address()
+        started, self._left = [], self._incomplete()
         for index in range(self.processes):
             environment = os.environ | {"XLA_FLAGS": QUICK}
             if self.processes > 1:
@@ -59,14 +59,14 @@ class Run:
     def finish(self) -> None:
         """Let it run to its end."""
         codes = [process.wait(timeout=900) for process in self.start()]
-        assert codes == [0] * self.processes, self.said()
+        assert codes == [0] * self.processes, self.output()
 
     def kill_when(self, ready: Callable[[], bool]) -> bool:
-        """Start it and kill all processes as soon as `ready`; whether it was before its end."""
+        """Kill all processes as soon as `ready`; return whether they were still running."""
         started = self.start()
         deadline = time.monotonic() + 900
         while not ready() and all(process.poll() is None for process in started):
-            assert time.monotonic() < deadline, self.said()
+            assert time.monotonic() < deadline, self.output()
             time.sleep(0.002)
         killed = all(process.poll() is None for process in started)
         for process in started:
@@ -75,21 +75,21 @@ class Run:
         return killed
 
     def lines(self) -> list[dict[str, float]]:
-        """The log (`logged`)."""
+        """Return the log (`logged`)."""
         return logged(self.out)
 
     def is_saving(self) -> bool:
-        """Whether the processes that run now, or ran last, have a checkpoint half written."""
-        return bool(self._half_written() - self._left)
+        """Return whether the processes that run now, or ran last, have an incomplete checkpoint."""
+        return bool(self._incomplete() - self._left)
 
-    def _half_written(self) -> set[tuple[str, int]]:
-        """Names and inodes: what an earlier kill left goes away only after the next start."""
+    def _incomplete(self) -> set[tuple[str, int]]:
+        """Return names and inodes: those of an earlier kill are removed after the next start."""
         found = set()
         for path in (self.out / "checkpoints").glob("*tmp*"):
             with contextlib.suppress(FileNotFoundError):
                 found.add((path.name, path.stat().st_ino))
         return found
 
-    def said(self) -> str:
-        """What the first process printed last."""
+    def output(self) -> str:
+        """Return the end of the first process's output."""
         return (self.out.parent / f"{self.out.name}_0.log").read_text("utf-8")[-3000:]

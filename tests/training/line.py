@@ -1,6 +1,6 @@
-"""A line fitted to points: a task that compiles in a moment, to test what surrounds any task.
+"""A line fitted to points: a task that compiles quickly, to test the loop around any task.
 
-As a program: OUT DATA and JSON of the fields of `Training`, with `hang` a step that never ends.
+As a program: OUT DATA and JSON of the fields of `TrainConfig`, with `hang` a step that never ends.
 """
 
 import json
@@ -19,8 +19,8 @@ from egosim_jax.command import DONE, run_with_exit_codes
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
 from egosim_jax.sharding import MeshConfig
-from egosim_jax.train.config import OptimizerConfig, Training
-from egosim_jax.train.distributed import joined
+from egosim_jax.train.config import OptimizerConfig, TrainConfig
+from egosim_jax.train.distributed import distributed_context
 from egosim_jax.train.loop import train
 
 WIDTH, POINTS = 8, 40
@@ -28,7 +28,7 @@ WIDTH, POINTS = 8, 40
 
 @dataclass(frozen=True)
 class Line:
-    """Squared error of `x @ kernel + bias`; `ids` tells which records a batch has, in order."""
+    """Squared error of `x @ kernel + bias`; `ids` identifies the records of a batch in order."""
 
     pause: float = 0.0
     hang: int = -1
@@ -84,11 +84,11 @@ def write_points(folder: Path, *, huge: tuple[int, ...] = (), factor: float = 1e
     return folder
 
 
-def training(**changes: Any) -> Training:
+def training(**changes: Any) -> TrainConfig:
     """A short run that saves often."""
     optimizer = OptimizerConfig(learning_rate=0.05, **changes.pop("optimizer", {}))
     fields = {"steps": 20, "batch_size": 8, "log_every": 1, "save_every": 5, "validate_every": 100}
-    return Training(**{**fields, "optimizer": optimizer, **changes})
+    return TrainConfig(**{**fields, "optimizer": optimizer, **changes})
 
 
 def main(out: str, data: str, changes: str) -> int:
@@ -98,7 +98,7 @@ def main(out: str, data: str, changes: str) -> int:
     task = Line(pause=settings.pop("pause", 0.0), hang=settings.pop("hang", -1))
 
     def run() -> int:
-        with joined():
+        with distributed_context():
             train(task, training(**settings), data=Path(data), validation=None, out=Path(out))
         return DONE
 

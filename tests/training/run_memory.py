@@ -15,7 +15,7 @@ import numpy as np
 from egosim_jax.preflight.targets import find
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train.preflight import compile_step
-from egosim_jax.train.recipes import Tabletop
+from egosim_jax.train.recipes import TABLETOP
 from egosim_jax.train.update import Programs
 
 
@@ -27,7 +27,7 @@ def resident(name: str) -> int:
 
 
 def main() -> None:
-    stage, target = Tabletop(out=Path()).stages()["denoiser"], find("cpu:1")
+    stage, target = TABLETOP.stages()["denoiser"], find("cpu:1")
     task, training = stage
     foretold = compile_step(stage, target).memory.peak
     mesh = make_mesh(training.mesh, target.devices)

@@ -82,7 +82,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
         )
         value, gradients = gradient(state.params, put(0))
         update = jax.jit(
-            make_update(TASK, graph, config, steps=STEPS, seed=0, accumulate=parts),
+            make_update(TASK, graph, config, steps=STEPS, seed=0, grad_accum_steps=parts),
             in_shardings=(sharding, None, placed),
             out_shardings=(sharding, None),
         )

@@ -12,8 +12,8 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io import weights
 from egosim_jax.models.wan.config import WanDiTConfig
-from egosim_jax.train.config import OptimizerConfig, Training
-from egosim_jax.train.distributed import joined
+from egosim_jax.train.config import OptimizerConfig, TrainConfig
+from egosim_jax.train.distributed import distributed_context
 from egosim_jax.train.loop import train
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import VideoSpec
@@ -28,13 +28,17 @@ MODEL = dataclasses.replace(
 TASK = Denoising(model=MODEL, dropout=ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2))
 
 
-def training(steps: int, save_every: int) -> Training:
-    """Muon's and AdamW's moments, an average, dropout and shuffling: what a resume must restore."""
-    return Training(
+def training(steps: int, save_every: int) -> TrainConfig:
+    """Return a config with Muon's and AdamW's moments and an EMA, which a resume must restore."""
+    return TrainConfig(
         steps=steps,
         batch_size=2,
         optimizer=OptimizerConfig(
-            rule="muon", learning_rate=1e-2, warmup=2, decay="cosine", average=0.9
+            name="muon",
+            learning_rate=1e-2,
+            warmup_steps=2,
+            schedule="cosine",
+            ema_decay=0.9,
         ),
         log_every=1,
         save_every=save_every,
@@ -59,10 +63,10 @@ def write_latents(folder: Path, records: int = 7) -> None:
 
 
 def main(data: str, out: str, steps: str, save_every: str) -> int:
-    """Train, and write the weights that come of it."""
+    """Train, and write the weights."""
 
     def run() -> int:
-        with joined():
+        with distributed_context():
             schedule = training(int(steps), int(save_every))
             networks = train(TASK, schedule, data=Path(data), validation=None, out=Path(out))
             weights.save(Path(out) / "dit.safetensors", networks.dit)

@@ -1,4 +1,4 @@
-"""What the denoiser's loss looks at."""
+"""The denoiser's loss weights, and its trained weights."""
 
 import dataclasses
 
@@ -7,27 +7,27 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from egosim_jax.train.tasks.denoising import Denoising, changed_places
+from egosim_jax.train.tasks.denoising import Denoising, loss_weights
 from tests.training.run_tiny import MODEL
 
 
-def test_places_that_change_count_more_and_all_count_one_on_average():
-    truth, prior = np.zeros((2, 2, 4, 4, 16), np.float32), np.zeros((2, 2, 4, 4, 16), np.float32)
-    truth[0, 1, 0, :2] = 3.0  # two of 32 places, by more than a deviation
-    truth[0, 0, 0, 0] = 0.5  # one, by a quarter of its square
-    places = np.asarray(changed_places(jnp.asarray(truth), jnp.asarray(prior), 4.0))[..., 0]
+def test_locations_that_change_weigh_more_with_mean_one():
+    target, prior = np.zeros((2, 2, 4, 4, 16), np.float32), np.zeros((2, 2, 4, 4, 16), np.float32)
+    target[0, 1, 0, :2] = 3.0  # two of 32 weights, by more than a deviation
+    target[0, 0, 0, 0] = 0.5  # one, by a quarter of its square
+    weights = np.asarray(loss_weights(jnp.asarray(target), jnp.asarray(prior), 4.0))[..., 0]
     mean = (29 * 1 + 2 * 5 + 1 * 2) / 32
-    assert places[0, 1, 0, 0] == pytest.approx(5 / mean)
-    assert places[0, 0, 0, 0] == pytest.approx(2 / mean)
-    assert places[0, 0, 3, 3] == pytest.approx(1 / mean)
-    np.testing.assert_allclose(places.mean(axis=(1, 2, 3)), 1, rtol=1e-6)
-    np.testing.assert_array_equal(places[1], 1)
+    assert weights[0, 1, 0, 0] == pytest.approx(5 / mean)
+    assert weights[0, 0, 0, 0] == pytest.approx(2 / mean)
+    assert weights[0, 0, 3, 3] == pytest.approx(1 / mean)
+    np.testing.assert_allclose(weights.mean(axis=(1, 2, 3)), 1, rtol=1e-6)
+    np.testing.assert_array_equal(weights[1], 1)
 
 
-def test_without_change_all_places_count_the_same():
+def test_without_change_loss_weight_all_locations_weigh_one():
     rng = np.random.default_rng(0)
-    truth, prior = rng.normal(size=(2, 1, 2, 3, 4, 16)).astype(np.float32)
-    np.testing.assert_array_equal(changed_places(jnp.asarray(truth), jnp.asarray(prior), 0.0), 1)
+    target, prior = rng.normal(size=(2, 1, 2, 3, 4, 16)).astype(np.float32)
+    np.testing.assert_array_equal(loss_weights(jnp.asarray(target), jnp.asarray(prior), 0.0), 1)
 
 
 def test_a_lora_is_all_that_its_task_trains_and_the_rest_is_in_the_compute_dtype():

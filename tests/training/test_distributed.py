@@ -24,7 +24,7 @@ def initialized(monkeypatch):
 
 
 def test_a_process_on_its_own_listens_on_loopback_and_may_be_suspended(initialized):
-    with distributed.joined():
+    with distributed.distributed_context():
         pass
     ((address, options),) = initialized
     assert options["coordinator_bind_address"] == address[0]
@@ -38,7 +38,7 @@ def test_a_process_on_its_own_listens_on_loopback_and_may_be_suspended(initializ
 def test_several_processes_listen_where_their_address_says(initialized, monkeypatch, host, bound):
     for name, value in zip(distributed.NAMES, (f"{host}:1234", "2", "0"), strict=True):
         monkeypatch.setenv(name, value)
-    with distributed.joined():
+    with distributed.distributed_context():
         pass
     ((_, options),) = initialized
     assert (options["coordinator_bind_address"] == f"{host}:1234") == bound

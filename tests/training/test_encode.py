@@ -25,7 +25,7 @@ from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import Networks
 from egosim_jax.train import encode as caching
-from egosim_jax.train.encode import cache, check_encoders
+from egosim_jax.train.encode import check_encoders, encode_shards
 from egosim_jax.types import InputError, VideoSpec
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ShardReader:
 def encode(source: ShardReader, weights: Path, out: Path, **options) -> None:
     """Twelve windows in three shards of five, five and two."""
     fixed = {"stride": 1, "batch_size": 2, "shard_windows": 5}
-    cache(CONFIG, weights, source=source, out=out, **{**fixed, **options})
+    encode_shards(CONFIG, weights, source=source, out=out, **{**fixed, **options})
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_latents_of_joint_encoders_come_with_their_inputs(encoded):
 
 
 def test_latents_of_frozen_encoders_come_with_their_embeddings(source, weights, tmp_path):
-    cache(FROZEN, weights, source=source, out=tmp_path, stride=4, batch_size=3)
+    encode_shards(FROZEN, weights, source=source, out=tmp_path, stride=4, batch_size=3)
     arrays = ShardReader(tmp_path)[0].arrays
     assert (arrays["text"].shape, arrays["image"].shape) == ((128, 64), (5, 32))
     assert "ids" not in arrays

@@ -69,7 +69,7 @@ def test_rates_are_of_steps_with_their_waits(monkeypatch):
         with clock.phase(phase):
             pass
     numbers = clock.tick(12, 132)
-    assert numbers["seconds"] == 2.0
-    assert numbers["waiting"] == 0.5
+    assert numbers["step_time_s"] == 2.0
+    assert numbers["data_wait_frac"] == 0.5
     assert numbers["mfu"] == pytest.approx(0.5)
-    assert numbers["minutes_left"] == 4.0
+    assert numbers["eta_min"] == 4.0

@@ -1,4 +1,4 @@
-"""Runs that are killed, stopped, hung, or go on elsewhere: programs of their own."""
+"""Runs that are killed, stopped, hung, or resumed on other devices, as separate programs."""
 
 import json
 import os
@@ -14,7 +14,7 @@ import pytest
 from egosim_jax.command import DONE, HUNG, RESUBMIT
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.train.distributed import own_address
+from egosim_jax.train.distributed import free_local_address
 from tests import flags
 from tests.training.killing import logged
 from tests.training.line import write_points
@@ -22,7 +22,7 @@ from tests.training.line import write_points
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 LONG = {"steps": 100, "save_every": 30, "pause": 0.03}
-"""Seconds of steps: jax hears of SIGTERM once a second."""
+"""A run of several seconds: jax checks for SIGTERM once a second."""
 
 
 @pytest.fixture(scope="module")
@@ -83,14 +83,14 @@ def test_sigterm_saves_the_step_and_ends_with_75_and_the_rest_is_the_same(
 def test_a_run_that_hangs_prints_its_stacks_and_ends_with_70(points, tmp_path):
     batches = make_loader(ShardReader(points), batch_size=8, seed=0)
     late = [next(batches)["record"] for _ in range(5)][-1]
-    process = start(tmp_path / "run", points, hang=int(late[0]), patience=1.0)
+    process = start(tmp_path / "run", points, hang=int(late[0]), hang_timeout_s=1.0)
     said = process.communicate(timeout=300)[1]
     assert process.returncode == HUNG, said
-    assert "no step was finished" in said
+    assert "no update finished" in said
     assert "train/loop.py" in said
 
 
-def test_a_run_goes_on_with_other_numbers_of_devices(points, tmp_path):
+def test_a_run_resumes_on_other_numbers_of_devices(points, tmp_path):
     """Relative, in float32: sums are taken in another order. The data is the same, in order."""
     run(tmp_path / "one", points, steps=40)
     out = tmp_path / "run"
@@ -110,7 +110,7 @@ def test_a_run_goes_on_with_other_numbers_of_devices(points, tmp_path):
 
 def pair(out: Path, data: Path, **settings) -> list[subprocess.Popen]:
     """Two processes of one run."""
-    shared = {"JAX_COORDINATOR_ADDRESS": own_address(), "JAX_NUM_PROCESSES": "2"}
+    shared = {"JAX_COORDINATOR_ADDRESS": free_local_address(), "JAX_NUM_PROCESSES": "2"}
     return [
         start(out, data, env={**shared, "JAX_PROCESS_ID": str(index)}, **settings)
         for index in range(2)
@@ -124,7 +124,7 @@ def finish(processes: list[subprocess.Popen]) -> list[int]:
     return codes
 
 
-def test_two_processes_stop_together_and_go_on_as_if_nothing_had_happened(points, tmp_path):
+def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
     schedule = LONG | {"pause": 0.06}
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     assert finish(pair(whole, points, **schedule)) == [DONE, DONE]
@@ -156,7 +156,7 @@ def test_two_processes_stop_together_and_go_on_as_if_nothing_had_happened(points
         ),
     ],
 )
-def test_what_says_half_or_nonsense_of_the_processes_is_refused(points, tmp_path, given, said):
+def test_an_incomplete_or_invalid_process_environment_is_refused(points, tmp_path, given, said):
     process = start(tmp_path / "run", points, env=given)
     assert said in process.communicate(timeout=120)[1]
     assert process.returncode == 2

@@ -1,4 +1,4 @@
-"""What surrounds the update: what is left out, averaged, taken in parts, written and refused."""
+"""The loop around the update: skipped updates, EMA, gradient accumulation, logs and refusals."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def values(networks) -> np.ndarray:
     return np.concatenate([np.ravel(networks.kernel[...]), np.ravel(networks.bias[...])])
 
 
-def test_the_loss_falls_and_the_run_says_where_the_time_went(points, tmp_path, capsys):
+def test_the_loss_falls_and_the_time_spent_is_reported(points, tmp_path, capsys):
     fit(tmp_path, points, validation=points)
     log = logged(tmp_path)
     losses = [line["loss"] for line in log if "loss" in line]
@@ -41,57 +41,60 @@ def test_the_loss_falls_and_the_run_says_where_the_time_went(points, tmp_path, c
     assert list(checked) == [0, 20]
     assert checked[20] < checked[0]
     said = capsys.readouterr().err
-    for phase in ("compiling", "waiting for data", "updates", "validation", "in all"):
+    for phase in ("compiling", "waiting for data", "updates", "validation", "total"):
         assert phase in said
 
 
-def test_an_update_that_is_not_finite_changes_nothing_and_is_named(tmp_path, capsys):
+def test_an_update_that_is_not_finite_is_skipped_and_named(tmp_path, capsys):
     data = write_points(tmp_path / "points", huge=(3,))
     fit(tmp_path / "run", data, steps=10)
     log = logged(tmp_path / "run")
-    out = [line for line in log if line.get("left_out")]
+    out = [line for line in log if line.get("skipped_updates")]
     assert len(out) == 2  # ten batches of eight see each of the forty points twice
     assert all("loss" not in line for line in out)
     assert all(np.isfinite(line["loss"]) for line in log if line not in out)
     said = capsys.readouterr().err
-    assert f"step {out[0]['step']} left out: loss inf" in said
+    assert f"step {out[0]['step']} skipped: loss inf" in said
     assert "point_3" in said
 
 
-def test_weights_after_an_update_that_is_left_out_are_those_before(tmp_path):
+def test_a_skipped_update_changes_no_weight(tmp_path):
     data = write_points(tmp_path / "points", huge=(3,))
     fit(tmp_path / "long", data, steps=10)
-    bad = next(line["step"] for line in logged(tmp_path / "long") if line.get("left_out"))
-    before = values(fit(tmp_path / "before", data, steps=bad - 1, optimizer={"decay": "constant"}))
-    after = values(fit(tmp_path / "after", data, steps=bad, optimizer={"decay": "constant"}))
+    bad = next(line["step"] for line in logged(tmp_path / "long") if line.get("skipped_updates"))
+    before = values(
+        fit(tmp_path / "before", data, steps=bad - 1, optimizer={"schedule": "constant"})
+    )
+    after = values(fit(tmp_path / "after", data, steps=bad, optimizer={"schedule": "constant"}))
     np.testing.assert_array_equal(after, before)
 
 
-def test_three_in_a_row_stop_the_run_with_the_names(tmp_path, capsys):
+def test_three_skips_in_a_row_stop_the_run_with_the_names(tmp_path, capsys):
     data = write_points(tmp_path / "points", huge=tuple(range(POINTS)))
     with pytest.raises(CommandExit, match="3 updates in a row") as stopped:
         fit(tmp_path / "run", data)
     assert stopped.value.code == FAILED
     said = capsys.readouterr().err
-    assert [f"step {n} left out" in said for n in (1, 2, 3, 4)] == [True, True, True, False]
+    assert [f"step {n} skipped" in said for n in (1, 2, 3, 4)] == [True, True, True, False]
 
 
-@pytest.mark.parametrize(("spike", "left_out"), [(2.5, True), (None, False)])
-def test_a_gradient_far_longer_than_usual_is_left_out_on_request(tmp_path, spike, left_out):
+@pytest.mark.parametrize(("factor", "skipped"), [(2.5, True), (None, False)])
+def test_a_spike_of_the_gradient_norm_is_skipped_on_request(tmp_path, factor, skipped):
     data = write_points(tmp_path / "points", huge=(7,), factor=100.0)
-    fit(tmp_path / "run", data, steps=70, log_every=1, save_every=70, optimizer={"spike": spike})
+    optimizer = {"skip_grad_norm_factor": factor}
+    fit(tmp_path / "run", data, steps=70, log_every=1, save_every=70, optimizer=optimizer)
     late = [line for line in logged(tmp_path / "run") if line["step"] > 50]
-    assert any("left_out" in line for line in late) == left_out
+    assert any("skipped_updates" in line for line in late) == skipped
 
 
-def test_a_batch_in_parts_gives_the_same_run(points, tmp_path):
+def test_gradient_accumulation_gives_the_same_run(points, tmp_path):
     """Relative, in float32: sums are taken in another order."""
     whole = values(fit(tmp_path / "whole", points))
-    parts = values(fit(tmp_path / "parts", points, accumulate=4))
+    parts = values(fit(tmp_path / "parts", points, grad_accum_steps=4))
     np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-6)
 
 
-def test_the_average_is_what_its_formula_says(points, tmp_path):
+def test_the_ema_follows_its_formula(points, tmp_path):
     decay, steps = 0.8, 6
     weights = [
         values(fit(tmp_path / str(n), points, steps=n, save_every=n)).astype(float)
@@ -101,20 +104,20 @@ def test_the_average_is_what_its_formula_says(points, tmp_path):
     want = begin
     for now in weights:
         want = decay * want + (1 - decay) * now
-    have = values(fit(tmp_path / "mean", points, steps=steps, optimizer={"average": decay}))
+    have = values(fit(tmp_path / "mean", points, steps=steps, optimizer={"ema_decay": decay}))
     np.testing.assert_allclose(have, want, rtol=1e-5, atol=1e-6)
 
 
-def test_a_run_goes_on_with_other_habits_but_not_with_another_seed(points, tmp_path):
+def test_a_run_resumes_with_other_intervals_but_not_with_another_seed(points, tmp_path):
     fit(tmp_path, points)
-    fit(tmp_path, points, log_every=7, save_every=3, keep=5, patience=9.0)
+    fit(tmp_path, points, log_every=7, save_every=3, keep=5, hang_timeout_s=9.0)
     with pytest.raises(InputError, match=r"training\.seed"):
         fit(tmp_path, points, seed=1)
 
 
 def test_a_batch_that_devices_cannot_share_says_what_would_do(points, tmp_path):
     with pytest.raises(InputError, match=r"A batch of 8 .* 3 parts.* multiple of their product, 3"):
-        fit(tmp_path, points, accumulate=3)
+        fit(tmp_path, points, grad_accum_steps=3)
 
 
 def test_a_mesh_that_is_not_of_the_devices_is_refused(points, tmp_path):
@@ -125,10 +128,10 @@ def test_a_mesh_that_is_not_of_the_devices_is_refused(points, tmp_path):
 def test_tensorboard_gets_the_numbers(points, tmp_path):
     fit(tmp_path, points, tensorboard=True)
     (events,) = (tmp_path / "tensorboard").iterdir()
-    assert b"gradient_norm" in events.read_bytes()
+    assert b"grad_norm" in events.read_bytes()
 
 
-def test_wandb_goes_on_in_the_run_it_began(points, tmp_path, monkeypatch):
+def test_wandb_resumes_its_run(points, tmp_path, monkeypatch):
     begun, logged = [], []
 
     def init(**settings):
@@ -153,9 +156,15 @@ def test_what_is_not_installed_is_named_with_its_extra(points, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("spike", 1.0), ("average", 1.0), ("average", 0.0), ("clip", 0.0)]
+    ("field", "value"),
+    [
+        ("skip_grad_norm_factor", 1.0),
+        ("ema_decay", 1.0),
+        ("ema_decay", 0.0),
+        ("clip_grad_norm", 0.0),
+    ],
 )
-def test_optimizer_settings_that_mean_nothing_are_refused(field, value):
+def test_optimizer_settings_out_of_range_are_refused(field, value):
     with pytest.raises(InputError, match=field):
         OptimizerConfig(**{field: value})
 

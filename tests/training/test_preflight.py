@@ -13,10 +13,9 @@ from jax.sharding import AbstractMesh
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.preflight import targets
 from egosim_jax.train import preflight as module
+from egosim_jax.train import recipes
 from egosim_jax.train.__main__ import main as egosim_train
-from egosim_jax.train.__main__ import with_paths
 from egosim_jax.train.preflight import Setting
-from egosim_jax.train.recipes import Debug
 from tests.flags import devices
 
 pytestmark = pytest.mark.slow
@@ -70,7 +69,18 @@ def test_json_has_the_memory_and_what_does_not_fit_ends_with_1(capsys):
     ("args", "said"),
     [
         (["debug", "--preflight", "h20:8"], "Nearest device: h200"),
-        (["debug", "--preflight", "cpu:1", "--vae.batch-size", "3", "--vae.accumulate", "2"], "3"),
+        (
+            [
+                "debug",
+                "--preflight",
+                "cpu:1",
+                "--vae.batch-size",
+                "3",
+                "--vae.grad-accum-steps",
+                "2",
+            ],
+            "3",
+        ),
         (["debug", "--preflight", "cpu:1", "--vae.mesh.fsdp", "2"], "does not fit 1 devices"),
     ],
 )
@@ -79,16 +89,24 @@ def test_what_cannot_be_compiled_is_refused(args, said, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_only_the_paths_that_a_recipe_needs_are_left_out():
-    given = ["egosim_14b", "--preflight", "h200:8", "--out", "runs/a"]
-    assert with_paths(given) == [*given, "--latents", "-", "--weights", "-"]
-    assert with_paths(["tabletop", "--preflight", "h200:1"])[3:] == ["--out", "-"]
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["egosim_14b", "--out", "runs/a"], "Missing --latents, --weights: required to train."),
+        (["tabletop"], "Missing --out: required to train."),
+        (["real_tiny"], "Missing --out, --metadata: required to train."),
+    ],
+)
+def test_only_a_training_needs_paths(args, said, capsys):
+    assert recipes.get(args[0]).stages()
+    assert egosim_train(args) == 2
+    assert said in capsys.readouterr().err
 
 
 @pytest.fixture
 def room(monkeypatch):
     """Compile nothing: what fits is what is said here, and what was tried can be read."""
-    stage, target = Debug(out=Path()).stages()["denoiser"], targets.find("cpu:1")
+    stage, target = recipes.DEBUG.stages()["denoiser"], targets.find("cpu:1")
     stage = stage._replace(training=replace(stage.training, batch_size=8))
     measured = module.compile_step(stage, target)
 

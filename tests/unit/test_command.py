@@ -16,7 +16,7 @@ from egosim_jax import command
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as convert
 from egosim_jax.train.__main__ import main as train
-from egosim_jax.train.config import Training
+from egosim_jax.train.config import TrainConfig
 from egosim_jax.types import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -64,7 +64,7 @@ def test_a_mistyped_config_gets_a_suggestion(capsys, tmp_path):
 @pytest.mark.parametrize("seed", [-1, 2**64])
 def test_seeds_out_of_range_are_refused(seed, tmp_path, capsys):
     with pytest.raises(InputError, match="--seed must be a whole number"):
-        Training(steps=1, seed=seed)
+        TrainConfig(steps=1, seed=seed)
     args = ["simulate", "--seed", str(seed), "--out", str(tmp_path)]
     assert egosim(args) == command.USAGE
     assert "--seed must be a whole number" in capsys.readouterr().err

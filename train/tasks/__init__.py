@@ -1,1 +1,1 @@
-"""Training tasks: each says what is trained, on which examples and by which loss."""
+"""Training tasks: each has networks, examples and a loss (`update.Task`)."""

@@ -3,11 +3,12 @@
 For a clip x in [-1, 1] with moments mu, log s^2 and a sample z = mu + s e, e ~ N(0, 1), decoded
 to y, the loss is
 
-    (y - x)^2 + edges * (|dx/du - dy/du| over rows and columns) + kl * KL(N(mu, s^2) || N(0, 1))
+    (y - x)^2 + edge_weight * (|dx/du - dy/du| over rows and columns)
+              + kl_weight * KL(N(mu, s^2) || N(0, 1))
 
 each term a mean over its elements. The edge term keeps fingers and small objects, which the
-squared error alone blurs first. The encoder sees all three videos of a triplet (truth,
-scene and hands), because all three are encoded later.
+squared error alone blurs first. The encoder is trained on all three videos of a triplet (target,
+prior and hands), because all three are encoded later.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +24,6 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.video import to_model
-from egosim_jax.data.transforms import COLORS, DecodeWindow
 from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
@@ -32,97 +31,86 @@ from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
 
 @dataclass(frozen=True, kw_only=True)
 class Autoencoding:
-    """The task of training the video VAE on random pieces of clips."""
+    """The task of training the video VAE on random crops of clips."""
 
     vae: WanVAEConfig
-    """The network."""
+    """Config of the VAE."""
     video: VideoSpec
-    """Frames of a piece, and the size of the videos it is cut from."""
+    """Frames of a crop, and the size of the videos that it is cut from."""
     crop: tuple[int, int] = (64, 64)
-    """Rows and columns of a piece in pixels."""
-    weights: tuple[float, float, float] = (0.6, 0.25, 0.15)
-    """How often a piece is of the truth, the scene and the hands."""
-    edges: float = 0.05
+    """Rows and columns of a crop in pixels."""
+    stream_probs: tuple[float, float, float] = (0.6, 0.25, 0.15)
+    """Probabilities that a crop is of the target, the prior and the hands."""
+    edge_weight: float = 0.05
     """Weight of the edge term."""
-    kl: float = 5e-5
+    kl_weight: float = 5e-5
     """Weight of the KL term."""
 
     def __post_init__(self) -> None:
-        """Check that a piece fits into the video and that the VAE can encode it."""
+        """Check that a crop fits into the video and that the VAE can encode it."""
         for name, crop, size in zip(
             ("rows", "columns"), self.crop, (self.video.height, self.video.width), strict=True
         ):
             if crop % SPATIAL_STRIDE or not 0 < crop <= size:
                 raise InputError(
-                    f"A piece of {crop} {name} cannot be cut out of {size}: it must be a multiple "
-                    f"of {SPATIAL_STRIDE} and at most the video's. (crop)"
+                    f"A crop of {crop} {name} cannot be cut out of {size}: it must be a multiple "
+                    f"of {SPATIAL_STRIDE} and at most the video's. (--crop)"
                 )
 
     def networks(self, rngs: nnx.Rngs) -> WanVAE:
-        """The VAE with random weights."""
+        """Return the VAE with random weights."""
         return self.vae.build(rngs=rngs)
 
     @property
     def trained(self) -> Any:
-        """All weights."""
+        """The nnx filter of all weights."""
         return nnx.Param
 
     @property
     def frozen_dtype(self) -> str:
-        """Of nothing."""
+        """Unused: nothing is frozen."""
         return "float32"
 
-    def examples(self) -> grain.transforms.RandomMap:
-        """Cut one random piece out of a record."""
-        return _RandomPiece(self)
+    def examples(self) -> Any:
+        """Return the transform that cuts one random crop out of a record."""
+        from egosim_jax.data.transforms import RandomCrop
+
+        return RandomCrop(self.video, self.crop, self.stream_probs)
 
     def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
-        """Pieces of videos."""
+        """Return the shape of a batch of crops."""
         shape = (batch, self.video.frames, *self.crop, 3)
         return {"video": jax.ShapeDtypeStruct(shape, np.uint8)}
 
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " b"]:
-        """A key of each sample, of which the first one's draws the noise of all."""
+        """Return per-sample keys; the first one draws the noise for the batch."""
         others = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(1, batch))
         return jnp.concatenate([key[None], others])
 
     def loss(
         self, networks: WanVAE, batch: Batch, keys: Key[Array, " b"]
     ) -> tuple[jax.Array, Metrics]:
-        """The loss above, for sampled latents."""
+        """Return the loss of the module docstring, for sampled latents."""
         video = to_model(batch["video"])
         mean, logvar = networks.moments(video)
         latents = mean + jnp.exp(logvar / 2) * jax.random.normal(keys[0], mean.shape)
         decoded = networks.decode_whole(latents)
-        squared = jnp.square(decoded - video).mean()
-        edges = _edge_error(decoded, video)
+        mse = jnp.square(decoded - video).mean()
+        edge_loss = _edge_error(decoded, video)
         kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
-        metrics = {"squared": squared, "edges": edges, "kl": kl, "psnr": _psnr(decoded, video)}
-        return squared + self.edges * edges + self.kl * kl, metrics
+        psnr = _psnr(decoded, video)
+        metrics = {"mse": mse, "edge_loss": edge_loss, "kl": kl, "psnr": psnr}
+        return mse + self.edge_weight * edge_loss + self.kl_weight * kl, metrics
 
     def flops(self, samples: int) -> float:
-        """Not counted."""
+        """Return NaN: not counted."""
         return float("nan")
 
     def validate(self, networks: WanVAE, batch: Batch) -> Metrics:
-        """Reconstruction of the mean latents."""
+        """Return the PSNR of the reconstruction from the mean latents."""
         video = to_model(batch["video"])
         decoded = networks.decode_whole(networks.moments(video)[0])
         return {"psnr": _psnr(decoded, video)}
-
-
-class _RandomPiece(grain.transforms.RandomMap):
-    def __init__(self, task: Autoencoding):
-        self.task = task
-
-    def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
-        """A piece at a random place of a random stream."""
-        task, (rows, columns) = self.task, self.task.crop
-        stream = str(rng.choice(COLORS, p=task.weights))
-        video = DecodeWindow(task.video).random_map(element, rng)[stream]
-        top = int(rng.integers(0, task.video.height - rows + 1))
-        left = int(rng.integers(0, task.video.width - columns + 1))
-        return {"video": video[:, top : top + rows, left : left + columns]}
 
 
 def _edge_error(a: Float[Array, "b f h w 3"], b: Float[Array, "b f h w 3"]) -> jax.Array:
@@ -133,13 +121,13 @@ def _edge_error(a: Float[Array, "b f h w 3"], b: Float[Array, "b f h w 3"]) -> j
 
 
 def _psnr(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) -> jax.Array:
-    """Mean over the clips, in dB, of float frames clipped to [-1, 1]."""
+    """Return the mean PSNR over clips in dB, of float frames clipped to [-1, 1]."""
     error = jnp.square(jnp.clip(decoded, -1, 1) - video).mean(axis=(1, 2, 3, 4))
     return (10 * jnp.log10(4.0 / jnp.maximum(error, 1e-10))).mean()
 
 
 def latent_statistics(vae: WanVAE, videos: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of each latent channel over uint8 videos `f h w 3`."""
+    """Return mean and standard deviation of each latent channel over uint8 videos `f h w 3`."""
     graph, params = nnx.split(vae)
 
     @jax.jit

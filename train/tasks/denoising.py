@@ -1,7 +1,7 @@
-"""Training the denoiser on cached latents, with its small encoders if the model has them.
+"""Training the denoiser on cached latents, with its small encoders if the model trains them.
 
-The loss is the flow-matching objective (`diffusion/objective.py`) of the velocity under a condition
-from which prior, mask, hands and text are dropped at random (`conditioning/dropout.py`).
+The loss is the diffusion objective (`diffusion/objective.py`) under a condition from which prior,
+mask, hands and text are dropped at random (`conditioning/dropout.py`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from egosim_jax.train.flops import count_forward
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import Condition
 
-VALIDATION_TIMES = (0.2, 0.5, 0.8, 0.97)
+VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)
 """Noise levels at which the validation loss is measured."""
 
 
@@ -38,69 +38,69 @@ class Denoising:
     model: ModelConfig
     """The model whose denoiser is trained."""
     objective: Objective = field(default_factory=Objective)
-    """How noise levels are drawn and errors weighted."""
+    """Distribution and weighting of the noise levels."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
-    """How often each condition is hidden."""
-    change: float = 0.0
-    """How much more a place counts where the clip is unlike its prior: at hands, at what they move
-    and at what was not observed, which is little of a picture and all that has to be learnt."""
+    """Dropout rate of each condition."""
+    change_loss_weight: float = 0.0
+    """Additional loss weight where the clip differs from its prior: at hands, at what they move and
+    in unobserved regions, which cover little of a frame and are all that has to be learned."""
     rank: int | None = None
-    """Of a LoRA on the linear layers of the blocks, which is then all that is trained."""
+    """Rank of a LoRA, which is then trained instead of the weights; None: no LoRA."""
 
     @property
     def trained(self) -> Any:
-        """All weights, or those of the LoRA."""
+        """The nnx filter of all weights, or of those of the LoRA."""
         return nnx.Param if self.rank is None else LowRankParam
 
     @property
     def frozen_dtype(self) -> str:
-        """That in which the transformer computes."""
+        """The compute dtype of the denoiser."""
         return self.model.dit.dtype
 
     def networks(self, rngs: nnx.Rngs) -> Networks:
-        """The networks with random weights."""
+        """Return the networks with random weights."""
         networks = Networks.build(self.model, only=self.model.trained_networks, rngs=rngs)
         if self.rank is not None:
             lora.start(networks.dit, self.rank, rngs=rngs)
         return networks
 
     def examples(self) -> None:
-        """A record of latents is an example as it is."""
+        """Return no transform: a latents record is an example."""
 
     def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
-        """Those of cached latents."""
+        """Return the shapes of a batch of latents records."""
         return example_shapes(self.model, batch)
 
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, "b 2"]:
-        """For each sample, what drops its conditions and what draws its noise."""
+        """Return two keys per sample: of its condition dropout and of its noise."""
         drop, draw = jax.random.split(key)
         return jnp.stack([jax.random.split(drop, batch), jax.random.split(draw, batch)], axis=1)
 
     def loss(
         self, networks: Networks, batch: Batch, keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
-        """The flow-matching loss of a batch under dropped conditions."""
+        """Return the diffusion loss of a batch under condition dropout."""
         condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
         velocity = _velocity(networks, condition)
-        places = changed_places(batch["target"], batch["prior"], self.change)
+        places = loss_weights(batch["target"], batch["prior"], self.change_loss_weight)
         loss, _ = self.objective.loss(velocity, batch["target"], keys[:, 1], places=places)
         return loss, {}
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
-        """Errors at fixed noise levels and with fixed noise, under the full condition."""
+        """Return the errors at fixed noise levels with fixed noise, under the full condition."""
         velocity = _velocity(networks, condition_of(networks, batch))
-        truth = batch["target"]
-        noise = jax.random.normal(jax.random.key(0), truth.shape)
+        target = batch["target"]
+        noise = jax.random.normal(jax.random.key(0), target.shape)
         errors = {
-            f"loss_{time}": self.objective.loss_at(
-                velocity, truth, noise, jnp.full(truth.shape[:1], time)
+            f"loss_{sigma}": self.objective.loss_at(
+                velocity, target, noise, jnp.full(target.shape[:1], sigma)
             ).mean()
-            for time in VALIDATION_TIMES
+            for sigma in VALIDATION_SIGMAS
         }
         return {"loss": jnp.mean(jnp.stack(list(errors.values()))), **errors}
 
     def flops(self, samples: int) -> float:
-        """Model FLOPs of an update, of the transformer alone, which has nearly all of them."""
+        """Return the model FLOPs of an update, of the denoiser only, which has nearly all."""
         image = self.model.image
         forward = count_forward(
             self.model.dit,
@@ -108,7 +108,7 @@ class Denoising:
             text=self.model.tokenizer.max_tokens,
             image=0 if image is None else 1 + (image.image_size // image.patch) ** 2,
         )
-        # Backward: by activations and by weights, of which a LoRA's are few.
+        # Backward: gradients of activations and of weights; those of a LoRA's weights cost little.
         weights = 3 if self.rank is None else 2
         return samples * (weights * forward.weights + 3 * forward.attention)
 
@@ -128,14 +128,15 @@ def condition_of(networks: Networks, batch: Batch) -> Condition:
     )
 
 
-def changed_places(
-    truth: Float[Array, "b f h w c"], prior: Float[Array, "b f h w c"], change: float
+def loss_weights(
+    target: Float[Array, "b f h w c"], prior: Float[Array, "b f h w c"], change: float
 ) -> Float[Array, "b f h w 1"]:
-    """Weight of each place, 1 on average: 1 + change where the latents differ by 1 or more.
+    """Return the loss weight of each location, with mean 1 over a sample.
 
-    Less where they differ by less; the latents of a channel have a deviation of 1.
+    Before the division by its mean it is 1 + change * min(d, 1), with d the mean squared difference
+    of the latents, whose channels have a standard deviation of 1.
     """
-    difference = jnp.square(truth - prior).mean(axis=-1, keepdims=True)
+    difference = jnp.square(target - prior).mean(axis=-1, keepdims=True)
     weight = 1 + change * jnp.minimum(difference, 1)
     return weight / weight.mean(axis=(1, 2, 3), keepdims=True)
 

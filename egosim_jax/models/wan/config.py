@@ -24,6 +24,8 @@ class WanDiTConfig:
 
     table: ClassVar[str] = "wan_dit"
     """Name table of conversion."""
+    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "attention", "remat")
+    """Fields that change only how values are computed, which a resumed training may change."""
 
     in_channels: int = 52
     """Channels of the noisy latents and the condition together."""

@@ -1,4 +1,4 @@
-"""Checkpoints: state and data position together, or nothing."""
+"""Checkpoints: state and data position, saved and restored together."""
 
 import errno
 import os
@@ -38,7 +38,7 @@ def save(folder: Path, data: grain.DatasetIterator) -> None:
     checkpoints.close()
 
 
-def test_state_and_data_position_come_back_together(tmp_path):
+def test_state_and_data_position_are_restored_together(tmp_path):
     data = numbers()
     seen = [next(data) for _ in range(5)]
     save(tmp_path, data)
@@ -61,11 +61,11 @@ def test_a_checkpoint_of_another_model_is_refused_path_by_path(tmp_path):
 def test_an_empty_folder_has_no_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.steps == []
-    with pytest.raises(InputError, match="no sound checkpoint"):
+    with pytest.raises(InputError, match="no valid checkpoint"):
         checkpoints.restore(abstract(state()), numbers())
 
 
-def test_what_a_kill_left_half_written_is_not_a_checkpoint(tmp_path):
+def test_an_incomplete_checkpoint_of_a_killed_run_is_ignored(tmp_path):
     save(tmp_path, numbers())
     (tmp_path / "9.orbax-checkpoint-tmp").mkdir()
     assert Checkpoints(tmp_path).steps == [7]
@@ -100,7 +100,7 @@ def truncate(file: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [flip, truncate, Path.unlink], ids=lambda f: f.__name__)
-def test_a_damaged_file_is_named_and_the_checkpoint_before_taken_only_when_asked(
+def test_a_damaged_file_is_named_and_the_checkpoint_before_used_only_on_request(
     tmp_path, damage, capsys
 ):
     folder = tmp_path / "checkpoints"
@@ -144,7 +144,7 @@ def test_a_checkpoint_that_orbax_cannot_list_is_named(tmp_path):
     about.write_text(
         about.read_text().replace('"performance_metrics": {}', '"performance_metrics": 7')
     )
-    with pytest.raises(InputError, match=r"cannot be listed: .*8/_CHECKPOINT_METADATA is not what"):
+    with pytest.raises(InputError, match=r"cannot be listed: .*8/_CHECKPOINT_METADATA differs"):
         Checkpoints(tmp_path)
 
 
@@ -167,7 +167,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_saved(tmp_path, monke
     checkpoints.close()
 
 
-def test_a_disk_that_fills_up_while_saving_says_what_stands(tmp_path, monkeypatch):
+def test_a_disk_that_fills_up_while_saving_names_the_newest_checkpoint(tmp_path, monkeypatch):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(7, state(), numbers())
     checkpoints.wait()
@@ -177,5 +177,5 @@ def test_a_disk_that_fills_up_while_saving_says_what_stands(tmp_path, monkeypatc
 
     monkeypatch.setattr("egosim_jax.io.checkpoint.write_json", full)
     checkpoints.save(8, state(), numbers())
-    with pytest.raises(InputError, match=r"step 8 was not saved, that of step 7 stands"):
+    with pytest.raises(InputError, match=r"step 8 was not saved, the newest is that of step 7"):
         checkpoints.close()

@@ -1,4 +1,4 @@
-"""Run folders: what they record, and whose they are."""
+"""Run folders: the config and environment that they record, and the runs that they refuse."""
 
 import json
 from dataclasses import dataclass
@@ -66,31 +66,31 @@ def test_a_value_that_cannot_be_written_leaves_the_old_file(tmp_path: Path):
     assert json.loads(path.read_text("utf-8")) == {"a": 1}
 
 
-def test_what_may_differ_may_and_is_recorded(tmp_path):
+def test_a_mutable_field_may_change_and_is_recorded(tmp_path):
     open_folder(tmp_path, {"training": {"mesh": {"fsdp": 8}, "meshes": 1, "seed": 0}})
     changed = {"training": {"mesh": {"fsdp": 4}, "meshes": 1, "seed": 0}}
-    open_folder(tmp_path, changed, may_differ=["training.mesh"])
+    open_folder(tmp_path, changed, mutable=["training.mesh"])
     assert json.loads((tmp_path / "config.json").read_text("utf-8")) == changed
     other = {"training": {"mesh": {"fsdp": 2}, "meshes": 2, "seed": 0}}
     with pytest.raises(InputError, match=r"training\.meshes") as refused:
-        open_folder(tmp_path, other, may_differ=["training.mesh"])
+        open_folder(tmp_path, other, mutable=["training.mesh"])
     assert "mesh.fsdp" not in str(refused.value)
 
 
-def test_places_to_write_to_are_no_settings(tmp_path):
+def test_output_folders_are_not_compared(tmp_path):
     open_folder(tmp_path, {"simulate": {"out": "runs/a", "seed": 0}})
     open_folder(tmp_path, {"simulate": {"out": str(tmp_path), "seed": 0}})
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"a": 1, "a": 2}', "\x00", '"' + "x" * 100])
-def test_a_damaged_record_is_named(tmp_path, text):
+def test_a_damaged_config_is_named(tmp_path, text):
     open_folder(tmp_path, config())
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(InputError, match=r"config\.json"):
         open_folder(tmp_path, config())
 
 
-def test_a_lost_record_is_named_with_the_way_out(tmp_path):
+def test_a_lost_config_is_named_with_the_fix(tmp_path):
     open_folder(tmp_path, config())
     (tmp_path / "config.json").unlink()
     with pytest.raises(InputError, match=r"config\.json is missing.*another --out"):

@@ -1,0 +1,222 @@
+"""Named trainings: each is a value whose fields are the options of `egosim-train NAME`."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import replace
+
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.train.config import OptimizerConfig, Recipe, TrainConfig
+from egosim_jax.train.fine_tuning import FineTuning
+from egosim_jax.train.from_scratch import FromClips, FromTabletop
+from egosim_jax.types import InputError
+
+_FULL = TrainConfig(
+    steps=4000,
+    batch_size=32,
+    grad_accum_steps=4,
+    optimizer=OptimizerConfig(learning_rate=1e-5, weight_decay=0.01),
+    save_every=200,
+    keep_every=1000,
+    validate_every=200,
+    sample_every=500,
+)
+
+EGOSIM_14B = FineTuning(config="egosim_14b", training=_FULL)
+r"""EgoSim's main training: the whole 14B transformer, from Wan 2.1 Fun InP 14B widened to 52.
+
+    egosim-convert weights Wan2.1-Fun-14B-InP --config egosim_14b --widen polarity \
+        --out weights/base
+    egosim data encode --config egosim_14b --weights weights/base --shards shards/train \
+        --out latents/train
+    egosim-train egosim_14b --weights weights/base --latents latents/train --out runs/egosim_14b
+
+AdamW at 1e-5, 32 clips of 61 frames of 832 x 480 per update, 4000 updates, as in the paper (section
+4.1). Weights and moments take 197 GB, so 8 x H200 share them by FSDP: some 31 GiB each, some 70 GiB
+with what a clip keeps; `--remat projections` is 5 % faster and takes 125 GiB. 4.3e20 model FLOPs:
+34 hours at 45 % of the devices' peak, which one H200 reached with 16 of the 40 blocks
+(docs/gpu.md). Estimated, not measured.
+"""
+
+EGOSIM_1_3B = FineTuning(config="egosim_1_3b", training=_FULL)
+r"""EgoSim's conditioning on the 1.3B transformer, from Wan 2.1 Fun InP 1.3B widened to 52 channels.
+
+    egosim-convert weights Wan2.1-Fun-1.3B-InP --config egosim_1_3b --widen polarity \
+        --out weights/base
+    egosim data encode --config egosim_1_3b --weights weights/base --shards shards/train \
+        --out latents/train
+    egosim-train egosim_1_3b --weights weights/base --latents latents/train --out runs/egosim_1_3b
+
+Weights and moments of 1.6 billion parameters take 19 GB, so that one H200 is enough; eight share
+them. A tenth of the FLOPs of the 14B. Estimated, not measured.
+"""
+
+EGOSIM_14B_ROBOT = FineTuning(
+    config="egosim_14b",
+    training=replace(
+        _FULL,
+        steps=200,
+        log_every=5,
+        save_every=50,
+        keep_every=None,
+        validate_every=50,
+        sample_every=100,
+    ),
+)
+r"""EgoSim's cross-embodiment training: from human hands to a robot's gripper.
+
+    egosim-train egosim_14b_robot --weights weights/egosim_14b --latents latents/agibot \
+        --out runs/robot
+
+200 updates of 32 clips after the main training, as in the paper (section 4.1); hardware and memory
+as in `egosim_14b`, two hours at 45 % of the peak. Estimated, not measured.
+"""
+
+EGOSIM_14B_FEWSHOT = FineTuning(
+    config="egosim_14b",
+    training=TrainConfig(
+        steps=50,
+        batch_size=8,
+        optimizer=OptimizerConfig(learning_rate=1e-5, weight_decay=0.01),
+        log_every=5,
+        save_every=25,
+        validate_every=25,
+        sample_every=25,
+    ),
+)
+r"""EgoSim's adaptation to a new wearer or place, from a few dozen clips.
+
+    egosim-train egosim_14b_fewshot --weights weights/egosim_14b --latents latents/mine \
+        --out runs/mine
+
+50 updates of one clip per device, as in the paper (section 4.1), which had 30 clips. 8 x H200 with
+some 62 GiB each, a few minutes; on other numbers of devices set `--training.batch-size` to theirs.
+Estimated, not measured.
+"""
+
+EGOSIM_14B_LORA = FineTuning(
+    config="egosim_14b",
+    rank=64,
+    training=TrainConfig(
+        steps=1000,
+        batch_size=8,
+        grad_accum_steps=8,
+        optimizer=OptimizerConfig(learning_rate=1e-4, warmup_steps=20),
+        save_every=100,
+        validate_every=100,
+        sample_every=250,
+    ),
+)
+"""LoRA of EgoSim's 14B transformer, which one GPU can train.
+
+    egosim-train egosim_14b_lora --weights weights/egosim_14b --latents latents/mine --out runs/lora
+    egosim-convert lora runs/lora/lora.safetensors --config egosim_14b --out mine.safetensors
+
+The weights are frozen, in bfloat16: 33 GB; a LoRA of rank 64 has 337 million weights, which are
+float32 with their moments: 4 GB. With what the one clip keeps that an update of 8 takes at a
+time, 65 GiB: one H200 or H100, a minute per update. Estimated, not measured. The second command
+writes the names that ComfyUI and diffusers read.
+"""
+
+
+def _muon(learning_rate: float, warmup_steps: int) -> OptimizerConfig:
+    return OptimizerConfig(
+        name="muon", learning_rate=learning_rate, warmup_steps=warmup_steps, schedule="cosine"
+    )
+
+
+TABLETOP = FromTabletop(
+    config="tabletop",
+    vae=TrainConfig(
+        steps=4000,
+        batch_size=2,
+        # With a short warm-up the first updates close the channel that separates green from purple,
+        # and it stays closed.
+        optimizer=_muon(1e-3, 300),
+        log_every=25,
+        save_every=250,
+        validate_every=500,
+    ),
+    denoiser=TrainConfig(
+        steps=8000,
+        batch_size=8,
+        optimizer=_muon(2e-3, 200),
+        log_every=25,
+        save_every=250,
+        validate_every=500,
+    ),
+    dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
+    weights_dtype="float16",
+)
+"""The model that comes with the package: from scratch, on clips of the tabletop world.
+
+    egosim-train tabletop --out runs/tabletop
+
+makes the clips, trains the VAE, encodes latents and trains the denoiser, on a CPU, in five hours on
+two cores. Every stage resumes: run the same command again after an interruption.
+"""
+
+REAL_TINY = FromClips(
+    config="real_tiny",
+    stride=2,
+    vae=TrainConfig(
+        steps=2000,
+        batch_size=2,
+        optimizer=_muon(1e-3, 20),
+        log_every=25,
+        save_every=500,
+        validate_every=250,
+    ),
+    denoiser=TrainConfig(
+        steps=2500,
+        batch_size=4,
+        optimizer=_muon(2e-3, 50),
+        log_every=25,
+        save_every=250,
+        validate_every=500,
+    ),
+)
+"""EgoSim's architecture, small, from scratch on recorded clips: the VAE, then the denoiser.
+
+    egosim-train real_tiny --metadata CLIPS/metadata.csv --out runs/real_tiny
+
+runs on a CPU, in an hour on two cores. Every stage resumes: run the same command again after an
+interruption.
+"""
+
+_DEBUG = TrainConfig(
+    steps=20,
+    batch_size=2,
+    optimizer=OptimizerConfig(name="muon", learning_rate=3e-3, warmup_steps=5),
+    log_every=5,
+    save_every=10,
+    validate_every=20,
+)
+
+DEBUG = FromClips(config="debug", vae=_DEBUG, denoiser=_DEBUG, clips=8, clip_frames=25, stride=8)
+"""The smallest training, on synthetic clips of the tabletop world, to check an installation.
+
+    egosim-train debug --out runs/debug
+
+takes minutes on 2 CPU cores. A clip has three windows of 9 frames to train on and two to test on.
+"""
+
+RECIPES: dict[str, tuple[str, Recipe]] = {
+    "debug": ("Train `debug` for a few updates on a few synthetic clips.", DEBUG),
+    "real_tiny": ("Train `real_tiny` from scratch on the clips of a metadata file.", REAL_TINY),
+    "tabletop": ("Train `tabletop` from scratch on scenes of the tabletop world.", TABLETOP),
+    "egosim_14b": ("Train EgoSim's 14B transformer from Wan 2.1 Fun InP.", EGOSIM_14B),
+    "egosim_1_3b": ("Train the 1.3B transformer with EgoSim's conditioning.", EGOSIM_1_3B),
+    "egosim_14b_robot": ("Train EgoSim's 14B transformer on clips of a robot.", EGOSIM_14B_ROBOT),
+    "egosim_14b_fewshot": ("Adapt EgoSim's 14B transformer to a few clips.", EGOSIM_14B_FEWSHOT),
+    "egosim_14b_lora": ("Train a LoRA of EgoSim's 14B transformer.", EGOSIM_14B_LORA),
+}
+"""Recipes by name, each with the line that describes it in the help."""
+
+
+def get(name: str) -> Recipe:
+    """Return the recipe of a name. Raises `InputError` with the nearest name if there is none."""
+    if name not in RECIPES:
+        near = difflib.get_close_matches(name, RECIPES, n=1, cutoff=0.0)
+        raise InputError(f"There is no recipe {name!r}. Nearest: {near[0]}.")
+    return RECIPES[name][1]
