@@ -154,7 +154,7 @@ def _setting(stage: Stage, target: Target) -> Setting:
     task, training = stage
     mesh = make_mesh(training.mesh, target.devices)
     remat = task.model.dit.remat if isinstance(task, Denoising) else "none"
-    clips = training.batch_size // parts("batch", mesh) // training.accumulate
+    clips = training.batch_size // parts("batch", mesh) // training.grad_accum_steps
     return Setting(clips=clips, remat=remat, context=parts("tokens", mesh))
 
 

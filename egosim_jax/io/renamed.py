@@ -59,8 +59,6 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
     "Tabletop": {"crop": [48, 64], "dropout": _DROPOUT, "stride": 1, "weights_dtype": "float16"},
 }
 """Fields that a class of config.json did not have under its old name, with their values then."""
-DROPPED = {"Objective": ("schedule",)}
-"""Fields of config.json that are gone, because another field always had the same value."""
 
 
 def upgrade(recorded: Any) -> Any:
@@ -72,12 +70,8 @@ def upgrade(recorded: Any) -> Any:
     kind = recorded.get("type")
     if not isinstance(kind, str):
         return {name: upgrade(value) for name, value in recorded.items()}
-    renamed, dropped = FIELDS.get(kind, {}), DROPPED.get(kind, ())
-    fields = {
-        renamed.get(name, name): upgrade(value)
-        for name, value in recorded.items()
-        if name not in dropped
-    }
+    renamed = FIELDS.get(kind, {})
+    fields = {renamed.get(name, name): upgrade(value) for name, value in recorded.items()}
     if kind == "RealTiny" and _made_its_clips(recorded):
         fields["metadata"] = None
     return {**ADDED.get(kind, {}), **fields, "type": TYPES.get(kind, kind)}
