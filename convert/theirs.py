@@ -92,7 +92,7 @@ def pipeline(config: ModelConfig, networks: Collection[Network]) -> Mapping[str,
             index[folder] = [None, None]
     left = ("tokenizer",) if config.image is None else ("tokenizer", "image_processor")
     index |= {part: [None, None] for part in left}  # they hold no weights: the caller gives them
-    scheduler = {"_class_name": SCHEDULER, "shift": config.schedule.shift}
+    scheduler = {"_class_name": SCHEDULER, "shift": config.process.shift}
     return files | {"scheduler/scheduler_config.json": scheduler, "model_index.json": index}
 
 

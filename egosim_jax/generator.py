@@ -28,7 +28,7 @@ from egosim_jax.conditioning import condition_channels, pack_mask
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.image import clip_pixels
 from egosim_jax.conditioning.video import to_model, to_uint8
-from egosim_jax.diffusion.schedule import VelocityFn
+from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import plain
@@ -117,7 +117,7 @@ def denoise(
     """Walk from noise to latents; the unconditional branch knows no text."""
     channels = condition_channels(condition)
 
-    def branch(text: Array) -> VelocityFn:
+    def branch(text: Array) -> DenoiseFn:
         context = dit.prepare(channels, text, condition.image)
         return lambda x, t: dit.denoise(x, t, context)
 
@@ -128,7 +128,7 @@ def denoise(
     return integrate(
         config.guidance.guide(conditional, unconditional),
         noise,
-        schedule=config.schedule,
+        process=config.process,
         solver=config.solver,
         steps=config.steps,
     )

@@ -12,8 +12,9 @@ from jax.sharding import Mesh
 
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.diffusion.guidance import Guidance
-from egosim_jax.diffusion.schedule import FlowSchedule
-from egosim_jax.diffusion.solver import Euler, UniPC
+from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
+from egosim_jax.diffusion.solver import Euler
+from egosim_jax.diffusion.unipc import UniPC
 from egosim_jax.io import weights
 from egosim_jax.models import Denoiser, ImageEncoder, NetworkConfig, TextEncoder, VideoCodec
 from egosim_jax.models.layers import initialize
@@ -50,14 +51,14 @@ class ModelConfig:
     """`frozen`: text and image encoder are given; `joint`: trained together with the denoiser."""
     image_range: Literal["signed", "unit"] = "signed"
     """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
-    schedule: FlowSchedule = field(default_factory=FlowSchedule)
-    """Noise schedule."""
+    process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
+    """Path from data to noise, and the quantity that the denoiser predicts."""
     solver: Euler | UniPC = field(default_factory=Euler)
     """Sampler."""
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
-    steps: int = 50
-    """Denoising steps."""
+    steps: int | tuple[float, ...] = 50
+    """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
 
     def __post_init__(self) -> None:
         """Check that the networks fit each other."""

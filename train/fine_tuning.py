@@ -61,7 +61,7 @@ class FineTuning(Recipe):
         model = self.model()
         task = Denoising(
             model=model,
-            objective=Objective(schedule=model.schedule, times=self.times),
+            objective=Objective(times=self.times),
             dropout=self.dropout,
             rank=self.rank,
         )

@@ -68,7 +68,6 @@ class FromScratch(Recipe):
 
     def stages(self) -> Mapping[str, Stage]:
         """Return the training of the denoiser, and that of the autoencoder unless it is given."""
-        from egosim_jax.diffusion.objective import Objective
         from egosim_jax.train.tasks.autoencoding import Autoencoding
         from egosim_jax.train.tasks.denoising import Denoising
 
@@ -77,7 +76,6 @@ class FromScratch(Recipe):
         vae = Autoencoding(vae=model.vae, video=model.video, crop=self.crop)
         denoiser = Denoising(
             model=model,
-            objective=Objective(schedule=model.schedule),
             dropout=self.dropout,
             change_loss_weight=self.change_loss_weight,
         )

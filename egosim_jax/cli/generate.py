@@ -181,7 +181,7 @@ class Generate:
         import dataclasses
 
         from egosim_jax import configs
-        from egosim_jax.diffusion import Euler, FlowSchedule, UniPC
+        from egosim_jax.diffusion import Euler, RectifiedFlow, UniPC
 
         config = configs.get(self.config)
         if self._weights is not None:
@@ -193,8 +193,8 @@ class Generate:
             solver = Euler() if self.solver == "euler" else UniPC()
             config = dataclasses.replace(config, solver=solver)
         if self.solver == "wan":
-            schedule = FlowSchedule.of_wan(config.schedule.shift)
-            config = dataclasses.replace(config, schedule=schedule)
+            process = RectifiedFlow.wan_unipc(config.process.shift)
+            config = dataclasses.replace(config, process=process)
         return config
 
     def _placing(self) -> tuple[Mesh, int]:

@@ -7,7 +7,7 @@ bfloat16 before they are embedded, and there is no guidance.
 from pathlib import Path
 
 from egosim_jax.conditioning.text import PromptTokenizer
-from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
@@ -24,6 +24,6 @@ CONFIG = ModelConfig(
     image=CLIPVisionConfig(dtype="bfloat16"),
     tokenizer=PromptTokenizer(kind=Path("google/umt5-xxl"), max_tokens=512),
     image_range="unit",
-    schedule=FlowSchedule(shift=5.0, timestep_rounding="bfloat16"),
+    process=RectifiedFlow(shift=5.0, timestep_rounding="bfloat16"),
     steps=50,
 )

@@ -5,7 +5,7 @@ in `weights/tabletop/README.md`.
 """
 
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
-from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
@@ -30,6 +30,6 @@ CONFIG = ModelConfig(
     image=CLIPVisionConfig(image_size=56, dim=64, layers=3, heads=2, ffn_dim=128),
     tokenizer=PromptTokenizer(kind="byt5", max_tokens=96),
     encoders="joint",
-    schedule=FlowSchedule(shift=3.0),
+    process=RectifiedFlow(shift=3.0),
     steps=10,
 )

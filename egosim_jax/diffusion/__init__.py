@@ -1,17 +1,27 @@
-"""Flow matching: the path, its noise levels, the solvers, guidance and the training objective."""
+"""Diffusion: processes from data to noise, solvers, guidance and the training objective."""
 
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.objective import Objective
-from egosim_jax.diffusion.schedule import FlowSchedule, VelocityFn
-from egosim_jax.diffusion.solver import Euler, Solver, UniPC, integrate
+from egosim_jax.diffusion.process import (
+    DenoiseFn,
+    Prediction,
+    Process,
+    RectifiedFlow,
+    VariancePreserving,
+)
+from egosim_jax.diffusion.solver import Euler, Solver, integrate
+from egosim_jax.diffusion.unipc import UniPC
 
 __all__ = [
+    "DenoiseFn",
     "Euler",
-    "FlowSchedule",
     "Guidance",
     "Objective",
+    "Prediction",
+    "Process",
+    "RectifiedFlow",
     "Solver",
     "UniPC",
-    "VelocityFn",
+    "VariancePreserving",
     "integrate",
 ]

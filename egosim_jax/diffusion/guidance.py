@@ -1,8 +1,9 @@
-"""Classifier-free guidance (Ho & Salimans 2022), in velocities.
+"""Classifier-free guidance (Ho & Salimans 2022), on a network's predictions y.
 
-    v = v_uncond + scale (v_cond - v_uncond)
+    y = y_uncond + scale (y_cond - y_uncond)
 
-At scale 1 this is v_cond, and the unconditional branch is not run: the EgoSim release samples so,
+Data, noise and velocity are linear in each other, so that every prediction type is guided alike.
+At scale 1 this is y_cond, and the unconditional branch is not run: the EgoSim release samples so,
 one forward pass a step. Other scales cost two, one after the other: at the sizes of video a single
 sample fills the device, so that a batch of both would only take more memory.
 """
@@ -14,25 +15,25 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from egosim_jax.diffusion.schedule import VelocityFn
+from egosim_jax.diffusion.process import DenoiseFn
 
 
 @dataclass(frozen=True, kw_only=True)
 class Guidance:
-    """How far to go beyond the condition."""
+    """Classifier-free guidance and its scale."""
 
     scale: float = 1.0
-    """1 follows the condition; above 1 exaggerates what sets it apart from none."""
+    """Guidance scale: 1 is the conditional prediction, above 1 extrapolates beyond it."""
 
-    def guide(self, conditional: VelocityFn, unconditional: VelocityFn) -> VelocityFn:
-        """The guided velocity of two branches; `conditional` itself at scale 1."""
+    def guide(self, conditional: DenoiseFn, unconditional: DenoiseFn) -> DenoiseFn:
+        """Return the guided prediction of two branches; `conditional` itself at scale 1."""
         if self.scale == 1:
             return conditional
 
-        def velocity(
+        def guided(
             x: Float[Array, "b f h w c"], t: Float[Array, " b"]
         ) -> Float[Array, "b f h w c"]:
             without = unconditional(x, t).astype(jnp.float32)
             return without + self.scale * (conditional(x, t).astype(jnp.float32) - without)
 
-        return velocity
+        return guided

@@ -240,7 +240,6 @@ class Embodiment:
     ) -> Path:
         """Train one model, from a weights folder or from random weights, unless that was done."""
         from egosim_jax.conditioning.dropout import ConditionDropout
-        from egosim_jax.diffusion.objective import Objective
         from egosim_jax.train.fine_tuning import write_trained
         from egosim_jax.train.loop import train
         from egosim_jax.train.tasks.denoising import Denoising
@@ -253,7 +252,6 @@ class Embodiment:
         trained = train(
             Denoising(
                 model=model,
-                objective=Objective(schedule=model.schedule),
                 dropout=ConditionDropout(prior=share, mask=share, hands=share, text=share),
                 rank=rank,
             ),

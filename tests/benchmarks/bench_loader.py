@@ -176,12 +176,11 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
     import jax
     from flax import nnx
 
-    from egosim_jax.diffusion.objective import Objective
     from egosim_jax.train.config import OptimizerConfig
     from egosim_jax.train.tasks.denoising import Denoising
     from egosim_jax.train.update import TrainState, make_update
 
-    task = Denoising(model=config, objective=Objective(schedule=config.schedule))
+    task = Denoising(model=config)
     graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)
     optimizer = OptimizerConfig(name="muon")
     update = jax.jit(make_update(task, graph, optimizer, steps=steps, seed=0), donate_argnums=0)

@@ -115,7 +115,6 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
 
     from egosim_jax.conditioning import assemble
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
-    from egosim_jax.diffusion.objective import Objective
     from egosim_jax.io.weights import fill
     from egosim_jax.networks import Networks
     from egosim_jax.train.config import OptimizerConfig
@@ -133,9 +132,9 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
                 return networks.dit(assemble(x, condition), t, condition.text, condition.image)
 
             parts = (batch[name] for name in ("target", "noise", "sigma"))
-            return self.objective.loss_at(velocity, *parts).mean(), {}
+            return self.objective.loss_at(config.process, velocity, *parts).mean(), {}
 
-    task = GivenNoise(model=config, objective=Objective(schedule=config.schedule))
+    task = GivenNoise(model=config)
     networks = nnx.eval_shape(lambda: task.networks(nnx.Rngs(0)))
     for network, module, rules, ignored in (
         (networks.dit, theirs.dit, wan_dit.diffusers(config.dit), []),
@@ -316,7 +315,7 @@ def _channels_first(batch: Batch, config: ModelConfig) -> dict[str, torch.Tensor
         for name, array in batch.items()
     }
     arrays["mask"] = arrays["mask"].astype(np.float32)
-    arrays["time"] = np.array(config.schedule.timesteps(batch["sigma"]))
+    arrays["time"] = np.array(config.process.timesteps(batch["sigma"]))
     tensors = {name: torch.tensor(np.ascontiguousarray(array)) for name, array in arrays.items()}
     return {**tensors, "ids": tensors["ids"].long(), "ids_mask": tensors["ids_mask"].long()}
 

@@ -21,7 +21,7 @@ from egosim_jax.conditioning import condition_channels
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
-from egosim_jax.diffusion.schedule import FlowSchedule
+from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
@@ -42,7 +42,7 @@ CONFIG = ModelConfig(
     image=CLIPVisionConfig(image_size=224, patch=14, dim=32, layers=2, heads=2, ffn_dim=64),
     # diffusers takes the last 512 tokens for text and the 257 before them for the image.
     tokenizer=PromptTokenizer(max_tokens=512),
-    schedule=FlowSchedule(shift=3.0),
+    process=RectifiedFlow(shift=3.0),
     steps=10,
 )
 
@@ -166,7 +166,7 @@ def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, trip
     text, image, _, mean, std = encoded_by_theirs(theirs, inputs)
     channels = np.asarray(condition_channels(condition))[..., :20]  # mask and prior
     channels = torch.tensor(rearrange(channels, "b f h w c -> b c f h w"))
-    scheduler = FlowMatchEulerDiscreteScheduler(shift=CONFIG.schedule.shift)
+    scheduler = FlowMatchEulerDiscreteScheduler(shift=CONFIG.process.shift)
     scheduler.set_timesteps(sigmas=np.linspace(1, 0, CONFIG.steps + 1)[:-1])
     x = torch.tensor(rearrange(noise, "b f h w c -> b c f h w"))
     with torch.no_grad():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
 
-from egosim_jax.diffusion import Euler, FlowSchedule, UniPC, integrate
+from egosim_jax.diffusion import Euler, RectifiedFlow, UniPC, integrate
 
 # Both round to float32: ours the latents, diffusers its coefficients.
 TOLERANCE = 1e-6
@@ -35,7 +35,7 @@ def euler_latents(noise, sigmas_before_shift):
     x, latents = torch.from_numpy(noise), []
     for t, sigma in zip(scheduler.timesteps, scheduler.sigmas[:-1], strict=True):
         v = torch.from_numpy(velocity(x.numpy(), 1000 * sigma.item()))
-        # The scheduler answers in the velocity's dtype.
+        # The scheduler returns the velocity's dtype.
         x = scheduler.step(v, t, x, return_dict=False)[0].double()
         latents.append(x.numpy())
     return latents
@@ -57,7 +57,7 @@ def test_euler_ends_where_diffusers_ends(noise, steps):
     actual = integrate(
         lambda x, t: velocity(x, t[:, None, None, None, None]),
         jnp.asarray(noise, jnp.float32),
-        schedule=FlowSchedule(shift=5.0),
+        process=RectifiedFlow(shift=5.0),
         solver=Euler(),
         steps=steps,
     )
@@ -74,33 +74,35 @@ def test_unipc_follows_diffusers_step_by_step(noise, steps, order):
     sigmas = scheduler.sigmas.double().numpy()
     expected = unipc_latents(noise, scheduler)
 
-    solver = UniPC(order=order)
-    plan, step = solver.plan(sigmas), jax.jit(solver.step)
+    solver, process = UniPC(order=order), RectifiedFlow()
+    rows = solver.coefficients(process, sigmas)
+    step = jax.jit(solver.step, static_argnums=0)
     state = solver.start(jnp.asarray(noise, jnp.float32))
     errors = []
     for i in range(steps):
         v = jnp.asarray(velocity(np.asarray(state.x, np.float64), 1000 * sigmas[i]), jnp.float32)
-        state = step(state, v, jax.tree.map(lambda column, i=i: column[i], plan))
+        state = step(process, state, v, jax.tree.map(lambda column, i=i: column[i], rows))
         errors.append(relative(state.x, expected[i]))
     assert max(errors) < TOLERANCE
 
 
 def test_euler_follows_diffusers_step_by_step(noise):
     expected = euler_latents(noise, np.linspace(1, 0, 51)[:-1])
-    solver = Euler()
-    sigmas = FlowSchedule(shift=5.0).sigmas(50)
+    solver, process = Euler(), RectifiedFlow(shift=5.0)
+    sigmas = process.times(50)
+    rows = jax.tree.map(jnp.asarray, solver.coefficients(process, sigmas))
     state = solver.start(jnp.asarray(noise, jnp.float32))
     errors = []
-    for i, row in enumerate(solver.plan(sigmas)):
+    for i in range(50):
         v = jnp.asarray(velocity(np.asarray(state.x, np.float64), 1000 * sigmas[i]), jnp.float32)
-        state = solver.step(state, v, jnp.asarray(row))
+        state = solver.step(process, state, v, jax.tree.map(lambda column, i=i: column[i], rows))
         errors.append(relative(state.x, expected[i]))
     assert max(errors) < TOLERANCE
 
 
 @pytest.mark.parametrize("steps", [10, 50])
 def test_unipc_takes_wans_noise_levels_and_whole_timesteps(noise, steps):
-    """Wan shifts 0.999 ... 0 and tells the network int64 timesteps."""
+    """Wan shifts 0.999 ... 0 and gives the network int64 timesteps."""
     uniform = np.linspace(0.999, 0, steps + 1)[:-1]
     sigmas = 5.0 * uniform / (1 + 4.0 * uniform)
     scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True)
@@ -108,13 +110,13 @@ def test_unipc_takes_wans_noise_levels_and_whole_timesteps(noise, steps):
     scheduler.sigmas = torch.from_numpy(np.append(sigmas, 0.0))
     timesteps = torch.from_numpy(1000 * sigmas).to(torch.int64)
     expected = torch.from_numpy(noise)
-    for told, t in zip(timesteps, scheduler.timesteps, strict=True):
-        v = torch.from_numpy(velocity(expected.numpy(), told.item()))
+    for given, t in zip(timesteps, scheduler.timesteps, strict=True):
+        v = torch.from_numpy(velocity(expected.numpy(), given.item()))
         expected = scheduler.step(v, t, expected, return_dict=False)[0]
     actual = integrate(
         lambda x, t: velocity(x, t[:, None, None, None, None]),
         jnp.asarray(noise, jnp.float32),
-        schedule=FlowSchedule.of_wan(5.0),
+        process=RectifiedFlow.wan_unipc(5.0),
         solver=UniPC(),
         steps=steps,
     )

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 from egosim_jax.conditioning import condition_channels
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.diffusion.objective import Objective
-from egosim_jax.diffusion.schedule import VelocityFn
+from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.models import lora
 from egosim_jax.models.layers import LowRankParam
 from egosim_jax.networks import ModelConfig, Networks
@@ -81,19 +81,23 @@ class Denoising:
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout."""
         condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
-        velocity = _velocity(networks, condition)
-        places = loss_weights(batch["target"], batch["prior"], self.change_loss_weight)
-        loss, _ = self.objective.loss(velocity, batch["target"], keys[:, 1], places=places)
+        denoise, process, target = (
+            _denoise(networks, condition),
+            self.model.process,
+            batch["target"],
+        )
+        weights = loss_weights(target, batch["prior"], self.change_loss_weight)
+        loss, _ = self.objective.loss(process, denoise, target, keys[:, 1], loss_weights=weights)
         return loss, {}
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return the errors at fixed noise levels with fixed noise, under the full condition."""
-        velocity = _velocity(networks, condition_of(networks, batch))
+        denoise = _denoise(networks, condition_of(networks, batch))
         target = batch["target"]
         noise = jax.random.normal(jax.random.key(0), target.shape)
         errors = {
             f"loss_{sigma}": self.objective.loss_at(
-                velocity, target, noise, jnp.full(target.shape[:1], sigma)
+                self.model.process, denoise, target, noise, jnp.full(target.shape[:1], sigma)
             ).mean()
             for sigma in VALIDATION_SIGMAS
         }
@@ -141,7 +145,7 @@ def loss_weights(
     return weight / weight.mean(axis=(1, 2, 3), keepdims=True)
 
 
-def _velocity(networks: Networks, condition: Condition) -> VelocityFn:
+def _denoise(networks: Networks, condition: Condition) -> DenoiseFn:
     dit = networks.dit
     context = dit.prepare(condition_channels(condition), condition.text, condition.image)
     return lambda x, t: dit.denoise(x, t, context)

@@ -29,6 +29,6 @@ def test_egosim_14b_has_the_released_networks_at_their_size():
 def test_egosim_14b_turns_on_the_quirks_of_the_release():
     config = configs.get("egosim_14b")
     assert config.image_range == "unit"
-    assert config.schedule.timestep_rounding == "bfloat16"
-    assert (config.schedule.shift, config.steps, config.guidance.scale) == (5.0, 50, 1.0)
+    assert config.process.timestep_rounding == "bfloat16"
+    assert (config.process.shift, config.steps, config.guidance.scale) == (5.0, 50, 1.0)
     assert config.video.latent_shape == (16, 60, 104)

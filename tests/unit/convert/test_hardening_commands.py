@@ -332,7 +332,7 @@ def test_diffusers_and_transformers_load_what_is_written_for_them(tmp_path, monk
             np.testing.assert_array_equal(found.numpy(), expected)
     pipeline = DiffusionPipeline.from_pretrained(out, tokenizer=None)
     assert pipeline.vae.config.z_dim == CONFIG.vae.z_dim
-    assert pipeline.scheduler.config.shift == CONFIG.schedule.shift
+    assert pipeline.scheduler.config.shift == CONFIG.process.shift
 
 
 # What the system refuses.

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.diffusion import FlowSchedule, Objective
+from egosim_jax.diffusion import Objective, RectifiedFlow
 from egosim_jax.types import InputError
 
+PROCESS = RectifiedFlow()
 TIMES = ["uniform", "logit-normal", "diffsynth"]
 DRAWS = 4000
 SHAPE = (3, 2, 4, 4, 16)
@@ -23,14 +24,14 @@ def x0():
     return jax.random.normal(jax.random.key(5), SHAPE)
 
 
-def draw(objective, seed=0):
-    return np.sort(objective.sample_sigma(jax.random.key(seed), DRAWS))
+def draw(objective, process=PROCESS, seed=0):
+    return np.sort(objective.sample_times(process, jax.random.key(seed), DRAWS))
 
 
 def test_the_error_is_the_mean_square_to_noise_minus_data(x0):
     noise = jax.random.normal(jax.random.key(6), SHAPE)
     sigma = np.array([0.0, 0.3, 1.0])
-    errors = Objective().loss_at(velocity, x0, noise, jnp.asarray(sigma, jnp.float32))
+    errors = Objective().loss_at(PROCESS, velocity, x0, noise, jnp.asarray(sigma, jnp.float32))
     for b in range(SHAPE[0]):
         squares = []
         for x, e in zip(np.ravel(x0[b]).tolist(), np.ravel(noise[b]).tolist(), strict=True):
@@ -42,51 +43,53 @@ def test_the_error_is_the_mean_square_to_noise_minus_data(x0):
 
 def test_the_true_velocity_has_no_error(x0):
     noise = jax.random.normal(jax.random.key(6), SHAPE)
-    errors = Objective().loss_at(lambda x, t: noise - x0, x0, noise, jnp.array([0.1, 0.5, 0.9]))
+    errors = Objective().loss_at(
+        PROCESS, lambda x, t: noise - x0, x0, noise, jnp.array([0.1, 0.5, 0.9])
+    )
     np.testing.assert_array_equal(errors, np.zeros(3))
 
 
-def test_the_network_is_told_the_rounded_timesteps(x0):
-    objective = Objective(schedule=FlowSchedule(timestep_rounding="bfloat16"))
-    told = []
+def test_the_network_is_given_the_rounded_timesteps(x0):
+    process = RectifiedFlow(timestep_rounding="bfloat16")
+    given = []
 
     def record(x, t):
-        told.extend(t.tolist())
+        given.extend(t.tolist())
         return x
 
-    objective.loss_at(record, x0, x0, jnp.array([0.9375, 0.25, 0.0926]))
-    assert told == [936, 250, 92.5]
+    Objective().loss_at(process, record, x0, x0, jnp.array([0.9375, 0.25, 0.0926]))
+    assert given == [936, 250, 92.5]
 
 
 @pytest.mark.parametrize("times", TIMES)
 def test_the_loss_is_the_weighted_mean_of_the_errors(x0, times):
     objective = Objective(times=times)
-    loss, sampled = objective.loss(velocity, x0, jax.random.key(1))
-    weights = objective.weight(sampled.sigma)
+    loss, sampled = objective.loss(PROCESS, velocity, x0, jax.random.key(1))
+    weights = objective.weight(PROCESS, sampled.time)
     expected = sum(float(w) * float(e) for w, e in zip(weights, sampled.error, strict=True)) / 3
     assert float(loss) == pytest.approx(expected, rel=1e-6)  # float32 sums
 
 
-def test_places_weigh_the_error_of_each_sample(x0):
+def test_loss_weights_weight_the_error_of_each_sample(x0):
     noise, sigma = jax.random.normal(jax.random.key(6), SHAPE), jnp.array([0.1, 0.5, 0.9])
     objective = Objective()
-    places = jnp.zeros((*SHAPE[:-1], 1)).at[:, 0].set(2.0)
-    half = objective.loss_at(velocity, x0, noise, sigma, places=places)
-    first = objective.loss_at(velocity, x0[:, :1], noise[:, :1], sigma)
+    weights = jnp.zeros((*SHAPE[:-1], 1)).at[:, 0].set(2.0)
+    half = objective.loss_at(PROCESS, velocity, x0, noise, sigma, loss_weights=weights)
+    first = objective.loss_at(PROCESS, velocity, x0[:, :1], noise[:, :1], sigma)
     np.testing.assert_allclose(half, first, rtol=1e-6)
     key = jax.random.key(3)
-    ones, _ = objective.loss(velocity, x0, key, places=jnp.ones((*SHAPE[:-1], 1)))
-    assert ones == objective.loss(velocity, x0, key)[0]
+    ones, _ = objective.loss(PROCESS, velocity, x0, key, loss_weights=jnp.ones((*SHAPE[:-1], 1)))
+    assert ones == objective.loss(PROCESS, velocity, x0, key)[0]
 
 
 @pytest.mark.parametrize("times", TIMES)
 def test_a_batch_with_its_own_keys_equals_batches_of_one(x0, times):
     objective = Objective(times=times)
     keys = jax.random.split(jax.random.key(2), SHAPE[0])
-    together = objective.loss(velocity, x0, keys)[1]
+    together = objective.loss(PROCESS, velocity, x0, keys)[1]
     for b in range(SHAPE[0]):
-        alone = objective.loss(velocity, x0[b : b + 1], keys[b : b + 1])[1]
-        assert alone.sigma[0] == together.sigma[b]
+        alone = objective.loss(PROCESS, velocity, x0[b : b + 1], keys[b : b + 1])[1]
+        assert alone.time[0] == together.time[b]
         # The same numbers, summed in another order.
         np.testing.assert_allclose(alone.error[0], together.error[b], rtol=1e-6)
 
@@ -100,14 +103,14 @@ def test_each_sample_of_a_batch_has_its_own_level_and_noise(times):
         seen.append(x)
         return x
 
-    _, sampled = Objective(times=times).loss(record, x0, jax.random.key(3))
-    assert len(set(sampled.sigma.tolist())) == 3
-    unit = np.asarray(seen[0]) / np.asarray(sampled.sigma)[:, None, None, None, None]
+    _, sampled = Objective(times=times).loss(PROCESS, record, x0, jax.random.key(3))
+    assert len(set(sampled.time.tolist())) == 3
+    unit = np.asarray(seen[0]) / np.asarray(sampled.time)[:, None, None, None, None]
     assert np.abs(np.corrcoef(unit.reshape(3, -1)) - np.eye(3)).max() < 0.2
 
 
 def test_uniform_levels_have_the_quantiles_of_the_shifted_uniform():
-    sigma = draw(Objective(times="uniform", schedule=FlowSchedule(shift=5.0)))
+    sigma = draw(Objective(times="uniform"), RectifiedFlow(shift=5.0))
     for quantile in (0.1, 0.5, 0.9):
         expected = 5 * quantile / (1 + 4 * quantile)
         # Five standard errors of the quantile at its flattest, sqrt(q (1-q) / n) d sigma / du.
@@ -115,10 +118,8 @@ def test_uniform_levels_have_the_quantiles_of_the_shifted_uniform():
 
 
 def test_logit_normal_levels_have_the_quantiles_of_the_shifted_sigmoid():
-    objective = Objective(
-        times="logit-normal", logit_mean=-0.5, logit_std=0.8, schedule=FlowSchedule(shift=3.0)
-    )
-    sigma = draw(objective)
+    objective = Objective(times="logit-normal", logit_mean=-0.5, logit_std=0.8)
+    sigma = draw(objective, RectifiedFlow(shift=3.0))
     for quantile in (0.1, 0.5, 0.9):
         z = statistics.NormalDist(-0.5, 0.8).inv_cdf(quantile)
         u = 1 / (1 + math.exp(-z))
@@ -141,7 +142,7 @@ def test_diffsynth_weights_are_a_shifted_bell_of_mean_one():
     bell = [math.exp(-2 * ((t - 500) / 1000) ** 2) for t in timesteps]
     shifted = [g - min(bell) for g in bell]
     expected = np.array([1000 * g / sum(shifted) for g in shifted])
-    weights = Objective(times="diffsynth").weight(jnp.array(timesteps, jnp.float32) / 1000)
+    weights = Objective(times="diffsynth").weight(PROCESS, jnp.array(timesteps, jnp.float32) / 1000)
     # float32 differences of numbers near 0.6, divided by a mean of 0.15.
     np.testing.assert_allclose(weights, expected, atol=2e-6)
     assert np.mean(weights) == pytest.approx(1, rel=1e-6)
@@ -150,11 +151,15 @@ def test_diffsynth_weights_are_a_shifted_bell_of_mean_one():
 
 @pytest.mark.parametrize("times", ["uniform", "logit-normal"])
 def test_other_draws_are_not_weighted(times):
-    np.testing.assert_array_equal(Objective(times=times).weight(jnp.array([0.1, 1.0])), [1, 1])
+    np.testing.assert_array_equal(
+        Objective(times=times).weight(PROCESS, jnp.array([0.1, 1.0])), [1, 1]
+    )
 
 
 def test_the_same_key_draws_the_same_loss(x0):
-    first, second = (Objective().loss(velocity, x0, jax.random.key(9))[0] for _ in range(2))
+    first, second = (
+        Objective().loss(PROCESS, velocity, x0, jax.random.key(9))[0] for _ in range(2)
+    )
     assert first == second
 
 

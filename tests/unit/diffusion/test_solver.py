@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.diffusion import Euler, FlowSchedule, UniPC, integrate
+from egosim_jax.diffusion import Euler, RectifiedFlow, UniPC, integrate
 from egosim_jax.types import InputError
 
-SCHEDULE = FlowSchedule(shift=2.0)
+PROCESS = RectifiedFlow(shift=2.0)
 SOLVERS = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3)]
 
 
@@ -39,9 +39,9 @@ def end_error(solver, x, steps):
 
     def body(state, row):
         velocity = gaussian_velocity(state.x, jnp.broadcast_to(row[0], x.shape[:1]))
-        return solver.step(state, velocity, row[1]), None
+        return solver.step(PROCESS, state, velocity, row[1]), None
 
-    state, _ = jax.lax.scan(body, solver.start(x), (t, solver.plan(sigmas)))
+    state, _ = jax.lax.scan(body, solver.start(x), (t, solver.coefficients(PROCESS, sigmas)))
     expected = x * (spread(sigmas[-1]) / spread(sigmas[0]))
     return float(jnp.linalg.norm(state.x - expected) / jnp.linalg.norm(expected))
 
@@ -54,7 +54,7 @@ def test_a_straight_path_ends_at_the_data(noise, solver, steps):
         # The velocity at x that leads straight to the data.
         lambda x, t: (x - data) / (per_sample(t) / 1000),
         noise,
-        schedule=SCHEDULE,
+        process=PROCESS,
         solver=solver,
         steps=steps,
     )
@@ -81,7 +81,7 @@ def test_the_velocity_is_traced_once_for_all_steps(noise, solver):
         calls.append(t.shape)
         return x
 
-    jax.jit(lambda x: integrate(velocity, x, schedule=SCHEDULE, solver=solver, steps=20))(noise)
+    jax.jit(lambda x: integrate(velocity, x, process=PROCESS, solver=solver, steps=20))(noise)
     assert calls == [(2,)]
 
 
@@ -93,29 +93,30 @@ def test_latents_stay_float32_when_the_network_computes_in_bfloat16(noise, solve
         seen.append(x.dtype)
         return x.astype(jnp.bfloat16)
 
-    x = integrate(velocity, noise.astype(jnp.bfloat16), schedule=SCHEDULE, solver=solver, steps=2)
+    x = integrate(velocity, noise.astype(jnp.bfloat16), process=PROCESS, solver=solver, steps=2)
     assert {x.dtype, *seen} == {jnp.dtype("float32")}
 
 
-def test_the_network_is_told_the_rounded_timesteps(noise):
-    schedule = FlowSchedule(timestep_rounding="bfloat16")
+def test_the_network_is_given_the_rounded_timesteps(noise):
+    process = RectifiedFlow(timestep_rounding="bfloat16")
     # The timesteps add up in the latents: x_N = sum_i (sigma_{i+1} - sigma_i) t_i.
     x = integrate(
         lambda x, t: jnp.broadcast_to(per_sample(t), x.shape),
         jnp.zeros_like(noise),
-        schedule=schedule,
+        process=process,
         solver=Euler(),
         steps=4,
     )
     sigmas = [5 * u / (1 + 4 * u) for u in (1, 0.75, 0.5, 0.25)] + [0]
-    told = [1000, 936, 832, 624]  # 1000, 937.5, 833.33, 625 in steps of 4
-    expected = sum((sigmas[i + 1] - sigmas[i]) * told[i] for i in range(4))
+    given = [1000, 936, 832, 624]  # 1000, 937.5, 833.33, 625 in steps of 4
+    expected = sum((sigmas[i + 1] - sigmas[i]) * given[i] for i in range(4))
     np.testing.assert_allclose(x, np.full(x.shape, expected), rtol=1e-6)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
-def test_a_plan_is_finite_from_pure_noise_to_data(order):
-    for column in UniPC(order=order).plan(FlowSchedule().sigmas(50)):
+def test_coefficients_are_finite_from_pure_noise_to_data(order):
+    process = RectifiedFlow()
+    for column in UniPC(order=order).coefficients(process, process.times(50)):
         assert column.dtype == np.float32
         assert np.isfinite(column).all()
 
