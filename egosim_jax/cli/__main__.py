@@ -18,6 +18,7 @@ from egosim_jax.cli.data import Check, Encode, Look, Make, Pack, Stats
 from egosim_jax.cli.doctor import Doctor
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import Generate
+from egosim_jax.cli.models import Fetch, List
 from egosim_jax.cli.plan import Plan
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.view import View
@@ -40,6 +41,20 @@ class Data:
         | Annotated[Look, tyro.conf.subcommand("look")]
         | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models:
+    """List released weights by name; fetch and convert them."""
+
+    command: (
+        Annotated[List, tyro.conf.subcommand("list")]
+        | Annotated[Fetch, tyro.conf.subcommand("fetch")]
     )
 
     def run(self) -> int:
@@ -72,6 +87,7 @@ Commands = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Data, tyro.conf.subcommand("data")]
+    | Annotated[Models, tyro.conf.subcommand("models")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import json
 import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egosim_jax.io import hub
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folders of weights that come with the package, by config."""
+RELEASED = Path(__file__).with_name("released.json")
+"""Weights on a model hub, by name."""
 
 
 def names() -> list[str]:
@@ -40,9 +44,35 @@ def shipped_weights(name: str) -> Path | None:
     return folder if folder.is_dir() else None
 
 
+def releases() -> dict[str, hub.Release]:
+    """Return the releases of weights that can be fetched, by name."""
+    found = json.loads(RELEASED.read_text("utf-8"))
+    return {name: hub.Release(name=name, **fields) for name, fields in found.items()}
+
+
+def release(name: str) -> hub.Release:
+    """Return the release of a name; an unknown one raises `InputError` with the nearest."""
+    known = releases()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+        raise InputError(
+            f"There are no released weights {name!r}. Nearest: {near[0]}. All: "
+            f"{', '.join(known)}. (egosim models list)"
+        )
+    return known[name]
+
+
 def weights_of(name: str, given: Path | None) -> Path:
-    """The folder that was given, else the shipped one; `InputError` if there is neither."""
+    """Return the folder of a config's weights: the given one, else shipped ones, else fetched ones.
+
+    Raises `InputError`, with the command that fetches them, if there are none.
+    """
     folder = given or shipped_weights(name)
+    if folder is None and hub.is_fetched(fetched := hub.fetched_folder(name)):
+        folder = fetched
     if folder is None:
-        raise InputError(f"{name} comes without weights. (--weights FOLDER)")
+        fetch = f"Fetch them: egosim models fetch {name}. Or name" if name in releases() else "Name"
+        raise InputError(
+            f"There are no weights of {name} here. {fetch} a folder of weights. (--weights FOLDER)"
+        )
     return folder

@@ -1,0 +1,105 @@
+"""`egosim models`: list and fetch released weights."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from egosim_jax.command import ExitCode
+
+if TYPE_CHECKING:
+    from egosim_jax.io.hub import Listing, Release
+
+DOWNLOADS = ".download"
+"""Folder of the downloaded files in a folder of weights, until they are converted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class List:
+    """List the models, and where their weights are or come from."""
+
+    def run(self) -> int:
+        """Print a table."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from egosim_jax import configs
+        from egosim_jax.io import hub
+
+        table = Table("name", "config", "weights", "about")
+        releases = configs.releases()
+        for name in [n for n in configs.names() if n not in releases]:
+            shipped = configs.shipped_weights(name)
+            table.add_row(name, name, str(shipped) if shipped else "none released", "")
+        for name, release in releases.items():
+            folder = hub.fetched_folder(name)
+            where = str(folder) if hub.is_fetched(folder) else f"egosim models fetch {name}"
+            table.add_row(name, release.config, where, f"{release.about} ({release.repository})")
+        Console(width=160, markup=False, emoji=False, highlight=False).print(table)
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fetch:
+    """Download released weights, verify them and convert them.
+
+    A partial download or conversion is continued when the same command runs again.
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Name in `egosim models list`."""
+    out: Path | None = None
+    """Folder of the converted weights; by default one in the user's cache, where `--config` and
+    `Generator.load` find it by name."""
+    dry_run: bool = False
+    """Print files, sizes and disk space, and download nothing."""
+    keep_download: bool = False
+    """Keep the downloaded files after the conversion."""
+
+    def run(self) -> int:
+        """Download, verify, convert, print the folder."""
+        from egosim_jax import configs
+        from egosim_jax.io import hub
+
+        release = configs.release(self.name)
+        folder = self.out or hub.fetched_folder(release.name)
+        if hub.is_fetched(folder) and not self.dry_run:
+            print(folder)
+            return ExitCode.DONE
+        listing = hub.list_files(release)
+        downloads = folder / DOWNLOADS
+        needed = hub.bytes_needed(listing, downloads)
+        if self.dry_run:
+            for file in listing.files:
+                print(f"{file.path}  {file.bytes:,} bytes  sha256 {file.sha256 or 'unknown'}")
+            print(f"{release.repository} at {listing.revision}: {listing.bytes / 1e9:.2f} GB")
+            print(f"{needed / 1e9:.2f} GB needed, {hub.free_space(folder) / 1e9:.2f} GB free")
+            print(f"weights: {folder}")
+            return ExitCode.DONE
+        hub.check_space(needed, folder)
+        _fetch(release, listing, folder, keep_download=self.keep_download)
+        print(folder)
+        return ExitCode.DONE
+
+
+def _fetch(release: Release, listing: Listing, folder: Path, *, keep_download: bool) -> None:
+    """Download to a hidden folder, convert from there, record, and remove the download."""
+    from egosim_jax.convert.commands import Weights
+    from egosim_jax.io import hub
+    from egosim_jax.io.atomic import lock_folder
+    from egosim_jax.io.run import write_json
+
+    with lock_folder(folder):
+        print(f"{release.repository}: {listing.bytes / 1e9:.2f} GB", file=sys.stderr)
+        downloads = folder / DOWNLOADS
+        hashes = hub.download(release, listing, downloads)
+        convert = Weights(source=downloads, config=release.config, out=folder, widen=release.widen)
+        convert.run()
+        write_json(folder / hub.RECORD, hub.as_record(release, listing, hashes))
+        if not keep_download:
+            shutil.rmtree(downloads)

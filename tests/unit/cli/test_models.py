@@ -1,0 +1,90 @@
+"""`egosim models`: from a release on a hub to weights that the generator loads."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file as load_numpy
+from safetensors.torch import load_file
+
+from egosim_jax import configs
+from egosim_jax.cli.__main__ import main
+from egosim_jax.command import ExitCode
+from egosim_jax.convert.commands import ToTorch
+from egosim_jax.io import hub
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.networks import Networks
+from egosim_jax.types import InputError
+from tests.hub import COMMIT, Hub, serve
+
+FILES = configs.release("egosim_14b").files
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    """A release of `debug` with the files of EgoSim-14B."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    ours, folder = tmp_path / "ours", tmp_path / "hub"
+    Networks.random(configs.get("debug"), seed=0).save(ours)
+    ToTorch(weights=ours, config="debug", out=folder).run()
+    for name in filter(lambda name: name.endswith(".pth"), FILES):
+        written = (folder / name).with_suffix(".safetensors")
+        torch.save(load_file(written), folder / name)
+        written.unlink()
+    (folder / "google" / "umt5-xxl").mkdir(parents=True)
+    (folder / "google" / "umt5-xxl" / "tokenizer.json").write_text("{}")
+    fields = {"about": "test", "config": "debug", "revision": None, "widen": None}
+    released = tmp_path / "released.json"
+    entry = {**fields, "repository": "someone/debug", "files": dict(FILES)}
+    released.write_text(json.dumps({"debug": entry}))
+    monkeypatch.setattr(configs, "RELEASED", released)
+    with serve(Hub(folder, "someone/debug"), monkeypatch) as running:
+        yield running
+
+
+def test_fetched_weights_are_those_of_the_release_and_are_found_by_name(served, tmp_path, capsys):
+    assert main(["models", "fetch", "debug"]) == ExitCode.DONE
+    folder = configs.weights_of("debug", None)
+    assert capsys.readouterr().out.splitlines()[-1] == str(folder)
+    for file in sorted((tmp_path / "ours").glob("*.safetensors")):
+        expected, found = load_numpy(file), load_numpy(folder / file.name)
+        assert found.keys() == expected.keys()
+        assert all(np.array_equal(found[name], expected[name]) for name in expected)
+    assert read_json(folder / hub.RECORD)["revision"] == COMMIT
+    assert not (folder / ".download").exists()
+    served.requests.clear()
+    assert main(["models", "fetch", "debug"]) == ExitCode.DONE
+    assert not served.requests
+    main(["models", "list"])
+    assert str(folder)[:20] in capsys.readouterr().out
+
+
+def test_a_dry_run_prints_sizes_and_downloads_nothing(served, capsys):
+    assert main(["models", "fetch", "debug", "--dry-run"]) == ExitCode.DONE
+    out = capsys.readouterr().out
+    assert f"someone/debug at {COMMIT}" in out
+    size = (served.folder / "Wan2.1_VAE.pth").stat().st_size
+    assert f"Wan2.1_VAE.pth  {size:,} bytes  sha256 " in out
+    assert not hub.fetched_folder("debug").exists()
+    assert not [path for _, path, _ in served.requests if "resolve" in path]
+
+
+def test_without_fetched_weights_the_error_names_the_command(served):
+    with pytest.raises(InputError, match="egosim models fetch debug"):
+        configs.weights_of("debug", None)
+
+
+def test_a_damaged_release_leaves_no_weights_behind(served):
+    path = served.folder / "diffusion_pytorch_model.safetensors"
+    data = np.frombuffer(path.read_bytes(), np.uint8)[:-4]
+    path.write_bytes(data.tobytes())
+    assert main(["models", "fetch", "debug"]) == ExitCode.USAGE
+    with pytest.raises(InputError, match="There are no weights of debug here"):
+        configs.weights_of("debug", None)
+
+
+def test_every_release_is_of_a_config():
+    assert {release.config for release in configs.releases().values()} <= set(configs.names())
+    with pytest.raises(InputError, match="Nearest: egosim_14b"):
+        configs.release("egosim14b")

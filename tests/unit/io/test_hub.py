@@ -1,0 +1,137 @@
+"""Downloads of releases: pinned, continued and verified, from a hub on the loopback."""
+
+import hashlib
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from egosim_jax.io import hub
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.types import InputError
+from tests.hub import COMMIT, Hub, serve
+
+RELEASE = hub.Release(
+    name="some_model",
+    about="a test",
+    config="debug",
+    repository="someone/some-model",
+    revision=None,
+    widen=None,
+    files={"weights.bin": None, "tokenizer/*": None},
+)
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "hub"
+    (folder / "tokenizer").mkdir(parents=True)
+    (folder / "weights.bin").write_bytes(np.random.default_rng(0).bytes(3_000_000))
+    (folder / "tokenizer" / "tokenizer.json").write_text("{}")
+    (folder / "model.py").write_text("raise SystemExit")
+    with serve(Hub(folder, RELEASE.repository), monkeypatch) as running:
+        yield running
+
+
+def fetch(release, folder):
+    return hub.download(release, hub.list_files(release), folder)
+
+
+def test_only_the_files_of_the_release_are_downloaded_and_their_hashes_recorded(served, tmp_path):
+    hashes = fetch(RELEASE, tmp_path / "here")
+    names = {p.name for p in (tmp_path / "here").iterdir() if not p.name.startswith(".")}
+    assert names == {"weights.bin", "tokenizer"}
+    data = (served.folder / "weights.bin").read_bytes()
+    assert (tmp_path / "here" / "weights.bin").read_bytes() == data
+    assert hashes["weights.bin"] == hashlib.sha256(data).hexdigest()
+    record = read_json(hub.record_path(RELEASE.name))
+    assert record["revision"] == COMMIT
+    assert record["files"]["tokenizer/tokenizer.json"]["bytes"] == 2
+
+
+def test_a_download_that_was_cut_off_continues_after_its_bytes(served, tmp_path):
+    served.cut.add("weights.bin")
+    fetch(RELEASE, tmp_path / "here")
+    ranges = [r for method, path, r in served.requests if "weights.bin" in path and r]
+    assert ranges == ["bytes=1500000-"]
+
+
+def test_a_second_fetch_downloads_nothing(served, tmp_path):
+    fetch(RELEASE, tmp_path / "here")
+    served.requests.clear()
+    fetch(RELEASE, tmp_path / "here")
+    assert not [path for method, path, _ in served.requests if "resolve" in path]
+
+
+def test_a_damaged_file_is_removed_and_named(served, tmp_path):
+    listing = hub.list_files(RELEASE)
+    hub.download(RELEASE, listing, tmp_path / "here")
+    path = tmp_path / "here" / "weights.bin"
+    data = bytearray(path.read_bytes())
+    data[7] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"weights\.bin has SHA-256 [0-9a-f]{64}; expected"):
+        hub.download(RELEASE, listing, tmp_path / "here")
+    assert not path.exists()
+    hub.download(RELEASE, listing, tmp_path / "here")
+    assert path.read_bytes() == (served.folder / "weights.bin").read_bytes()
+
+
+def test_a_hash_of_the_release_is_binding(served):
+    release = replace(RELEASE, files={"weights.bin": "0" * 64})
+    with pytest.raises(InputError, match=f"expected {'0' * 64}"):
+        hub.list_files(release)
+
+
+def test_the_first_fetch_pins_the_commit(served, tmp_path):
+    fetch(RELEASE, tmp_path / "here")
+    served.commit = "f" * 40
+    with pytest.raises(InputError, match="cannot be downloaded"):
+        fetch(RELEASE, tmp_path / "there")
+    hub.record_path(RELEASE.name).unlink()
+    assert hub.list_files(RELEASE).revision == "f" * 40
+
+
+def test_a_file_that_the_first_fetch_hashed_must_stay_the_same(served, tmp_path):
+    fetch(RELEASE, tmp_path / "here")
+    (served.folder / "tokenizer" / "tokenizer.json").write_text("[]")
+    with pytest.raises(InputError, match=r"tokenizer\.json has SHA-256"):
+        fetch(RELEASE, tmp_path / "there")
+
+
+def test_a_missing_file_is_named_with_the_command_that_converts_by_hand(served):
+    release = replace(RELEASE, files={"other.bin": None})
+    with pytest.raises(InputError, match=r"no file other\.bin.*egosim-convert weights FOLDER"):
+        hub.list_files(release)
+
+
+def test_a_hub_that_cannot_be_reached_is_one_message(served):
+    release = replace(RELEASE, repository="someone/else")
+    with pytest.raises(InputError, match="someone/else cannot be downloaded") as refused:
+        hub.list_files(release)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["../weights.bin", "/etc/weights.bin", "a/.hidden/weights.bin"])
+def test_unsafe_names_are_refused(name, served, monkeypatch):
+    sibling = SimpleNamespace(rfilename=name, size=1, lfs=None)
+    info = SimpleNamespace(sha=COMMIT, siblings=[sibling])
+    monkeypatch.setattr("huggingface_hub.HfApi.model_info", lambda *args, **options: info)
+    with pytest.raises(InputError, match="not a file that can be downloaded safely"):
+        hub.list_files(replace(RELEASE, files={"*weights.bin": None}))
+
+
+def test_a_damaged_record_is_refused(served):
+    path = hub.record_path(RELEASE.name)
+    path.parent.mkdir(parents=True)
+    path.write_text('{"revision": "main", "files": {}}')
+    with pytest.raises(InputError, match="not a record of a fetched release"):
+        hub.list_files(RELEASE)
+
+
+def test_too_little_disk_space_is_found_before_the_download(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub, "free_space", lambda folder: 10**9)
+    with pytest.raises(InputError, match=r"has 1\.0 GB free, and 2\.5 GB are needed"):
+        hub.check_space(2_500_000_000, tmp_path)
