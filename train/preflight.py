@@ -1,9 +1,9 @@
-"""Whether a training step fits a machine, compiled for it by its own compiler.
+"""Preflight of a training: compile its update for a target machine, and report whether it fits.
 
-The step is the one that training runs: the same function, mesh, shardings and donation. After the
-recipe's own setting come the others that take the same batch: as many clips at a time on a device,
-and as much kept for the backward pass, as there is memory for. If there is too little for anything,
-2 devices share a clip, then 4, and so on.
+The compiled update is the one that training runs: the same function, mesh, shardings and donation.
+After the recipe's own setting come the others that take the same batch: as many clips at a time on
+a device, and as much kept for the backward pass, as fit its memory. If nothing fits, 2 devices
+share a clip, then 4, and so on.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any
 import jax
 
 from egosim_jax.command import DONE, FAILED
-from egosim_jax.models.wan.config import Remat
 from egosim_jax.preflight.report import Report, TooLarge, compile_for, plain, size, text
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.progress import track
@@ -27,26 +26,23 @@ from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import Programs, Stage
 from egosim_jax.types import MeshConfig
 
-KEEPING: tuple[Remat, ...] = ("offload", "full", "attention", "projections", "products", "none")
-"""What a backward pass may keep, by the memory of a device that it takes, least first."""
-
-ANNOUNCEMENT = "looking for other settings that fit, which takes minutes; --no-search leaves it out"
+ANNOUNCEMENT = "looking for other settings that fit, which takes minutes; --no-search skips it"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """How a step takes its batch."""
+    """The part of a batch that is computed at a time, and the rematerialization."""
 
     clips: int
-    """On a device at a time; those that share a clip count as one."""
-    remat: Remat
-    """What the backward pass computes again."""
+    """Clips on a device at a time; devices that share a clip count as one."""
+    remat: str
+    """Rematerialization in the backward pass."""
     context: int = 1
-    """Devices that share a clip."""
+    """Number of devices that share a clip."""
 
 
 def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: bool) -> int:
-    """Print what the stages of a recipe take on a target; 1 if one of them does not fit."""
+    """Print the reports of a recipe's stages on a target; return 1 if one does not fit."""
     target, fit = find(name), True
     found: dict[str, dict[str, Any]] = {}
     for title, stage in stages.items():
@@ -55,9 +51,9 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
         found[title] = {"asked": plain(report)}
         if not as_json:
             print(f"{_heading(title, stage, target)}\n\n{text(report)}", flush=True)
-        # Settings are ordered by the target's speed.
-        ordered = isinstance(stage.task, Denoising) and not math.isnan(target.device.flops)
-        if search and ordered:
+        # Settings are ordered by predicted speed.
+        known_speed = not math.isnan(target.device.flops)
+        if search and isinstance(stage.task, Denoising) and known_speed:
             print(ANNOUNCEMENT, file=sys.stderr, flush=True)
             others = _others(stage, target, report)
             found[title]["settings"] = [
@@ -85,7 +81,7 @@ def compile_step(stage: Stage, target: Target) -> Report | TooLarge:
 
 
 def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Setting, Report]:
-    """The settings that fit, best first, with as few devices to a clip as any of them needs."""
+    """Return the settings that fit, best first, with as few devices per clip as possible."""
     known = {_setting(stage, target): asked}
     for mesh in _meshes(stage, target):
         shared = stage._replace(training=replace(stage.training, mesh=mesh))
@@ -96,7 +92,7 @@ def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Sett
 
 
 def _meshes(stage: Stage, target: Target) -> Iterator[MeshConfig]:
-    """The mesh as it is, and then with more and more devices to a clip."""
+    """Yield the mesh as it is, and then with more and more devices per clip."""
     task: Any = stage.task
     own = make_mesh(stage.training.mesh, target.devices).shape
     context = own["context"]
@@ -108,17 +104,18 @@ def _meshes(stage: Stage, target: Target) -> Iterator[MeshConfig]:
 def _fitting(
     stage: Stage, target: Target, known: Mapping[Setting, Report | TooLarge]
 ) -> dict[Setting, Report]:
-    """The settings of a mesh that fit."""
+    """Return the settings of a mesh that fit."""
     mesh = make_mesh(stage.training.mesh, target.devices)
     share, context = stage.training.batch_size // parts("batch", mesh), parts("tokens", mesh)
     counts = [clips for clips in range(1, share + 1) if share % clips == 0]
     fitting: dict[Setting, Report] = {}
-    keeping = KEEPING
+    task: Any = stage.task
+    levels = task.model.dit.remat_levels
 
     def tries() -> Iterator[None]:
-        nonlocal keeping
+        nonlocal levels
         for clips in counts:
-            for place, remat in enumerate(keeping):
+            for place, remat in enumerate(levels):
                 setting = Setting(clips=clips, remat=remat, context=context)
                 report = known.get(setting)
                 if report is None:
@@ -126,24 +123,24 @@ def _fitting(
                 yield
                 if not isinstance(report, Report) or not report.fits:
                     # What keeps more does not fit either, nor does it with more clips.
-                    keeping = keeping[:place]
+                    levels = levels[:place]
                     break
                 fitting[setting] = report
 
-    shared = f", {context} devices to a clip" if context > 1 else ""
-    for _ in track(tries(), f"compiling other settings{shared}", total=len(counts) * len(keeping)):
+    shared = f", {context} devices per clip" if context > 1 else ""
+    for _ in track(tries(), f"compiling other settings{shared}", total=len(counts) * len(levels)):
         pass
     return fitting
 
 
 def _order(report: Report) -> tuple[float, int]:
-    """Less work first, then less memory; of what waits for what nothing is known."""
+    """Order by predicted work, then by memory; overlap is not modeled."""
     return report.compute_s + report.memory_s + report.link_s, report.memory.peak
 
 
 def _heading(title: str, stage: Stage, target: Target) -> str:
     setting, device = _setting(stage, target), target.devices[0].device_kind
-    shared = f", {setting.context} to a clip" if setting.context > 1 else ""
+    shared = f", {setting.context} per clip" if setting.context > 1 else ""
     return (
         f"{title} on {target.name}, {len(target.devices)} x {device}{shared}: batch "
         f"{stage.training.batch_size}, {setting.clips} on a device at a time, remat {setting.remat}"
@@ -160,24 +157,26 @@ def _setting(stage: Stage, target: Target) -> Setting:
 
 def _with(stage: Stage, setting: Setting, share: int) -> Stage:
     task: Any = stage.task
-    dit = replace(task.model.dit, remat=setting.remat)
+    dit = task.model.dit
+    if setting.remat != dit.remat:
+        dit = replace(dit, remat=setting.remat)
     return Stage(
         replace(task, model=replace(task.model, dit=dit)),
-        replace(stage.training, accumulate=share // setting.clips),
+        replace(stage.training, grad_accum_steps=share // setting.clips),
     )
 
 
 def _table(settings: Mapping[Setting, Report], batch: int) -> str:
     if not settings:
         return "  no setting of this batch fits: more devices"
-    columns = f"{'clips at a time':<17}{'accumulate':<12}{'context':<9}{'remat':<13}"
+    columns = f"{'clips at a time':<17}{'grad accum':<12}{'context':<9}{'remat':<13}"
     lines = ["", "  settings that fit, best first"]
-    lines.append(f"    {columns}{'peak':>10}{'least s':>10}{'clips/s':>9}")
+    lines.append(f"    {columns}{'peak':>10}{'roofline s':>11}{'clips/s':>9}")
     for setting, report in settings.items():
         least = report.least_s
         accumulate = batch * setting.context // report.devices // setting.clips
         lines.append(
             f"    {setting.clips:<17}{accumulate:<12}{setting.context:<9}{setting.remat:<13}"
-            f"{size(report.memory.peak):>10}{least:10.3g}{batch / least:9.3g}"
+            f"{size(report.memory.peak):>10}{least:11.3g}{batch / least:9.3g}"
         )
     return "\n".join(lines)

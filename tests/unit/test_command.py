@@ -80,7 +80,7 @@ def test_a_missing_extra_is_found_before_anything_starts(extra, tmp_path, monkey
     assert not (tmp_path / "run").exists()
 
 
-def test_the_preflights_search_is_announced_and_can_be_left_out(monkeypatch, capsys):
+def test_the_preflights_search_is_announced_and_can_be_skipped(monkeypatch, capsys):
     from egosim_jax.train import preflight
 
     searched = []
@@ -95,7 +95,7 @@ def test_the_preflights_search_is_announced_and_can_be_left_out(monkeypatch, cap
     assert "--no-search" not in capsys.readouterr().err
     assert train(options) == command.DONE
     assert len(searched) == 1
-    assert "takes minutes; --no-search leaves it out" in capsys.readouterr().err
+    assert "takes minutes; --no-search skips it" in capsys.readouterr().err
 
 
 def test_viser_can_be_installed_too():

@@ -26,6 +26,10 @@ class WanDiTConfig:
     """Name table of conversion."""
     numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "attention", "remat")
     """Fields that change only how values are computed, which a resumed training may change."""
+    remat_levels: ClassVar[tuple[Remat, ...]] = (
+        "offload", "full", "attention", "projections", "products", "none",
+    )  # fmt: skip
+    """Values of `remat`, by the memory that they take, ascending."""
 
     in_channels: int = 52
     """Channels of the noisy latents and the condition together."""
