@@ -29,8 +29,9 @@ class OptimizerConfig:
     """Optimizer, learning-rate schedule and guard against bad gradients."""
 
     name: Literal["adamw", "muon"] = "adamw"
-    """Optimizer; `muon` orthogonalizes the updates of matrices and convolutions and uses Adam for
-    the rest."""
+    """Name of the optimizer.
+
+    `muon` orthogonalizes the updates of matrices and convolutions and uses Adam for the rest."""
     learning_rate: float = 1e-5
     """Peak learning rate."""
     warmup_steps: int = 0
@@ -46,11 +47,11 @@ class OptimizerConfig:
     clip_grad_norm: float = 1.0
     """Maximum global norm of the gradient, to which longer gradients are scaled."""
     skip_grad_norm_factor: float | None = None
-    """Skip an update whose gradient norm exceeds this multiple of its running mean; None: skip
-    none."""
+    """Multiple of the running mean gradient norm above which an update is skipped; None: none."""
     ema_decay: float | None = None
-    """Decay of the moving average of the weights (EMA), for instance 0.9999, which is then
-    validated and kept; None: no EMA, which saves its memory."""
+    """Decay of the moving average of the weights (EMA), for instance 0.9999; None: no EMA.
+
+    The EMA is what is validated and kept. It takes the memory of the weights."""
 
     def __post_init__(self) -> None:
         """Check the range of each number."""
@@ -66,7 +67,7 @@ class OptimizerConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Training hyper-parameters."""
+    """Training hyper-parameters: duration, batch, optimizer, devices, checkpoints and logs."""
 
     steps: int
     """Total number of updates."""
@@ -77,7 +78,7 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimizer and learning rate."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
-    """Device mesh."""
+    """Shape of the device mesh."""
     seed: int = 0
     """Seed of the initial weights, of the order of the data and of the noise."""
     log_every: int = 10
@@ -95,11 +96,13 @@ class TrainConfig:
     fallback: bool = False
     """If the newest checkpoint is damaged, resume from the one before it."""
     workers: int = 0
-    """Processes that load data. They determine the order of the data, so a resumed run needs the
-    same number."""
+    """Number of processes that load data; 0: threads of the training process.
+
+    It determines the order of the data, so a resumed run needs the same."""
     hang_timeout_s: float = 300.0
-    """Seconds without a finished update, if also ten times the usual, after which the run is
-    considered hung and exits with code 70."""
+    """Seconds without a finished update, at least, after which a run exits with code 70.
+
+    It must also be ten times the usual time."""
     tensorboard: bool = False
     """Also write metrics for TensorBoard, to OUT/tensorboard."""
     wandb: str | None = None
@@ -148,15 +151,15 @@ class Recipe(ABC):
     """A training that one command runs, in one or several stages."""
 
     out: Path | None = None
-    """Run folder."""
+    """Folder of the run."""
     preflight: str | None = None
-    """Do not train. Compile each stage's update for a machine that need not be present, such as
-    h200:8, v5p:2x2x2 or cpu:1, and report whether it fits. Needs no other option."""
+    """Machine to compile for instead of training, such as h200:8, v5p:2x2x2 or cpu:1.
+
+    It need not be present. Reports whether each stage's update fits, and needs no other option."""
     json: bool = False
     """With --preflight: print JSON."""
     search: bool = True
-    """With --preflight: also compile the other settings that take the same batch, which takes
-    minutes."""
+    """With --preflight: also compile other settings for the same batch, which takes minutes."""
 
     def run(self) -> int:
         """Train, or run the preflight, and return the exit code."""

@@ -31,7 +31,7 @@ class FineTuning(Recipe):
     config: str
     """Name of the model."""
     training: TrainConfig
-    """Training hyper-parameters."""
+    """Hyper-parameters of the denoiser's training."""
     latents: Path | None = None
     """Folder of latents shards."""
     weights: Path | None = None

@@ -55,8 +55,9 @@ class FromScratch(Recipe):
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition of the denoiser."""
     change_loss_weight: float = 0.0
-    """Additional loss weight of the denoiser where the clip differs from its prior: at hands and at
-    what they move."""
+    """Additional loss weight of the denoiser where the clip differs from its prior.
+
+    It differs at hands, at what they move and in unobserved regions."""
     weights_dtype: str = "float32"
     """Dtype of the weights that are written."""
     weights: Path | None = None

@@ -329,8 +329,8 @@ def memory_summary(program: Any) -> str:
     analysis = program.memory_analysis()
     if analysis is None:
         return ""
-    gigabytes = (analysis.argument_size_in_bytes + analysis.temp_size_in_bytes) / 1e9
-    return f", needs {gigabytes:.2f} GB per device"
+    peak_gb = (analysis.argument_size_in_bytes + analysis.temp_size_in_bytes) / 1e9
+    return f", needs {peak_gb:.2f} GB per device"
 
 
 def startup_message(state: TrainState, training: TrainConfig, out: Path) -> str:

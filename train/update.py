@@ -83,7 +83,7 @@ class Stage(NamedTuple):
     task: Task
     """Networks, examples and loss."""
     training: TrainConfig
-    """Training hyper-parameters."""
+    """Hyper-parameters of its training."""
 
 
 @no_type_check
@@ -99,8 +99,7 @@ class TrainState:
     opt_state: Any
     """State of the optax transformation."""
     grad_norm_ema: jax.Array
-    """Running geometric mean of the gradient norms, skipped updates excluded, float32; 0 at the
-    start."""
+    """Running geometric mean of the gradient norms, skipped updates excluded, float32; first 0."""
     consecutive_skips: jax.Array
     """Number of updates skipped in a row, int32."""
     ema_params: nnx.State | None
@@ -253,9 +252,9 @@ class Programs:
     frozen_sharding: Any
     """Shardings of the frozen weights."""
     update: Any
-    """Jitted `make_update`, which donates the state."""
+    """Jitted function of `make_update`, which donates the state."""
     validate: Any
-    """Jitted `make_validation`."""
+    """Jitted function of `make_validation`."""
 
     @classmethod
     def of(cls, task: Task, training: TrainConfig, mesh: Mesh) -> Programs:

@@ -1,4 +1,4 @@
-"""One update of the `tabletop` denoiser: memory that was foretold, and that the process then took.
+"""One update of the `tabletop` denoiser: its predicted and its measured memory.
 
 Prints both, in bytes. Both begin with the weights, moments and batch.
 """
@@ -29,7 +29,7 @@ def resident(name: str) -> int:
 def main() -> None:
     stage, target = TABLETOP.stages()["denoiser"], find("cpu:1")
     task, training = stage
-    foretold = compile_step(stage, target).memory.peak
+    predicted = compile_step(stage, target).memory.peak
     mesh = make_mesh(training.mesh, target.devices)
     programs, placed = Programs.of(task, training, mesh), batch_sharding(mesh)
     with jax.set_mesh(mesh):
@@ -51,7 +51,7 @@ def main() -> None:
         state = jax.block_until_ready(zeros())
         Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins again
         jax.block_until_ready(update(state, programs.frozen, batch))
-    print(json.dumps({"foretold": foretold, "taken": resident("VmHWM") - before}))
+    print(json.dumps({"predicted": predicted, "measured": resident("VmHWM") - before}))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How a process joins the others, and what it does where there are none."""
+"""Joining the processes of a run, and running alone."""
 
 import jax
 import pytest
@@ -8,7 +8,7 @@ from egosim_jax.train import distributed
 
 @pytest.fixture
 def initialized(monkeypatch):
-    """What jax was asked for, instead of asking it."""
+    """The arguments of `jax.distributed.initialize`, which is not called."""
     calls = []
     for name in distributed.NAMES:
         monkeypatch.delenv(name, raising=False)

@@ -24,7 +24,7 @@ from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import Networks
-from egosim_jax.train import encode as caching
+from egosim_jax.train import encode as encoding
 from egosim_jax.train.encode import check_encoders, encode_shards
 from egosim_jax.types import InputError, VideoSpec
 
@@ -96,7 +96,7 @@ def test_every_window_is_a_record_in_order(encoded):
 
 
 def test_frames_are_not_decoded_again(source, weights, tmp_path):
-    with pytest.raises(InputError, match=r"decoding is 'accurate', not official\. Pack"):
+    with pytest.raises(InputError, match=r"decoded as 'accurate', not official\. Pack"):
         encode(source, weights, tmp_path / "out", decoding="official")
     assert not (tmp_path / "out").exists()
 
@@ -135,7 +135,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
     encoded, source, weights, tmp_path, monkeypatch
 ):
     """The first time it ends within the second part."""
-    whole, calls = caching.Encoding.__call__, []
+    whole, calls = encoding.Encoding.__call__, []
 
     def failing(self, triplets):
         calls.append(triplets)
@@ -143,7 +143,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
             raise KeyboardInterrupt
         return whole(self, triplets)
 
-    monkeypatch.setattr(caching.Encoding, "__call__", failing)
+    monkeypatch.setattr(encoding.Encoding, "__call__", failing)
     with pytest.raises(KeyboardInterrupt):
         encode(source, weights, tmp_path)
     assert not (tmp_path / MANIFEST).exists()
@@ -181,7 +181,7 @@ def test_processes_share_the_parts_and_give_the_same_bytes(encoded, source, weig
 
 
 def test_a_finished_folder_is_left_alone(encoded, source, weights, monkeypatch):
-    monkeypatch.setattr(caching, "Encoding", lambda *_: pytest.fail("it encodes"))
+    monkeypatch.setattr(encoding, "Encoding", lambda *_: pytest.fail("it encodes"))
     before = (encoded / MANIFEST).stat().st_mtime_ns
     encode(source, weights, encoded)
     assert (encoded / MANIFEST).stat().st_mtime_ns == before
@@ -198,7 +198,7 @@ def test_a_folder_of_other_settings_is_refused(encoded, source, weights, options
 
 @pytest.fixture(scope="module")
 def others(weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Other weights."""
+    """Weights of another autoencoder."""
     folder = tmp_path_factory.mktemp("others")
     tensors = load_file(weights / "vae.safetensors")
     save_file({name: 2 * tensor for name, tensor in tensors.items()}, folder / "vae.safetensors")
@@ -213,14 +213,14 @@ def test_a_folder_of_other_encoders_or_clips_is_refused(encoded, source, weights
         encode(clips, weights, encoded)
 
 
-def test_shards_that_were_not_encoded_here_are_refused(source, weights, tmp_path):
+def test_a_folder_of_other_shards_is_refused(source, weights, tmp_path):
     write_clips(tmp_path, CONFIG.video)
-    with pytest.raises(InputError, match="already holds shards that were not encoded here"):
+    with pytest.raises(InputError, match="already holds other shards"):
         encode(source, weights, tmp_path)
 
 
 def test_what_cannot_be_encoded_is_refused(encoded, source, weights, tmp_path):
-    with pytest.raises(InputError, match="there must be videos or frames, with their truth"):
+    with pytest.raises(InputError, match="expected videos or frames with their target"):
         encode(ShardReader(encoded), weights, tmp_path / "a")
     short = ShardReader(write_clips(tmp_path / "short", CONFIG.video, frames=4))
     with pytest.raises(InputError, match="record 0 has 4 frames; a window needs 5"):
@@ -247,7 +247,7 @@ def test_shards_fit_the_weights_that_encoded_them(encoded, weights, others):
 
 
 def test_shards_of_another_model_are_refused(encoded, weights):
-    with pytest.raises(InputError, match="config: the shards have debug, this training odd"):
+    with pytest.raises(InputError, match="config: the shards have debug, this training has odd"):
         check_encoders(encoded, dataclasses.replace(CONFIG, name="odd"), None)
     with pytest.raises(InputError, match=r"video: .*height=16.*height=64"):
         check_encoders(encoded, DEBUG, weights)
@@ -258,10 +258,10 @@ def test_weights_without_a_vae_are_refused(encoded, tmp_path):
         check_encoders(encoded, CONFIG, tmp_path)
 
 
-def test_shards_that_do_not_say_who_encoded_them_are_refused(tmp_path):
+def test_shards_without_hashes_of_encoders_are_refused(tmp_path):
     with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video) as writer:
         writer.add({"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
-    with pytest.raises(InputError, match="does not say which encoders made them"):
+    with pytest.raises(InputError, match="without the hashes of their encoders"):
         check_encoders(tmp_path, CONFIG, None)
 
 
@@ -301,10 +301,10 @@ def test_the_decoding_of_videos_is_recorded(weights, tmp_path):
     videos["first_frame"] = np.frombuffer(png.getvalue(), np.uint8)
     with ShardWriter(tmp_path / "videos", kind="videos") as writer:
         writer.add(videos, {"video_id": "a", "prompt": "take it"})
-    truths = {}
+    targets = {}
     for decoding in ("accurate", "official"):
         out = tmp_path / decoding
         encode(ShardReader(tmp_path / "videos"), weights, out, decoding=decoding, batch_size=1)
         assert read_manifest(out).provenance["decoding"] == decoding
-        truths[decoding] = ShardReader(out)[0].arrays["target"]
-    assert (truths["accurate"] != truths["official"]).any()
+        targets[decoding] = ShardReader(out)[0].arrays["target"]
+    assert (targets["accurate"] != targets["official"]).any()

@@ -27,7 +27,7 @@ def test_a_forward_of_the_14b_takes_1126_tflop():
 
 @pytest.mark.parametrize("image", [0, 5])
 def test_the_count_is_the_compilers_of_a_small_network(image):
-    """Which counts norms and activations, too: a few percent at this width."""
+    """The compiler counts norms and activations, too: a few percent at this width."""
     config = WanDiTConfig(
         dim=256, ffn_dim=512, heads=2, layers=1, text_dim=64, image_dim=64 if image else None
     )

@@ -1,4 +1,4 @@
-"""What is computed does not depend on how it is shared among devices."""
+"""Updates on meshes of devices, compared with updates on one device."""
 
 import math
 import os

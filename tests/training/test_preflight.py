@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parent / "run_memory.py"
 
 
-def test_the_memory_of_a_step_is_what_was_foretold():
+def test_the_memory_of_an_update_is_predicted():
     """Within 15 %: the libraries' own buffers are not XLA's."""
     program = [sys.executable, "-m", "tests.training.run_memory"]
     ran = subprocess.run(
@@ -35,7 +35,7 @@ def test_the_memory_of_a_step_is_what_was_foretold():
     )
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
-    assert found["taken"] == pytest.approx(found["foretold"], rel=0.15)
+    assert found["measured"] == pytest.approx(found["predicted"], rel=0.15)
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def room(monkeypatch):
 
 
 def test_settings_that_fit_are_found_and_what_needs_more_is_not_tried(room):
-    """Of a batch of 8 on one device, with room for 2 clips, or for 1 with attention's output."""
+    """A batch of 8 on one device, with room for 2 clips, or for 1 with attention's output."""
     fits = [
         Setting(clips=1, remat="attention"),
         Setting(clips=2, remat="full"),

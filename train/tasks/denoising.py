@@ -42,8 +42,10 @@ class Denoising:
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
     change_loss_weight: float = 0.0
-    """Additional loss weight where the clip differs from its prior: at hands, at what they move and
-    in unobserved regions, which cover little of a frame and are all that has to be learned."""
+    """Additional loss weight where the clip differs from its prior.
+
+    It differs at hands, at what they move and in unobserved regions, which cover little of a frame
+    and are all that has to be learned."""
     rank: int | None = None
     """Rank of a LoRA, which is then trained instead of the weights; None: no LoRA."""
 
