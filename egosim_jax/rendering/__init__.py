@@ -1,6 +1,39 @@
-"""The renderer: a scene's points and the hands, seen along a camera path.
+"""Rendering of a scene's points and of hands along a camera path.
 
-`reference` is NumPy, `jitted` its twin in JAX; both give the same pictures. Sources: EgoSim,
-section 3.2 (rendering of the prior) and the released `render_16fps_aligned.py`; the hands' colors
-and sizes are those measured on the published videos.
+`reference` is in NumPy, `jitted` in JAX; both are a `Renderer` and draw the same pictures. Sources:
+EgoSim, section 3.2 (rendering of the prior) and the released `render_16fps_aligned.py`; colors and
+sizes of the hands are measured on the published videos.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import Literal, Protocol, cast, runtime_checkable
+
+from jaxtyping import Float, Float32, UInt8
+from numpy import ndarray
+
+from egosim_jax.types import Cameras, Kind, SceneState, View
+
+RendererName = Literal["jax", "numpy"]
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Renderer of views and hands, such as the modules `reference` and `jitted`."""
+
+    def render(self, state: SceneState, cameras: Cameras, *, point_px: int) -> View:
+        """Render a state along a camera path. Raises `InputError` if frame 0 shows no point."""
+        ...
+
+    def draw_hands(
+        self, joints_m: Float[ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
+    ) -> tuple[UInt8[ndarray, "f h w 3"], Float32[ndarray, "f h w"]]:
+        """Draw n hands; return the picture and its depth, black and infinite elsewhere."""
+        ...
+
+
+def get(name: RendererName) -> Renderer:
+    """Return a renderer by name, imported when it is first used."""
+    module = {"jax": "jitted", "numpy": "reference"}[name]
+    return cast(Renderer, importlib.import_module(f"{__name__}.{module}"))

@@ -1,20 +1,25 @@
-"""The renderer in JAX: the same pictures as `reference`, one compiled program for a whole path.
+"""Renderer in JAX, which the product uses; it draws the same pictures as `reference`.
 
-All squares of a given size are the same square moved by whole pixels. So each point goes into one
-cell only, that of its first pixel, and the nearest of p x p neighboring cells is what a pixel
-sees: p^2 comparisons a pixel instead of p^2 writes a point.
+Points: all squares of a given size are the same square moved by integer offsets. So each point is
+written into one cell only, that of its first pixel, and a pixel sees the nearest of p x p
+neighboring cells: p^2 comparisons per pixel instead of p^2 writes per point.
+
+Hands: a shape is intersected only with the rays of the tiles that its bounding box meets.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from einops import rearrange
 from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
-from egosim_jax.geometry import invert, pixel_rays, project, transform
+from egosim_jax.geometry import invert, project, transform
+from egosim_jax.rendering.reference import check_visible
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
     FAR_M,
@@ -23,30 +28,58 @@ from egosim_jax.rendering.skeleton import (
     NEAR_M,
     SKELETONS,
 )
-from egosim_jax.types import Cameras, Kind
+from egosim_jax.types import Cameras, Kind, SceneState, View
+
+TILE_PX, CHUNK = 16, 256
+"""Side of the tiles that hands are drawn in, and pairs of shape and tile drawn at a time."""
+
+
+def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
+    """Render a state along a camera path, as `reference.render` does.
+
+    Raises `InputError` if the first frame shows no point.
+    """
+    # Points are padded to few different counts, so that a growing state rarely compiles again.
+    count = len(state.points_m)
+    block = 1 << max(count.bit_length() - 3, 12)
+    missing = -count % block
+    points = np.pad(state.points_m, ((0, missing), (0, 0)), constant_values=np.nan)
+    depth_m, index = splat(points, cameras, point_px=point_px)
+    check_visible(np.asarray(index[0]), count)
+    colors = np.pad(state.colors, ((0, missing), (0, 0)))
+    ids = np.pad(state.object_ids, (0, missing))
+    return View(
+        frames=np.asarray(paint(index, colors, gamma=False)),
+        mask=np.asarray(unobserved(index, dilate=True)),
+        depth_m=np.asarray(depth_m),
+        object_ids=np.asarray(_identify(index, ids)),
+    )
+
+
+@jax.jit
+def _identify(index: Int[Array, "f h w"], object_ids: Int32[Array, " n"]) -> Int32[Array, "f h w"]:
+    """Return the object id of the point that each pixel sees; 0 where there is none."""
+    return jnp.where(index < 0, 0, object_ids[index])
 
 
 def splat(
     points_m: Float[Array | np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
 ) -> tuple[Float32[Array, "f h w"], Int32[Array, "f h w"]]:
-    """Depth in meters and number of the point that each pixel sees; infinite and -1 where none."""
-    poses, intrinsics = _poses(cameras)
-    return _splat(
-        points_m, poses, intrinsics, size=(cameras.height, cameras.width), point_px=point_px
-    )
-
-
-def _poses(cameras: Cameras) -> tuple[Float32[Array, "f 4 4"], Float32[Array, "3 3"]]:
-    return (
-        jnp.asarray(invert(cameras.world_from_camera), jnp.float32),
-        jnp.asarray(cameras.intrinsics_px, jnp.float32),
-    )
+    """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none."""
+    with jax.enable_x64(True):  # as `reference`: of close points, float32 would show another
+        return _splat(
+            points_m,
+            invert(cameras.world_from_camera).astype(np.float64),
+            cameras.intrinsics_px.astype(np.float32),
+            size=(cameras.height, cameras.width),
+            point_px=point_px,
+        )
 
 
 @partial(jax.jit, static_argnames=("size", "point_px"))
 def _splat(
     points_m: Float[Array | np.ndarray, "n 3"],
-    cameras_from_world: Float32[Array, "f 4 4"],
+    cameras_from_world: Float[Array, "f 4 4"],
     intrinsics_px: Float32[Array, "3 3"],
     *,
     size: tuple[int, int],
@@ -56,12 +89,12 @@ def _splat(
     margin = point_px - 1  # a square may begin this far outside and still show
     rows, columns = height + margin, width + margin
     count = len(points_m)
-    points = points_m.astype(jnp.float32).T
+    points = points_m.astype(jnp.float64).T
 
     def frame(camera_from_world: Array) -> tuple[Array, Array]:
         # Written out: as a product of matrices with three columns it takes ten times as long.
         x, y, z = (
-            a * points[0] + b * points[1] + c * points[2] + shift
+            (a * points[0] + b * points[1] + c * points[2] + shift).astype(jnp.float32)
             for a, b, c, shift in camera_from_world[:3]
         )
         u, v = project(intrinsics_px, jnp.stack([x, y, z], axis=-1))
@@ -71,9 +104,13 @@ def _splat(
         seen &= (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         nowhere = rows * columns
         cell = jnp.where(seen, row * columns + column, nowhere).astype(jnp.int32)
-        nearest = jnp.full(nowhere + 1, jnp.inf).at[cell].min(z)
+        nearest = jnp.full(nowhere + 1, jnp.inf, jnp.float32).at[cell].min(z)
         first = jnp.where(z <= nearest[cell], cell, nowhere)
-        number = jnp.full(nowhere + 1, count, jnp.int32).at[first].min(jnp.arange(count))
+        number = (
+            jnp.full(nowhere + 1, count, jnp.int32)
+            .at[first]
+            .min(jnp.arange(count, dtype=jnp.int32))
+        )
         return _nearest_square(
             nearest[:-1].reshape(rows, columns), number[:-1].reshape(rows, columns), point_px
         )
@@ -85,7 +122,7 @@ def _splat(
 def _nearest_square(
     depth: Float32[Array, "r c"], number: Int32[Array, "r c"], point_px: int
 ) -> tuple[Float32[Array, "h w"], Int32[Array, "h w"]]:
-    """The nearest, or of equally near ones the first, of the p x p cells that reach each pixel."""
+    """Return the nearest of the p x p cells that cover each pixel; among equals the first."""
     height, width = (extent - point_px + 1 for extent in depth.shape)
     best = depth[:height, :width], number[:height, :width]
     for down in range(point_px):
@@ -104,7 +141,7 @@ def paint(
     *,
     gamma: bool,
 ) -> UInt8[Array, "f h w 3"]:
-    """The picture of the points that are seen, black where there are none."""
+    """Return the picture of the visible points, black where there are none."""
     colors = jnp.asarray(GAMMA)[colors] if gamma else jnp.asarray(colors)
     return jnp.where(index[..., None] < 0, jnp.uint8(0), colors[index])
 
@@ -113,7 +150,7 @@ def paint(
 def unobserved(
     index: Int[Array | np.ndarray, "f h w"], *, dilate: bool = False
 ) -> UInt8[Array, "f h w"]:
-    """The mask: 255 where no point is seen; what is drawn may be widened by a pixel."""
+    """Return the mask, 255 where no point is seen; `dilate` widens the observed part by a pixel."""
     drawn = jnp.asarray(index) >= 0
     if dilate:
         drawn = jax.lax.reduce_window(
@@ -124,71 +161,158 @@ def unobserved(
 
 def draw_hands(
     joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
-) -> tuple[UInt8[Array, "f h w 3"], Float32[Array, "f h w"]]:
-    """Picture and depth of n hands, black and infinite where there are none."""
-    poses, _ = _poses(cameras)
-    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
-    return _draw(jnp.asarray(joints_m, jnp.float32), poses, jnp.asarray(rays, jnp.float32), kind)
+) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
+    """Draw n hands; return the picture and its depth, black and infinite where there is no hand."""
+    tiles = -(-cameras.height // TILE_PX), -(-cameras.width // TILE_PX)
+    intrinsics = jnp.asarray(cameras.intrinsics_px, jnp.float32)
+    frames = []
+    for joints, pose in zip(joints_m, cameras.world_from_camera, strict=True):
+        canvas = (
+            jnp.full((tiles[0] * tiles[1], TILE_PX, TILE_PX), jnp.inf),
+            jnp.zeros((tiles[0] * tiles[1], TILE_PX, TILE_PX, 3), jnp.uint8),
+        )
+        for chunk in _chunks(_shapes_of(joints, pose, kind), cameras, tiles):
+            canvas = _draw_chunk(*canvas, **chunk, intrinsics_px=intrinsics, columns=tiles[1])
+        frames.append(canvas)
+    depth, picture = (np.stack([np.asarray(frame[k]) for frame in frames]) for k in range(2))
+    join = "f (r c) i j ... -> f (r i) (c j) ..."
+    depth = rearrange(depth, join.replace(" ...", ""), r=tiles[0])
+    picture = rearrange(picture, join, r=tiles[0])
+    inside = slice(None), slice(cameras.height), slice(cameras.width)
+    return picture[inside], depth[inside]
 
 
-@partial(jax.jit, static_argnames="kind")
-def _draw(
-    joints_m: Float32[Array, "f n j 3"],
-    cameras_from_world: Float32[Array, "f 4 4"],
-    rays: Float32[Array, "h w 3"],
-    kind: Kind,
-) -> tuple[UInt8[Array, "f h w 3"], Float32[Array, "f h w"]]:
+def _shapes_of(
+    joints_m: Float[np.ndarray, "n j 3"], world_from_camera: Float[np.ndarray, "4 4"], kind: Kind
+) -> dict[str, np.ndarray]:
+    """Return the spheres and tubes of one frame's hands in camera coordinates, one per row."""
     skeleton = SKELETONS[kind]
     joint = np.arange(len(skeleton.colors))
     starts = np.concatenate([joint, skeleton.bones[:, 0]])
     ends = np.concatenate([joint, skeleton.bones[:, 1]])
-    radii = np.where(starts == ends, JOINT_RADIUS_M, BONE_RADIUS_M).astype(np.float32)
+    present = joints_m[np.isfinite(joints_m).all(axis=(1, 2))]
+    local = transform(invert(world_from_camera), present)
+    return {
+        "start": local[:, starts].reshape(-1, 3),
+        "end": local[:, ends].reshape(-1, 3),
+        "radius": np.tile(np.where(starts == ends, JOINT_RADIUS_M, BONE_RADIUS_M), len(present)),
+        "color": np.tile(skeleton.colors[ends], (len(present), 1)),
+    }
 
-    def frame(inputs: tuple[Array, Array]) -> tuple[Array, Array]:
-        joints, camera_from_world = inputs
-        present = jnp.isfinite(joints).all(axis=(1, 2))
-        local = transform(camera_from_world, joints)
-        count = len(joints) * len(starts)
-        shapes = (
-            local[:, starts].reshape(count, 3),
-            local[:, ends].reshape(count, 3),
-            jnp.tile(radii, len(joints)),
-            jnp.tile(jnp.asarray(skeleton.colors)[ends], (len(joints), 1)),
-            jnp.repeat(present, len(starts)),
-        )
 
-        def draw(seen: tuple[Array, Array], shape: tuple[Array, ...]) -> tuple[tuple, None]:
-            picture, depth = seen
-            start, end, radius, color, here = shape
-            met = _meet(rays, start, end, radius)
-            nearer = here & (met < depth)
-            picture = jnp.where(nearer[..., None], color, picture)
-            return (picture, jnp.where(nearer, met, depth)), None
+def _chunks(
+    shapes: dict[str, np.ndarray], cameras: Cameras, tiles: tuple[int, int]
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yield each shape with each tile that its bounding box meets, `CHUNK` pairs at a time.
 
-        empty = jnp.zeros(rays.shape, jnp.uint8), jnp.full(rays.shape[:2], jnp.inf)
-        return jax.lax.scan(draw, empty, shapes)[0]
+    The last chunk is padded with shapes that no ray meets.
+    """
+    first, last = _bounding_tiles(shapes, cameras, tiles)
+    counts = np.maximum(last - first, 0)
+    total = counts.prod(axis=1)
+    shape = np.repeat(np.arange(len(total)), total)
+    number = np.arange(len(shape)) - np.repeat(np.cumsum(total) - total, total)
+    row, column = np.divmod(number, counts[shape, 1])
+    tile = (first[shape, 0] + row) * tiles[1] + first[shape, 1] + column
+    for begin in range(0, len(tile), CHUNK):
+        here = slice(begin, begin + CHUNK)
+        padding = (0, CHUNK - len(tile[here]))
+        pairs = {name: values[shape[here]] for name, values in shapes.items()}
+        yield {
+            "tile": np.pad(tile[here], padding).astype(np.int32),
+            **{
+                name: np.pad(
+                    values.astype(np.uint8 if name == "color" else np.float32),
+                    (padding, *[(0, 0)] * (values.ndim - 1)),
+                    constant_values=0 if name == "color" else np.nan,
+                )
+                for name, values in pairs.items()
+            },
+        }
 
-    return jax.lax.map(frame, (joints_m, cameras_from_world))
+
+def _bounding_tiles(
+    shapes: dict[str, np.ndarray], cameras: Cameras, tiles: tuple[int, int]
+) -> tuple[Int[np.ndarray, "s 2"], Int[np.ndarray, "s 2"]]:
+    """Return the first row and column of tiles of each shape, and those after the last.
+
+    They bound the picture of the corners of the box around the shape. A shape that reaches nearer
+    than `NEAR_M` may be anywhere in the picture; one that is nearer as a whole has no tiles.
+    """
+    radius = shapes["radius"][:, None]
+    low = np.minimum(shapes["start"], shapes["end"]) - radius
+    high = np.maximum(shapes["start"], shapes["end"]) + radius
+    box = np.stack([low, high], axis=1)
+    near = low[:, 2] < NEAR_M
+    box[near, :, 2] = NEAR_M
+    corners = np.stack([box[:, which, range(3)] for which in np.ndindex(2, 2, 2)], axis=1)
+    columns, rows = project(cameras.intrinsics_px, corners)
+    pixels = np.stack([rows, columns], axis=-1)
+    first = np.floor(pixels.min(axis=1) - 1) // TILE_PX
+    last = np.ceil(pixels.max(axis=1) + 1) // TILE_PX + 1
+    first = np.where(near[:, None], 0, np.clip(first, 0, tiles)).astype(int)
+    last = np.where(near[:, None], tiles, np.clip(last, 0, tiles)).astype(int)
+    return first, np.where(high[:, 2:] < NEAR_M, first, last)
+
+
+@partial(jax.jit, static_argnames="columns", donate_argnames=("depth", "picture"))
+def _draw_chunk(
+    depth: Float32[Array, "t p p"],
+    picture: UInt8[Array, "t p p 3"],
+    *,
+    tile: Int32[Array, " k"],
+    start: Float32[Array, "k 3"],
+    end: Float32[Array, "k 3"],
+    radius: Float32[Array, " k"],
+    color: UInt8[Array, "k 3"],
+    intrinsics_px: Float32[Array, "3 3"],
+    columns: int,
+) -> tuple[Float32[Array, "t p p"], UInt8[Array, "t p p 3"]]:
+    """Draw each shape into its tile; of equally near ones the first is seen."""
+    corner = jnp.stack([tile % columns, tile // columns]) * TILE_PX
+    pixel = (
+        corner[:, :, None, None]
+        + jnp.stack(jnp.meshgrid(jnp.arange(TILE_PX), jnp.arange(TILE_PX)))[:, None]
+    )
+    x = (pixel[0] - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
+    y = (pixel[1] - intrinsics_px[1, 2]) / intrinsics_px[1, 1]
+    met = _meet(x, y, start, end, radius)
+    count = len(tile)
+    nearest = depth.at[tile].min(met)
+    seen = (met <= nearest[tile]) & (met < depth[tile])
+    number = jnp.where(seen, jnp.arange(count)[:, None, None], count)
+    winner = jnp.full(depth.shape, count).at[tile].min(number)
+    drawn = color[jnp.minimum(winner, count - 1)]
+    return nearest, jnp.where((winner < count)[..., None], drawn, picture)
 
 
 def _meet(
-    rays: Float32[Array, "h w 3"],
-    start: Float32[Array, " 3"],
-    end: Float32[Array, " 3"],
-    radius: Float32[Array, ""],
-) -> Float32[Array, "h w"]:
-    """Depth at which rays with z = 1 enter a sphere (start = end) or a tube, else infinity."""
+    x: Float32[Array, "k p p"],
+    y: Float32[Array, "k p p"],
+    start: Float32[Array, "k 3"],
+    end: Float32[Array, "k 3"],
+    radius: Float32[Array, " k"],
+) -> Float32[Array, "k p p"]:
+    """Return the depth at which rays (x, y, 1) enter a sphere (start = end) or a tube, or infinity.
+
+    Written by components: as products of matrices with three columns it takes ten times as long.
+    """
     along = end - start
-    length = jnp.sqrt(along @ along)
-    axis = along / jnp.where(length > 0, length, 1)
-    across = rays - (rays @ axis)[..., None] * axis
-    offset = start - (start @ axis) * axis
-    a = (across**2).sum(axis=-1)
+    length = jnp.sqrt((along**2).sum(axis=-1))
+    axis = along / jnp.where(length > 0, length, 1)[:, None]
+    offset = start - (start * axis).sum(axis=-1, keepdims=True) * axis
+    ax, ay, az, ox, oy, oz, sx, sy, sz = (
+        vector[:, k, None, None] for vector in (axis, offset, start) for k in range(3)
+    )
+    cosine = x * ax + y * ay + az
+    cx, cy, cz = x - cosine * ax, y - cosine * ay, 1 - cosine * az
+    a = cx**2 + cy**2 + cz**2
     # The nearest point of each ray to the axis first: b^2 - a c would cancel in float32.
-    b = across @ offset
-    gap = offset - (b / a)[..., None] * across
-    discriminant = radius**2 - (gap**2).sum(axis=-1)
+    b = cx * ox + cy * oy + cz * oz
+    share = b / a
+    gap = (ox - share * cx) ** 2 + (oy - share * cy) ** 2 + (oz - share * cz) ** 2
+    discriminant = radius[:, None, None] ** 2 - gap
     t = (b - jnp.sqrt(jnp.maximum(discriminant, 0) * a)) / a
-    place = (t[..., None] * rays - start) @ axis
-    hit = (discriminant >= 0) & (t >= NEAR_M) & (place >= 0) & (place <= length)
+    place = (t * x - sx) * ax + (t * y - sy) * ay + (t - sz) * az
+    hit = (discriminant >= 0) & (t >= NEAR_M) & (place >= 0) & (place <= length[:, None, None])
     return jnp.where(hit, t, jnp.inf)

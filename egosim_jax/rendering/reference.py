@@ -1,9 +1,9 @@
-"""The renderer in NumPy: what its JAX twin is checked against, and what needs no jax.
+"""Renderer in NumPy, the reference for `jitted`; it does not import jax.
 
 A point at depth z that projects to (u, v) is a square of p x p pixels: those (i, j) with
--p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. Among all that cover a pixel the nearest is seen, and
-of equally near ones the first. A joint is a sphere, a bone the tube between two joints; a pixel
-shows whichever its ray meets first, without shading.
+-p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. A pixel sees the nearest of the points that cover it,
+and among equally near ones the first. A joint is a sphere, a bone the tube between two joints; a
+pixel shows the shape that its ray meets first, without shading.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
 def splat(
     points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
 ) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
-    """Depth in meters and number of the point that each pixel sees; infinite and -1 where none.
+    """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none.
 
     Points with a coordinate that is not finite, nearer than 1 cm or farther than 100 m are not
     drawn.
@@ -58,7 +58,7 @@ def splat(
 def paint(
     index: Int[np.ndarray, "f h w"], colors: UInt8[np.ndarray, "n 3"], *, gamma: bool
 ) -> UInt8[np.ndarray, "f h w 3"]:
-    """The picture of the points that are seen, black where there are none.
+    """Return the picture of the visible points, black where there are none.
 
     `gamma` applies the original renderer's color curve, c -> c^(1/2.2).
     """
@@ -69,10 +69,10 @@ def paint(
 def unobserved(
     index: Int[np.ndarray, "f h w"], *, dilate: bool = False
 ) -> UInt8[np.ndarray, "f h w"]:
-    """The mask: 255 where no point is seen.
+    """Return the mask, 255 where no point is seen.
 
-    Training draws the points twice as large for it than for the picture; the memory draws them
-    alike and widens what is drawn by a pixel all around: `dilate`.
+    Training data has masks of points twice as large as those of the picture; a view of the state
+    has points of one size and a mask whose observed part is widened by a pixel: `dilate`.
     """
     drawn = index >= 0
     if not dilate:
@@ -87,16 +87,12 @@ def unobserved(
 
 
 def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
-    """A state along a camera path: Π of EgoSim's section 3.2, as the memory is drawn.
+    """Render a state along a camera path: Π of EgoSim's section 3.2.
 
     Raises `InputError` if the first frame shows no point.
     """
     depth_m, index = splat(state.points_m, cameras, point_px=point_px)
-    if (index[0] < 0).all():
-        raise InputError(
-            f"None of the {len(state.points_m)} points of the scene is seen in the first frame: "
-            "the camera must look at the scene, from 1 cm to 100 m away."
-        )
+    check_visible(index[0], len(state.points_m))
     return View(
         frames=paint(index, state.colors, gamma=False),
         mask=unobserved(index, dilate=True),
@@ -105,13 +101,22 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
     )
 
 
+def check_visible(index: Int[np.ndarray, "h w"], count: int) -> None:
+    """Raise `InputError` if no pixel of the first frame sees one of the scene's points."""
+    if (index < 0).all():
+        raise InputError(
+            f"None of the {count} points of the scene is seen in the first frame: the camera must "
+            "look at the scene, from 1 cm to 100 m away."
+        )
+
+
 def draw_hands(
     joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Picture and depth of n hands, black and infinite where there are none.
+    """Draw n hands; return the picture and its depth, black and infinite where there is no hand.
 
-    A hand with a joint that is not finite is missing from that frame. What lies nearer than 1 cm
-    or behind the camera is not drawn.
+    A hand with a joint that is not finite is missing from that frame. Nothing nearer than 1 cm or
+    behind the camera is drawn.
     """
     skeleton = SKELETONS[kind]
     frames, height, width = len(joints_m), cameras.height, cameras.width
@@ -141,11 +146,9 @@ def draw_hands(
 def _window(
     start: np.ndarray, end: np.ndarray, radius: float, cameras: Cameras
 ) -> tuple[slice, slice]:
-    """Rows and columns that may show a shape: a box around the corners of the box around it."""
+    """Return the rows and columns that may show a shape: the bounds of its projected box."""
     low, high = np.minimum(start, end) - radius, np.maximum(start, end) + radius
-    if (
-        low[2] < NEAR_M
-    ):  # too near to have corners in the picture; `_meet` leaves out what is behind
+    if low[2] < NEAR_M:  # its corners have no projection; `_meet` drops the part behind the camera
         return slice(0, cameras.height), slice(0, cameras.width)
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
     u, v = project(cameras.intrinsics_px, corners)
@@ -161,10 +164,10 @@ def _meet(
     end: Float[np.ndarray, " 3"],
     radius: float,
 ) -> Float[np.ndarray, "h w"]:
-    """Depth at which rays with z = 1 enter a sphere (start = end) or a tube, else infinity.
+    """Return the depth at which rays with z = 1 enter a sphere (start = end) or tube, or infinity.
 
-    With the part of ray d and of start s across the tube's axis, |t d - s| = r is a quadratic
-    equation in t.
+    With d and s the ray's direction and the start across the tube's axis, |t d - s| = r is a
+    quadratic equation in t.
     """
     along = end - start
     length = np.linalg.norm(along)

@@ -1,4 +1,4 @@
-"""Joints, bones, colors and sizes of drawn hands, and the color curve of the original renderer.
+"""Joints, bones, colors and sizes of drawn hands, and the tone curve of the original renderer.
 
 A hand has 21 joints: the wrist, then four from knuckle to tip of thumb, index, middle, ring and
 little finger. A gripper has three: the wrist and the tips of thumb and index, whose angle is the
@@ -14,14 +14,14 @@ import numpy as np
 from egosim_jax.types import Kind
 
 JOINT_RADIUS_M = 0.0055
-"""Of the sphere at a joint: measured on the published videos, give or take a fifth."""
+"""Radius of the sphere at a joint in meters: measured on the published videos, +-20 %."""
 BONE_RADIUS_M = 0.00275
-"""Of the tube along a bone."""
+"""Radius of the tube along a bone in meters."""
 NEAR_M, FAR_M = 0.01, 100.0
-"""Nothing nearer or farther is drawn."""
+"""Near and far plane in meters: nothing outside them is drawn."""
 
 GAMMA = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
-"""What the original renderer makes of each color value: it lifts without having linearized."""
+"""Tone curve of the original renderer: c -> c^(1/2.2), applied to values that are not linear."""
 
 THUMB, INDEX, MIDDLE = (238, 130, 238), (255, 99, 71), (230, 245, 250)
 RING, LITTLE = (173, 255, 47), (0, 152, 191)
@@ -29,7 +29,7 @@ RING, LITTLE = (173, 255, 47), (0, 152, 191)
 
 @dataclass(frozen=True)
 class Skeleton:
-    """What is drawn for one hand."""
+    """Colors and bones of one drawn hand."""
 
     colors: np.ndarray
     """RGB of each joint, uint8 `j 3`. A bone has the color of its outer joint."""
@@ -50,4 +50,4 @@ def _robot() -> Skeleton:
 
 
 SKELETONS: dict[Kind, Skeleton] = {"human": _human(), "robot": _robot()}
-"""Human hands are drawn with the original's color curve, robots without."""
+"""Skeleton of each kind of hand; human ones have the original's tone curve, grippers do not."""

@@ -1,20 +1,21 @@
-"""NumPy, JAX and a scalar loop written from the contract (Appendix B of the facts) agree."""
+"""The renderers in NumPy and JAX agree with each other and with a scalar loop."""
 
 import math
 
 import numpy as np
 import pytest
 
+from egosim_jax import rendering
 from egosim_jax.geometry import look_at
-from egosim_jax.rendering import jitted, reference
-from egosim_jax.types import Cameras
+from egosim_jax.rendering import Renderer, jitted, reference
+from egosim_jax.types import Cameras, InputError, SceneState
 
 DIFFERENT = 1e-3
-"""Share of pixels that may differ: points on a pixel's edge fall to either side in float32."""
+"""Share of pixels that may differ: points on a pixel's edge round to either side in float32."""
 HEIGHT, WIDTH = 24, 40
 RAW = [(238, 130, 238), (255, 99, 71), (230, 245, 250), (173, 255, 47), (0, 152, 191)]
 MEASURED = [(247, 189, 247), (255, 167, 144), (244, 251, 253), (215, 255, 119), (0, 203, 224)]
-"""Thumb to little finger, and what the published videos show of them."""
+"""Colors from thumb to little finger, and as measured on the published videos."""
 
 
 def make_cameras(frames=3):
@@ -32,7 +33,7 @@ def make_cameras(frames=3):
 
 @pytest.fixture(scope="module")
 def scene():
-    """Points in front of, beside and behind the camera, some twice, some not finite."""
+    """Points in front of, next to and behind the camera, some duplicate, some not finite."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.5, -2.5, -1.0], [1.5, 1.5, 1.0], (600, 3))
     points[50:90] = points[:40]
@@ -148,7 +149,7 @@ def make_hands(frames=3):
 
 
 def hands_by_hand(joints, cameras, kind):
-    """March along every pixel's ray; the first place inside a sphere or a tube."""
+    """Find where every pixel's ray first enters a sphere or a tube."""
     if kind == "human":
         bones = [(0, 4 * f + 1) for f in range(5)]
         bones += [(4 * f + k, 4 * f + k + 1) for f in range(5) for k in range(1, 4)]
@@ -179,7 +180,7 @@ def hands_by_hand(joints, cameras, kind):
 
 
 def first_inside(ray, start, end, radius):
-    """Where |part of (t ray - start) across the axis| = radius, by the cross product."""
+    """Solve |part of (t ray - start) across the axis| = radius by the cross product."""
     axis = end - start
     if not axis.any():
         roots = np.roots([ray @ ray, -2 * ray @ start, start @ start - radius**2])
@@ -215,3 +216,54 @@ def test_a_hand_that_is_missing_or_behind_the_camera_is_not_drawn(renderer):
     assert not picture[:2].any()
     assert np.isinf(depth[:2]).all()
     assert picture[2].any()
+
+
+def test_both_renderers_are_a_renderer_by_name():
+    assert rendering.get("numpy") is reference
+    assert rendering.get("jax") is jitted
+    assert isinstance(reference, Renderer)
+    assert isinstance(jitted, Renderer)
+
+
+def make_state(points, colors):
+    return SceneState(
+        points_m=points,
+        colors=colors,
+        object_ids=np.arange(len(points), dtype=np.int32) % 5,
+        last_seen=np.zeros(len(points), np.int32),
+        intrinsics_px=np.eye(3),
+    )
+
+
+def test_both_renderers_give_the_same_view(scene):
+    points, colors = scene
+    finite = np.isfinite(points).all(axis=1)
+    state = make_state(points[finite], colors[finite])
+    views = [r.render(state, make_cameras(), point_px=2) for r in (reference, jitted)]
+    for name in ("frames", "mask", "depth_m", "object_ids"):
+        expected, got = (getattr(view, name) for view in views)
+        assert got.dtype == expected.dtype
+        assert (got != expected).mean() <= DIFFERENT
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_a_first_frame_without_points_is_refused(renderer):
+    state = make_state(np.float32([[0, -5, 0]]), np.zeros((1, 3), np.uint8))
+    with pytest.raises(InputError, match=r"None of the 1 points of the scene is seen"):
+        renderer.render(state, make_cameras(), point_px=2)
+
+
+def test_hands_close_to_the_camera_are_drawn_alike():
+    """Shapes that reach through the near plane or fill the picture, and more of them than a chunk
+    holds."""
+    rng = np.random.default_rng(2)
+    cameras = make_cameras(2)
+    forward, eye = cameras.world_from_camera[:, :3, 2], cameras.world_from_camera[:, :3, 3]
+    near = (eye + 0.02 * forward)[:, None, None] + rng.normal(scale=0.02, size=(2, 9, 21, 3))
+    pictures, depths = zip(
+        *(r.draw_hands(near, cameras, kind="human") for r in (reference, jitted)), strict=True
+    )
+    assert pictures[0].any(axis=-1).mean() > 0.2
+    assert (pictures[0] != pictures[1]).any(axis=-1).mean() <= DIFFERENT
+    same = (pictures[0] == pictures[1]).all(axis=-1) & np.isfinite(depths[0])
+    np.testing.assert_allclose(depths[1][same], depths[0][same], rtol=1e-3)
