@@ -35,7 +35,7 @@ from egosim_jax.io.run import plain
 from egosim_jax.models import Denoiser
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import Program, gathered, place
-from egosim_jax.rendering.reference import draw_hands
+from egosim_jax.rendering import Renderer, jitted
 from egosim_jax.types import (
     Action,
     Clip,
@@ -137,8 +137,16 @@ def denoise(
 class Generator:
     """A model ready to generate, on one device or on those of a mesh."""
 
-    def __init__(self, config: ModelConfig, networks: Networks, mesh: Mesh | None = None):
+    def __init__(
+        self,
+        config: ModelConfig,
+        networks: Networks,
+        mesh: Mesh | None = None,
+        *,
+        renderer: Renderer = jitted,
+    ):
         self.config = config
+        self.renderer = renderer
         self.networks = networks = place(networks, mesh)
         self._encode = Program(encode_condition, networks, mesh=mesh, about=("encode", config))
         self._latents = Program(
@@ -241,7 +249,7 @@ class Generator:
             prompt=action.prompt,
             prior=view.frames,
             mask=view.mask,
-            hands=draw_hands(action.joints_m, action.cameras, kind=action.kind)[0],
+            hands=self.renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0],
             first_frame=first_frame,
         )
         return self.generate([triplet], [seed])[0].frames

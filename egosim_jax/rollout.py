@@ -44,8 +44,8 @@ class Rollout:
 
         The same call resumes an interrupted run. `first_frame` is the first frame of the first
         clip; step N uses `seed + N`. Raises `InputError` showing both values if the folder holds a
-        run of another state, action, generator, perception or seed, and if another process writes
-        to it.
+        run of another state, action, generator, renderer, perception or seed, and if another
+        process writes to it.
         """
         check_seed(seed, name="seed")
         with lock_folder(self.folder):
@@ -66,6 +66,7 @@ class Rollout:
             "state": snapshot.fingerprint(state),
             "first_frame": fingerprint(first_frame),
             "generator": fingerprint(simulator.generator),
+            "renderer": fingerprint(simulator.renderer),
             "perception": fingerprint(simulator.perception),
             "fusion": fingerprint((simulator.fusion, simulator.point_px, simulator.fps)),
             "seed": str(seed),

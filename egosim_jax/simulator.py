@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.perception import Perception
-from egosim_jax.rendering import reference
+from egosim_jax.rendering import Renderer, reference
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.tsdf import Fusion
 from egosim_jax.types import Action, Clip, InputError, SceneState, View
@@ -60,6 +60,11 @@ class Simulator:
     fusion: Fusion = field(default_factory=Fusion)
     """Settings of the fusion."""
 
+    @property
+    def renderer(self) -> Renderer:
+        """Renderer of the view: the generator's, which draws its hands, or the NumPy reference."""
+        return getattr(self.generator, "renderer", reference)
+
     def step(
         self,
         state: SceneState,
@@ -81,7 +86,7 @@ class Simulator:
 
     def render(self, state: SceneState, action: Action) -> View:
         """Render the state along the action's camera path."""
-        return reference.render(state, action.cameras, point_px=self.point_px)
+        return self.renderer.render(state, action.cameras, point_px=self.point_px)
 
     def generate(
         self,

@@ -14,6 +14,7 @@ from egosim_jax.cli.recording import Recording
 from egosim_jax.cli.view import RECORDING, write_portrait
 from egosim_jax.command import DONE
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.rendering import RendererName
 from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ class Simulate:
     or another registered one."""
     update: Literal["full", "none"] = "full"
     """Whether the state learns from the clips, or stays as it was before the first."""
+    renderer: RendererName = "jax"
+    """Renderer of the view and the hands; numpy is the slow reference."""
     robot: bool = False
     """The hands are a robot's gripper."""
     first_frame: Path | None = None
@@ -60,7 +63,7 @@ class Simulate:
 
     def run(self) -> int:
         """Simulate, measure, draw."""
-        from egosim_jax import configs
+        from egosim_jax import configs, rendering
         from egosim_jax.generator import Generator
         from egosim_jax.io.digest import sha256
         from egosim_jax.io.run import open_folder, write_json
@@ -85,7 +88,11 @@ class Simulate:
         kind = "robot" if self.robot else "human"
         truth = list(make_sequence(self.seed, spec=config.video, clips=self.clips, kind=kind))
         simulator = Simulator(
-            generator=Generator(config.at(weights), Networks.load(config, weights)),
+            generator=Generator(
+                config.at(weights),
+                Networks.load(config, weights),
+                renderer=rendering.get(self.renderer),
+            ),
             perception=None if self.update == "none" else backend(self.perception, truth),
             fps=config.video.fps,
         )

@@ -8,7 +8,7 @@ import hashlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import CodeType, MethodType
+from types import CodeType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,8 @@ def _parts(value: Any, within: tuple[int, ...]) -> Iterator[bytes]:
             yield from _parts(item, within)
     elif callable(getattr(value, "fingerprint", None)) and not isinstance(value, type):
         yield str(value.fingerprint()).encode()
+    elif isinstance(value, ModuleType):
+        yield f"module {value.__name__}".encode()
     elif isinstance(value, type):
         yield f"type {value.__qualname__}".encode()
     elif hasattr(value, "__array__"):

@@ -1,10 +1,12 @@
 """One pure step of the loop."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from egosim_jax.rendering import reference
 from egosim_jax.simulator import Simulator
 from egosim_jax.types import Clip, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action
@@ -47,3 +49,25 @@ def test_without_a_first_frame_the_generator_gets_that_of_the_view(clip):
     assert step.state is clip.state
     np.testing.assert_array_equal(seen[0][0], step.view.frames[0])
     assert seen[0][1] == 5
+
+
+class Marked:
+    """A generator with a renderer."""
+
+    renderer = SimpleNamespace(
+        render=lambda state, cameras, *, point_px: replace(
+            reference.render(state, cameras, point_px=point_px),
+            object_ids=np.full((5, 48, 80), 99, np.int32),
+        ),
+        draw_hands=reference.draw_hands,
+    )
+
+    def __call__(self, view, action, first_frame, seed):
+        return view.frames
+
+
+def test_the_view_is_drawn_by_the_renderer_of_the_generator(clip):
+    plain = Simulator(generator=copy_the_view, perception=None, fps=8)
+    assert plain.renderer is reference
+    drawn = Simulator(generator=Marked(), perception=None, fps=8)
+    assert (drawn.render(clip.state, to_action(clip)).object_ids == 99).all()
