@@ -30,7 +30,12 @@ STATE = {
     "average": "ema_params",
 }
 """Fields of the training state in a checkpoint: the old name, then today's."""
-TYPES = {"Training": "TrainConfig", "RealTiny": "FromClips", "Tabletop": "FromTabletop"}
+TYPES = {
+    "Training": "TrainConfig",
+    "RealTiny": "FromClips",
+    "Tabletop": "FromTabletop",
+    "FlowSchedule": "RectifiedFlow",
+}
 """Classes of config.json: the old name, then today's."""
 FIELDS = {
     "Training": {"accumulate": "grad_accum_steps", "patience": "hang_timeout_s"},
@@ -42,6 +47,7 @@ FIELDS = {
         "spike": "skip_grad_norm_factor",
         "average": "ema_decay",
     },
+    "ModelConfig": {"schedule": "process"},
     "Denoising": {"change": "change_loss_weight"},
     "Autoencoding": {"weights": "stream_probs", "edges": "edge_weight", "kl": "kl_weight"},
     "Tabletop": {"change": "change_loss_weight"},
@@ -56,9 +62,12 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
         "change_loss_weight": 0.0,
         "weights_dtype": "float32",
     },
+    "FlowSchedule": {"prediction": "velocity"},
     "Tabletop": {"crop": [48, 64], "dropout": _DROPOUT, "stride": 1, "weights_dtype": "float16"},
 }
 """Fields that a class of config.json did not have under its old name, with their values then."""
+DROPPED = {"Objective": ("schedule",)}
+"""Fields of config.json that are gone, because another field always had the same value."""
 
 
 def upgrade(recorded: Any) -> Any:
@@ -70,8 +79,12 @@ def upgrade(recorded: Any) -> Any:
     kind = recorded.get("type")
     if not isinstance(kind, str):
         return {name: upgrade(value) for name, value in recorded.items()}
-    renamed = FIELDS.get(kind, {})
-    fields = {renamed.get(name, name): upgrade(value) for name, value in recorded.items()}
+    renamed, dropped = FIELDS.get(kind, {}), DROPPED.get(kind, ())
+    fields = {
+        renamed.get(name, name): upgrade(value)
+        for name, value in recorded.items()
+        if name not in dropped
+    }
     if kind == "RealTiny" and _made_its_clips(recorded):
         fields["metadata"] = None
     return {**ADDED.get(kind, {}), **fields, "type": TYPES.get(kind, kind)}
