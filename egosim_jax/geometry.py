@@ -1,4 +1,4 @@
-"""Rigid motions and the pinhole camera, for NumPy arrays and jax's alike.
+"""Rigid transforms and the pinhole camera, for NumPy and JAX arrays.
 
 Cameras follow OpenCV: x right, y down, z forward, in meters, with pixel centers at integer
 coordinates. A matrix `a_from_b` takes coordinates in b to coordinates in a, so that
@@ -17,12 +17,12 @@ from egosim_jax.types import Cameras, InputError
 
 
 def transform(a_from_b: Float[Any, "*#b 4 4"], points: Float[Any, "*#b n 3"]) -> Any:
-    """The points `*b n 3` of b, in a."""
+    """Transform points `*b n 3` from frame b to frame a."""
     return points @ a_from_b[..., :3, :3].swapaxes(-1, -2) + a_from_b[..., None, :3, 3]
 
 
 def invert(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
-    """`b_from_a` of a rigid motion."""
+    """Return the inverse `b_from_a` of a rigid transform."""
     inverse = np.zeros_like(a_from_b)
     rotation = a_from_b[..., :3, :3].swapaxes(-1, -2)
     inverse[..., :3, :3] = rotation
@@ -32,9 +32,9 @@ def invert(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]
 
 
 def project(intrinsics_px: Float[Any, "3 3"], points: Float[Any, "*b n 3"]) -> tuple[Any, Any]:
-    """Columns and rows, each `*b n`, at which a camera sees points of its own coordinates.
+    """Project points in camera coordinates; return columns and rows in pixels, each `*b n`.
 
-    Points at depth 0 come out infinite or NaN, those behind the camera mirrored: look at z first.
+    Points at depth 0 give infinity or NaN, those behind the camera are mirrored: check z first.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     focal_x, focal_y = intrinsics_px[0, 0], intrinsics_px[1, 1]
@@ -44,9 +44,9 @@ def project(intrinsics_px: Float[Any, "3 3"], points: Float[Any, "*b n 3"]) -> t
 def pixels_of(
     cameras: Cameras, points: Float[np.ndarray, "*b n 3"]
 ) -> tuple[Int[np.ndarray, "*b n"], Int[np.ndarray, "*b n"], Bool[np.ndarray, "*b n"]]:
-    """Row and column of the pixel that points of a camera's coordinates fall into.
+    """Return row, column and visibility of the pixels that points in camera coordinates fall into.
 
-    And whether they do: those behind the camera or beside the picture have row and column 0.
+    Points behind the camera or outside the image are not visible and have row and column 0.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = project(cameras.intrinsics_px, points)
@@ -59,17 +59,19 @@ def pixels_of(
 def pixel_rays(
     intrinsics_px: Float[np.ndarray, "3 3"], *, height: int, width: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """The direction of each pixel in camera coordinates, with z = 1: times a depth, its point."""
+    """Return the ray of each pixel in camera coordinates, with z = 1: times depth, a point."""
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     x = (columns - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
     y = (rows - intrinsics_px[1, 2]) / intrinsics_px[1, 1]
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
-def finer(intrinsics_px: Float[np.ndarray, "3 3"], times: int) -> Float[np.ndarray, "3 3"]:
-    """The same camera with each pixel split into `times` x `times`.
+def upsample_intrinsics(
+    intrinsics_px: Float[np.ndarray, "3 3"], times: int
+) -> Float[np.ndarray, "3 3"]:
+    """Return the intrinsics of the same camera with each pixel split into `times` x `times`.
 
-    The centers of pixel i's parts lie around `times` i + (`times` - 1) / 2.
+    The center of pixel i is at `times` i + (`times` - 1) / 2 afterwards.
     """
     split = intrinsics_px.copy()
     split[:2] *= times
@@ -77,8 +79,8 @@ def finer(intrinsics_px: Float[np.ndarray, "3 3"], times: int) -> Float[np.ndarr
     return split
 
 
-def turned(radians: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation about z, from x towards y."""
+def rotation_z(radians: float) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation about z by an angle in radians, from x towards y."""
     cosine, sine = np.cos(radians), np.sin(radians)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
@@ -86,7 +88,7 @@ def turned(radians: float) -> Float[np.ndarray, "3 3"]:
 def look_at(
     eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], *, up: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`world_from_camera` of a camera at `eye` that has `target` in the middle and `up` above."""
+    """Return `world_from_camera` of a camera at `eye` that looks at `target`, with `up` upwards."""
     forward = target - eye
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -103,30 +105,31 @@ def umeyama(
     *,
     scaled: bool = False,
 ) -> Float[np.ndarray, "4 4"]:
-    """The motion that brings points nearest to their targets in the least squares sense.
+    """Return the least-squares transform of points to targets: rigid, or with a scale if `scaled`.
 
-    Rotation, translation and, if `scaled`, one positive scale; never a reflection. Source: Umeyama
-    1991, equations 40 to 43. Raises `InputError` if the points do not determine it: fewer than
-    three, or all on one line.
+    Never a reflection. Source: Umeyama 1991, equations 40 to 43. Raises `InputError` if the points
+    do not determine it: fewer than three, or collinear.
     """
-    middle, aim = points.mean(axis=0), targets.mean(axis=0)
-    centerd, aimed = points - middle, targets - aim
-    u, strength, vt = np.linalg.svd(aimed.T @ centerd / len(points))
-    if len(points) < 3 or strength[1] <= 1e-12 * max(strength[0], 1e-300):
+    center, target_center = points.mean(axis=0), targets.mean(axis=0)
+    centered, targets = points - center, targets - target_center
+    u, singular, vt = np.linalg.svd(targets.T @ centered / len(points))
+    if len(points) < 3 or singular[1] <= 1e-12 * max(singular[0], 1e-300):
         raise InputError(
-            f"{len(points)} points do not determine a motion: it needs at least three that are "
+            f"{len(points)} points do not determine a transform: it needs at least three that are "
             "non-collinear."
         )
     signs = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     motion = np.eye(4)
     motion[:3, :3] = (u * signs) @ vt
     if scaled:
-        motion[:3, :3] *= (strength * signs).sum() / np.square(centerd).sum(axis=1).mean()
-    motion[:3, 3] = aim - motion[:3, :3] @ middle
+        motion[:3, :3] *= (singular * signs).sum() / np.square(centered).sum(axis=1).mean()
+    motion[:3, 3] = target_center - motion[:3, :3] @ center
     return motion
 
 
-def beside(cameras: Cameras, world_from_object: Float[np.ndarray, "f 4 4"]) -> Cameras:
-    """The cameras in the coordinates of a thing that moves."""
+def cameras_in_object_frame(
+    cameras: Cameras, world_from_object: Float[np.ndarray, "f 4 4"]
+) -> Cameras:
+    """Return the cameras in the coordinates of a moving object."""
     poses = invert(world_from_object) @ cameras.world_from_camera
     return replace(cameras, world_from_camera=poses)

@@ -197,9 +197,9 @@ def score(step: Step, clip: TabletopClip) -> dict[str, float]:
 
 
 def _camera_error(frames: np.ndarray, clip: TabletopClip, still: np.ndarray) -> float:
-    from egosim_jax.metrics.trajectory import camera_errors, seen_from
+    from egosim_jax.metrics.trajectory import camera_errors, estimate_cameras
 
-    path = seen_from(frames, clip.frames, clip.depth_m, still, clip.cameras)
+    path = estimate_cameras(frames, clip.frames, clip.depth_m, still, clip.cameras)
     return 1000 * camera_errors(path, clip.cameras.world_from_camera)[0]
 
 

@@ -72,7 +72,7 @@ class Scene:
             "psnr": whole.psnr,
             "ssim": whole.ssim,
             "region_psnr": region.region_psnr(video[1:], truth, hands | thing),
-            "hand_iou": region.silhouette_iou(region.opened(seen >= FIRST_HAND), hands),
+            "hand_iou": region.silhouette_iou(region.open_mask(seen >= FIRST_HAND), hands),
             "object_error": 100 * float(np.mean(errors)) / ids.shape[2] if len(errors) else np.nan,
         }
 

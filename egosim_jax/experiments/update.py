@@ -26,14 +26,14 @@ CARRIED = ("carry", "stack")
 MEASURES = {
     "accurate": ("accurate %", "{:.1f}"),
     "complete": ("complete %", "{:.1f}"),
-    "left": ("left behind %", "{:.2f}"),
+    "ghost": ("ghost points %", "{:.2f}"),
     "background_mm": ("background mm", "{:.2f}"),
 }
 DEFINITIONS = {
     "accurate": "share of the carried thing's points within 1 cm of its true surface at its end",
     "complete": "share of its true surface that any frame shows, which has one of its points "
     "within 1 cm",
-    "left": "share of its points from before that lie off its new surface and still are there",
+    "ghost": "percentage of its points from before, off its new surface, that are still there",
     "background_mm": "95th percentile of the distances between nearest points of the background "
     "before and after, the larger of both ways, where it was seen before",
     "spread": "standard deviation over scenes (n - 1)",
@@ -114,7 +114,7 @@ def _rows(
 def judge(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, float]:
     """How well the state is after these frames of a clip were perceived and fused."""
     from egosim_jax.geometry import transform
-    from egosim_jax.metrics.update import both_ways, thing_accuracy
+    from egosim_jax.metrics.update import object_accuracy, symmetric_distance
     from egosim_jax.state.fuse import fuse
     from egosim_jax.types import Clip
     from egosim_jax.worlds.tabletop import to_action
@@ -125,14 +125,14 @@ def judge(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, 
     after = fuse(before, perceived)
     number, path = clip.body_ids[clip.target], clip.world_from_body[clip.target]
     part = clip.parts[clip.target]
-    thing = thing_accuracy(
+    found = object_accuracy(
         *(state.points_m[state.object_ids == number] for state in (before, after)),
         surface=(transform(path[-1], part.vertices_m), part.triangles),
         seen_m=_seen(clip, number, path),
     )
     known = before.points_m[before.object_ids == 0]
     background = _seen_before(clip, after)
-    return {**asdict(thing), "background_mm": 1000 * both_ways(known, background)}
+    return {**asdict(found), "background_mm": 1000 * symmetric_distance(known, background)}
 
 
 def _seen(clip: TabletopClip, number: int, path: np.ndarray) -> np.ndarray:
@@ -159,11 +159,11 @@ def _seen_before(clip: TabletopClip, after: SceneState) -> np.ndarray:
     import numpy as np
 
     from egosim_jax.geometry import invert, pixels_of, transform
-    from egosim_jax.metrics.update import NEAR_M
+    from egosim_jax.metrics.update import ON_SURFACE_M
 
     cameras, first = clip.cameras, clip.first
     points = after.points_m[after.object_ids == 0]
     local = transform(invert(cameras.world_from_camera[0]), points.astype(float))
     row, column, inside = pixels_of(cameras, local)
     bare = np.where(np.isin(first.ids, list(clip.state.names)), np.inf, first.depth_m)
-    return points[inside & (np.abs(bare[row, column] - local[:, 2]) <= NEAR_M)]
+    return points[inside & (np.abs(bare[row, column] - local[:, 2]) <= ON_SURFACE_M)]

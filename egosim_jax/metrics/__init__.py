@@ -1,1 +1,1 @@
-"""How close a generated video is to the recorded one."""
+"""Metrics of generated videos and of states, against ground truth."""

@@ -1,4 +1,4 @@
-"""How far off depth is. The paper's Depth ERR comes without a formula; this definition is ours."""
+"""Depth error. The paper's Depth ERR has no formula; this definition is ours."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from jaxtyping import Bool, Float32
 
 def depth_error(
     depth_m: Float32[np.ndarray, "f h w"],
-    truth_m: Float32[np.ndarray, "f h w"],
+    target_m: Float32[np.ndarray, "f h w"],
     counted: Bool[np.ndarray, "f h w"],
 ) -> float:
-    """Mean of |depth - truth| / truth in percent, over the counted pixels where both are known.
+    """Return the mean of |depth - target| / target in percent over counted pixels with both known.
 
     NaN if there are none.
     """
-    known = counted & np.isfinite(depth_m) & np.isfinite(truth_m) & (depth_m > 0) & (truth_m > 0)
+    known = counted & np.isfinite(depth_m) & np.isfinite(target_m) & (depth_m > 0) & (target_m > 0)
     if not known.any():
         return float("nan")
-    depth, truth = depth_m[known].astype(float), truth_m[known].astype(float)
-    return float(100 * np.mean(np.abs(depth - truth) / truth))
+    depth, target = depth_m[known].astype(float), target_m[known].astype(float)
+    return float(100 * np.mean(np.abs(depth - target) / target))
 
 
 def coverage(depth_m: Float32[np.ndarray, "f h w"], counted: Bool[np.ndarray, "f h w"]) -> float:
-    """Share of the counted pixels whose depth is known, in percent; NaN if none count."""
+    """Return the percentage of counted pixels whose depth is known; NaN if none are counted."""
     return float(100 * np.isfinite(depth_m[counted]).mean()) if counted.any() else float("nan")

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of uint8 RGB videos, and the color fit of a baseline.
+"""PSNR and SSIM of uint8 RGB videos, and color fitting of a baseline.
 
 PSNR of a frame is 10 log10(255^2 / MSE), the MSE over all its pixels and channels; a frame equal
 to its reference would be infinite and counts as 100 dB. A video's PSNR is the mean over frames.
@@ -9,7 +9,7 @@ window of sigma 1.5, whose weights sum to one:
     (2 mu_a mu_b + C1) (2 cov_ab + C2) / ((mu_a^2 + mu_b^2 + C1) (var_a + var_b + C2))
 
 with C1 = (0.01 * 255)^2 and C2 = (0.03 * 255)^2. It is computed for each channel, averaged over the
-windows that lie within the frame (no border is made up), then over channels and frames.
+windows inside the frame (no padding), then over channels and frames.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from einops import rearrange
 from jaxtyping import Array, Float, UInt8
 
 MAX_PSNR = 100.0
+"""Largest PSNR in dB, that of equal frames."""
 _GRAY = 127.5
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
@@ -32,7 +33,7 @@ _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 def psnr(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
-    """PSNR of every frame in dB, at most `MAX_PSNR`."""
+    """Return the PSNR of every frame in dB, at most `MAX_PSNR`."""
     errors = np.array(
         [
             np.square(frame.astype(np.float32) - other).mean(dtype=np.float64)
@@ -43,7 +44,7 @@ def psnr(
 
 
 def decibels(errors: Float[Any, "*n"]) -> Any:
-    """PSNR of mean squared errors, at most `MAX_PSNR`."""
+    """Return the PSNR in dB of mean squared errors, at most `MAX_PSNR`."""
     floor = 255**2 / 10 ** (MAX_PSNR / 10)
     return 10 * np.log10(255**2 / np.maximum(errors, floor))
 
@@ -51,7 +52,7 @@ def decibels(errors: Float[Any, "*n"]) -> Any:
 def ssim(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
-    """SSIM of every frame; frames must be at least 11 pixels high and wide."""
+    """Return the SSIM of every frame, of at least 11 pixels in height and width."""
     values = []
     for frame, other in zip(video, reference, strict=True):
         moments, center = _moments(frame, other)
@@ -62,9 +63,9 @@ def ssim(
 def fit_colors(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> UInt8[np.ndarray, "f h w 3"]:
-    """Change the colors of a video to come nearest to a reference.
+    """Return a video whose colors are fitted to a reference.
 
-    One affine map, 3 x 4, for the whole clip, fitted by least squares over all pixels.
+    One affine map, 3 x 4, for the clip, by least squares over all pixels.
     """
     gram, moment = np.zeros((4, 4)), np.zeros((4, 3))
     for frame, other in zip(video, reference, strict=True):
@@ -89,7 +90,7 @@ def _map_colors(frame: UInt8[Array, "h w 3"], matrix: Float[Array, "4 3"]) -> UI
 
 
 def _with_one(frame: UInt8[Array, "h w 3"]) -> Float[Array, "n 4"]:
-    """Centerd colors and a one for each pixel."""
+    """Return centered colors and a one for each pixel."""
     colors = rearrange(frame, "h w c -> (h w) c").astype(jnp.float32) - _GRAY
     return jnp.concatenate([colors, jnp.ones((len(colors), 1))], axis=1)
 
@@ -98,10 +99,10 @@ def _with_one(frame: UInt8[Array, "h w 3"]) -> Float[Array, "n 4"]:
 def _moments(
     a: UInt8[Array, "h w c"], b: UInt8[Array, "h w c"]
 ) -> tuple[Float[Array, "4 h w c"], Float[Array, ""]]:
-    """a, b, a b and a^2 + b^2 of values less a constant, and that constant.
+    """Return a, b, a b and a^2 + b^2 of values minus a constant, and that constant.
 
-    Variances are small differences of large squares; taking the frames' mean off first is what
-    keeps float32 exact enough.
+    Variances are small differences of large squares; subtracting the frames' mean first keeps
+    float32 exact enough.
     """
     a, b = a.astype(jnp.float32), b.astype(jnp.float32)
     center = jnp.rint((a.mean() + b.mean()) / 2)
@@ -111,7 +112,7 @@ def _moments(
 
 @functools.partial(jax.jit, static_argnames="axis")
 def _blur(x: Float[Array, "4 _ _ c"], *, axis: int) -> Float[Array, "4 _ _ c"]:
-    """The Gaussian window along one axis, wherever it fits.
+    """Apply the Gaussian window along one axis, where it is inside the frame.
 
     Two jitted passes: in one program XLA would compute the first pass again for each tap of the
     second.
@@ -128,7 +129,7 @@ def _blur(x: Float[Array, "4 _ _ c"], *, axis: int) -> Float[Array, "4 _ _ c"]:
 
 @jax.jit
 def _similarity(blurred: Float[Array, "4 h w c"], center: Float[Array, ""]) -> Float[Array, ""]:
-    """Mean SSIM over windows and channels."""
+    """Return the mean SSIM over windows and channels."""
     mu_a, mu_b, product, squares = blurred
     covariance = product - mu_a * mu_b
     variances = squares - mu_a**2 - mu_b**2

@@ -1,10 +1,10 @@
-"""Whether the right things are where they should be: silhouettes and places read off by color.
+"""Silhouettes and positions of hands and objects, segmented by color.
 
-A thing of color c that is lit by s shows s * c. Where the scene without hands and without the
-thing they move is known, each pixel belongs to whichever comes nearest to its color: that
-background in some light, {s * b : 0.45 <= s <= 1.15}, or one of the colors of hands and thing. The
-same rule reads the truth and the generated video; on the truth, where ids are known, it says how
-far it can be trusted.
+An object of color c under light s has pixels of color s * c. Where the scene without hands and
+without the object that they move is known, each pixel gets the label whose color is nearest: that
+background under some light, {s * b : 0.45 <= s <= 1.15}, or one of the colors of hands and object.
+The same rule labels the ground truth and the generated video; on the ground truth, whose ids are
+known, its accuracy can be measured.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from numpy.lib.stride_tricks import sliding_window_view
 
 from egosim_jax.metrics.image import decibels
 
 SHADES = (0.45, 1.15)
-"""Least and greatest light on a surface."""
-LEAST_SEEN_PX = 20
-"""Frames in which fewer pixels of a thing are visible say nothing about where it is."""
-NEAR = 0.12
-"""Share of the width around the median pixel of a thing in which its pixels count."""
+"""Range of light on a surface."""
+MIN_VISIBLE_PX = 20
+"""Fewest visible pixels of an object in a frame whose centroid is compared."""
+CENTROID_RADIUS = 0.12
+"""Radius around an object's median pixel within which pixels count, as a fraction of the width."""
 
 
 def label(
@@ -30,7 +29,7 @@ def label(
     background: UInt8[np.ndarray, "f h w 3"],
     paints: Mapping[int, tuple[int, int, int]],
 ) -> Int[np.ndarray, "f h w"]:
-    """What each pixel shows: an id of `paints`, which are RGB by id, or 0 for the background."""
+    """Return the label of each pixel: an id of `paints`, RGB by id, or 0 for the background."""
     pixels = video.astype(np.float32)
     numbers = np.array([0, *paints])
     colors = [background, *(np.array(color) for color in paints.values())]
@@ -41,62 +40,60 @@ def label(
 def _distance(
     pixels: Float[np.ndarray, "f h w 3"], color: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "f h w"]:
-    """Squared distance from a color in the light that brings it nearest."""
+    """Return the squared distance to a color under the light that minimizes it."""
     strength = np.maximum(np.square(color).sum(axis=-1), 1e-6)
     shade = np.clip((pixels * color).sum(axis=-1) / strength, *SHADES)
     return np.square(pixels - shade[..., None] * color).sum(axis=-1)
 
 
-def opened(silhouette: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """The silhouette without what no 3 x 3 square fits into: lines along blurred edges, specks."""
+def open_mask(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """Return masks without lines and specks that no 3 x 3 square fits into (opening)."""
+    import cv2
 
-    def around(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w 3 3"]:
-        padded = np.pad(mask, ((0, 0), (1, 1), (1, 1)), mode="edge")
-        return sliding_window_view(padded, (3, 3), axis=(1, 2))
-
-    eroded = np.min(around(silhouette), axis=(3, 4))
-    return np.max(around(eroded), axis=(3, 4))
+    square = np.ones((3, 3), np.uint8)
+    opened = [cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_OPEN, square) for m in mask]
+    return np.stack(opened) > 0
 
 
 def region_psnr(
     video: UInt8[np.ndarray, "f h w 3"],
-    truth: UInt8[np.ndarray, "f h w 3"],
+    target: UInt8[np.ndarray, "f h w 3"],
     region: Bool[np.ndarray, "f h w"],
 ) -> float:
-    """PSNR in dB over the pixels of a region in all frames together; NaN if there are none."""
+    """Return the PSNR in dB over the pixels of a region in all frames; NaN if it is empty."""
     if not region.any():
         return float("nan")
-    return float(decibels(np.square(video[region].astype(np.float64) - truth[region]).mean()))
+    return float(decibels(np.square(video[region].astype(np.float64) - target[region]).mean()))
 
 
-def silhouette_iou(found: Bool[np.ndarray, "f h w"], truth: Bool[np.ndarray, "f h w"]) -> float:
-    """Intersection over union, averaged over the frames in which the truth has any; else NaN."""
-    shown = truth.any(axis=(1, 2))
-    both = (found & truth).sum(axis=(1, 2))[shown]
-    either = (found | truth).sum(axis=(1, 2))[shown]
+def silhouette_iou(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
+    """Return the IoU, averaged over the frames in which the target has pixels; else NaN."""
+    shown = target.any(axis=(1, 2))
+    both = (found & target).sum(axis=(1, 2))[shown]
+    either = (found | target).sum(axis=(1, 2))[shown]
     return float((both / either).mean()) if shown.any() else float("nan")
 
 
 def centroid_errors(
-    found: Bool[np.ndarray, "f h w"], truth: Bool[np.ndarray, "f h w"]
+    found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]
 ) -> Float[np.ndarray, " g"]:
-    """Distances in pixels between the centroids of two silhouettes.
+    """Return the distances in pixels between the centroids of two silhouettes.
 
-    One for each frame in which the truth is seen well; a thing that is not found at all counts as
-    a picture's width away.
+    One for each frame in which the target has enough pixels; an empty silhouette counts as an
+    image width away.
     """
-    width = truth.shape[2]
+    width = target.shape[2]
     errors = []
-    for here, there in zip(found, truth, strict=True):
-        if there.sum() >= LEAST_SEEN_PX:
+    for here, there in zip(found, target, strict=True):
+        if there.sum() >= MIN_VISIBLE_PX:
             gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
             errors.append(np.hypot(*gap))
     return np.array(errors)
 
 
 def _centroid(silhouette: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
-    """Of the pixels around the median one: stray pixels of a like color do not count."""
+    """Return the centroid of the pixels near the median one; stray pixels do not count."""
     pixels = np.argwhere(silhouette)
     gaps = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
-    near = gaps <= max(NEAR * silhouette.shape[1], gaps.min())
+    near = gaps <= max(CENTROID_RADIUS * silhouette.shape[1], gaps.min())
     return pixels[near].mean(axis=0)

@@ -1,6 +1,6 @@
-"""How well a state knows a thing that was moved, against the thing's true surface.
+"""Accuracy of a state after an object was moved, against the object's ground-truth surface.
 
-Shares are in percent. Source: the definitions are ours; the paper gives none for the state.
+All fractions are in percent. Source: the definitions are ours; the paper gives none for the state.
 """
 
 from __future__ import annotations
@@ -10,60 +10,65 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-NEAR_M, SAME_M = 0.01, 0.005
-"""What is on a surface, and what is at the same place."""
+ON_SURFACE_M = 0.01
+"""Distance in meters within which a point is on a surface."""
+SAME_POINT_M = 0.005
+"""Distance in meters within which two points are the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ThingAccuracy:
-    """What became of one thing's points."""
+class ObjectAccuracy:
+    """Accuracy of the points of one object after an update, in percent."""
 
     accurate: float
-    """Share of its points within 1 cm of its true surface, where it is now."""
+    """Percentage of its points within 1 cm of its ground-truth surface after the move."""
     complete: float
-    """Share of its true surface that was seen, which has one of its points within 1 cm."""
-    left: float
-    """Share of its points from before that lie off its true surface and still are there."""
+    """Percentage of its observed surface within 1 cm of one of its points."""
+    ghost: float
+    """Percentage of ghost points: of those off the new surface before, the ones still there."""
 
 
-def thing_accuracy(
+def object_accuracy(
     before_m: Float32[np.ndarray, "n 3"],
     after_m: Float32[np.ndarray, "m 3"],
     *,
     surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]],
     seen_m: Float[np.ndarray, "k 3"],
-) -> ThingAccuracy:
-    """Compare a thing's points before and after with its true mesh and what was seen of it.
+) -> ObjectAccuracy:
+    """Compare an object's points before and after with its mesh and its observed surface points.
 
-    `surface` and `seen_m` are where the thing is now. A state without points of it is neither
-    accurate nor complete: 0; a thing that did not leave its place leaves nothing there: 0.
+    `surface` and `seen_m` are at the object's pose after the move. A state without points of it is
+    neither accurate nor complete (0); an object that did not move leaves no ghost points (0).
     """
-    off = distance_to_mesh(before_m, surface) > NEAR_M
-    return ThingAccuracy(
-        accurate=_percent(distance_to_mesh(after_m, surface) <= NEAR_M),
-        complete=_percent(nearest(seen_m, after_m) <= NEAR_M),
-        left=_percent(nearest(before_m[off], after_m) <= SAME_M),
+    off = distance_to_mesh(before_m, surface) > ON_SURFACE_M
+    return ObjectAccuracy(
+        accurate=_percent(distance_to_mesh(after_m, surface) <= ON_SURFACE_M),
+        complete=_percent(nearest(seen_m, after_m) <= ON_SURFACE_M),
+        ghost=_percent(nearest(before_m[off], after_m) <= SAME_POINT_M),
     )
 
 
-def both_ways(
-    points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"], *, share: float = 0.95
+def symmetric_distance(
+    points_m: Float[np.ndarray, "n 3"],
+    others_m: Float[np.ndarray, "m 3"],
+    *,
+    quantile: float = 0.95,
 ) -> float:
-    """The larger of the two quantiles of nearest-neighbor distances, in meters.
+    """Return the larger of both quantiles of nearest-neighbor distances, in meters.
 
     Infinite if there are no points on either side.
     """
     if not len(points_m) or not len(others_m):
         return float("inf")
-    ways = (nearest(points_m, others_m), nearest(others_m, points_m))
-    return max(float(np.quantile(way, share)) for way in ways)
+    distances = (nearest(points_m, others_m), nearest(others_m, points_m))
+    return max(float(np.quantile(one, quantile)) for one in distances)
 
 
 def distance_to_mesh(
     points_m: Float[np.ndarray, "n 3"],
     surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]],
 ) -> Float32[np.ndarray, " n"]:
-    """Distance of each point from the nearest triangle."""
+    """Return the distance of each point from the nearest triangle, in meters."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -77,7 +82,7 @@ def distance_to_mesh(
 def nearest(
     points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance of each point from the nearest of the others; infinite if there are none."""
+    """Return the distance of each point from the nearest other; infinite if there are none."""
     import open3d as o3d
 
     if not len(points_m) or not len(others_m):

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 
-from egosim_jax.geometry import beside, invert, pixel_rays, project, transform
+from egosim_jax.geometry import cameras_in_object_frame, invert, pixel_rays, project, transform
 from egosim_jax.perception.object_motion import PALM, TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
 from egosim_jax.perception.registry import register
@@ -100,7 +100,9 @@ class RevealedSurfaces:
             depth[revealed] = np.minimum(depth, plane_depth(planes[number], cameras))[revealed]
         for number, motion in motions.items():
             points = state.points_m[state.object_ids == number].astype(float)
-            moved, index = splat(points, beside(cameras, motion), point_px=self.point_px)
+            moved, index = splat(
+                points, cameras_in_object_frame(cameras, motion), point_px=self.point_px
+            )
             nearer = (index >= 0) & (moved < np.minimum(depth, rest))
             depth[nearer], ids[nearer] = moved[nearer], number
         return depth, ids

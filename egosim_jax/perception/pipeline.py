@@ -41,15 +41,13 @@ class Observation:
     joints_m: Float[np.ndarray, "f n j 3"] | None = None
     """Hand joints in the world in meters; NaN where a hand is missing."""
     object_ids: Int32[np.ndarray, "f h w"] | None = None
-    """Object instance of each pixel: 0 background, negative hands and arms, else the state's ids
-    where they are known."""
+    """Object instance of each pixel: 0 background, negative hands and arms, else the state's id."""
     depth_m: Float32[np.ndarray, "f h w"] | None = None
     """Depth along the camera's z axis in meters; infinite where unknown."""
     motions: Mapping[int, Float[np.ndarray, "f 4 4"]] | None = None
     """Rigid motion in the world of each tracked object, relative to its pose before the clip."""
     support_planes: Mapping[int, Float[np.ndarray, " 4"]] | None = None
-    """Plane (a, b, c, d), a x + b y + c z + d = 0, on which each tracked object stood; d is NaN
-    where there is none."""
+    """Plane a x + b y + c z + d = 0 that supported each tracked object; d is NaN without one."""
     interacted_frames: Mapping[int, Bool[np.ndarray, " f"]] | None = None
     """Frames in which hands acted on each object; only objects with at least one."""
     names: Mapping[int, str] | None = None

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from egosim_jax.geometry import beside, transform
+from egosim_jax.geometry import cameras_in_object_frame, transform
 from egosim_jax.rendering.reference import splat
-from egosim_jax.state.fuse import widened
+from egosim_jax.state.fuse import dilate
 from egosim_jax.types import Cameras, SceneState
 
 
@@ -167,7 +167,7 @@ class _Neighborhood:
         depth, index = splat(state.points_m[others], cameras, point_px=config.point_px)
         colors = state.colors[others].astype(np.float32)
         background = np.append(colors, np.full((1, 3), np.nan, np.float32), axis=0)[index]
-        local = beside(cameras, best.path[frames])
+        local = cameras_in_object_frame(cameras, best.path[frames])
         _, drawn = splat(best.model.points_m, local, point_px=config.point_px)
         return cls(
             model=best.model,
@@ -175,13 +175,13 @@ class _Neighborhood:
             shown=shown[frames],
             background=background,
             background_m=depth,
-            compared=widened(drawn >= 0, config.margin) & ~hidden[frames],
+            compared=dilate(drawn >= 0, config.margin) & ~hidden[frames],
             point_px=config.point_px,
         )
 
     def cost(self, path: Float[np.ndarray, "f 4 4"], color: ColorCost) -> float:
         """Return the mean difference between the clip and a rendering with the object there."""
-        local = beside(self.cameras, path)
+        local = cameras_in_object_frame(self.cameras, path)
         depth, index = splat(self.model.points_m, local, point_px=self.point_px)
         nearer = (index >= 0) & (depth < self.background_m)
         drawn = np.where(nearer[..., None], self.model.colors[index], self.background)

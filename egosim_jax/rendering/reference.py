@@ -77,13 +77,11 @@ def unobserved(
     drawn = index >= 0
     if not dilate:
         return np.where(drawn, 0, 255).astype(np.uint8)
-    _, height, width = drawn.shape
-    padded = np.pad(drawn, ((0, 0), (1, 1), (1, 1)))
-    wide = np.zeros_like(drawn)
-    for down in range(3):
-        for right in range(3):
-            wide |= padded[:, down : down + height, right : right + width]
-    return np.where(wide, 0, 255).astype(np.uint8)
+    import cv2
+
+    square = np.ones((3, 3), np.uint8)
+    wide = np.stack([cv2.dilate(frame.astype(np.uint8), square) for frame in drawn])
+    return np.where(wide > 0, 0, 255).astype(np.uint8)
 
 
 def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:

@@ -1,4 +1,4 @@
-"""The state's operations: align what was perceived, filter it, fuse it, keep it.
+"""Operations on the scene state: alignment, interaction filter, fusion, storage.
 
-NumPy and Open3D, no jax: any generator can drive the loop.
+NumPy and Open3D, no JAX: any generator can drive the loop.
 """

@@ -16,8 +16,10 @@ from egosim_jax.geometry import umeyama
 from egosim_jax.types import InputError
 
 CameraMethod = Literal["centers", "orientations", "orientations and scale"]
-"""Umeyama on camera centers with a scale; or the mean rotation between the cameras, and then the
-translation between their centers, without or with a scale."""
+"""Camera alignment method.
+
+`centers` is Umeyama on camera centers with a scale; `orientations` is the mean rotation between the
+cameras and then the translation between their centers, without or with a scale."""
 
 
 def align_cameras(

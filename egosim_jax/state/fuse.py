@@ -1,16 +1,16 @@
-"""What was perceived becomes part of the state: U of EgoSim's equation S_k = U(S_{k-1}, O_k).
+"""State update: U of EgoSim's equation S_k = U(S_{k-1}, O_k).
 
-1. Depth is fused into surfaces, without the hands: one of everything that stood still, and one of
-   each thing that was tracked, in its own coordinates, so that all frames count wherever it was.
-2. What the memory knows of a tracked thing moves with it.
-3. Free space is carved: a remembered point goes if the last frames that could have seen it look
-   through it. (The original does not, and a moved thing leaves a ghost.)
-4. New points replace remembered ones within 5 mm, and take over the colors of the nearest of the
-   same thing: what was seen once is not painted again from a generated clip, whose colors drift
-   from clip to clip. (The original paints again.)
+1. Depth is fused into surfaces, without the hands: one for everything static, and one for each
+   tracked object in its own coordinates, so that all frames contribute wherever the object was.
+2. Points of the state that belong to a tracked object move with it.
+3. Free space is carved: a point of the state is removed if the last frames that could have observed
+   it see through it. (The original does not, and a moved object leaves ghost points.)
+4. New points replace points of the state within 5 mm, and take the color of the nearest one of the
+   same object: a surface that was observed once is not repainted from a generated clip, whose
+   colors drift from clip to clip. (The original repaints.)
 
-Fusing the same again changes nothing, clips that see different places may be fused in either order,
-and the points come out in one order, so that equal states are equal arrays.
+The update is idempotent, clips of different places commute, and the points have a canonical order,
+so that equal states are equal arrays.
 """
 
 from __future__ import annotations
@@ -20,25 +20,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import beside, invert, pixels_of, transform
+from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
 from egosim_jax.state.filter import disappeared_objects
-from egosim_jax.state.tsdf import Fusion, steady, surface
+from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
 from egosim_jax.types import Perceived, SceneState
 
 REPLACE_M = 0.005
-"""A new point takes the place of remembered ones within so much."""
-THROUGH_M, DOUBT = 0.02, 2
-"""A point is looked through if the surface lies so far behind it; a verdict wavers between -DOUBT
-and DOUBT, down one for each frame that looks through and up one for each that sees the point."""
-NEIGHBORS, DEVIATIONS = 20, 2.0
-"""Outliers are farther from so many neighbors than most by so many deviations."""
-BORDER = 5 / 832
-"""Around hands, as a share of the width: what is not trusted."""
+"""Distance within which a new point replaces points of the state, in meters."""
+FREE_SPACE_MARGIN_M = 0.02
+"""A frame sees through a point if the surface is this far behind it, in meters."""
+VOTE_LIMIT = 2
+"""Bound of a point's votes: -1 per frame that sees through it, +1 per frame that observes it."""
+OUTLIER_NEIGHBORS = 20
+"""Neighbors whose mean distance decides whether a point is an outlier."""
+OUTLIER_DEVIATIONS = 2.0
+"""Standard deviations of that distance beyond which a point is an outlier."""
+HAND_MARGIN = 5 / 832
+"""Border around hands in which depth is not used, as a fraction of the image width."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Points:
-    """Points as the state keeps them."""
+    """Points with the attributes that a state stores."""
 
     points_m: Float32[np.ndarray, "n 3"]
     colors: UInt8[np.ndarray, "n 3"]
@@ -50,41 +53,42 @@ class _Points:
 
 
 def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = None) -> SceneState:
-    """The state after what was perceived; a clip in which nothing is known leaves its points."""
-    lost = disappeared_objects(perceived.object_ids, dict(perceived.interacted_frames)) - set(
-        perceived.world_from_object
-    )
-    sure = steady(perceived.depth_m)
-    new = _observed(perceived, sure, lost, fusion or Fusion())
-    old = _moved(state, perceived, lost)
-    old = _carved(old, perceived, sure)
-    new = replace(new, colors=_remembered(new, old))
-    old = old[~_near(old.points_m, new.points_m, REPLACE_M)]
-    everything = _ordered(_together([old, new]))
+    """Return the state after a clip; without any known depth its points stay."""
+    disappeared = disappeared_objects(perceived.object_ids, dict(perceived.interacted_frames))
+    disappeared -= set(perceived.world_from_object)
+    valid = valid_depth_mask(perceived.depth_m)
+    new = reconstruct(perceived, valid, disappeared, fusion or Fusion())
+    old = apply_motion(state, perceived, disappeared)
+    old = carve_free_space(old, perceived, valid)
+    new = replace(new, colors=transfer_colors(new, old))
+    old = old[~_has_neighbor(old.points_m, new.points_m, REPLACE_M)]
+    points = canonical_sort(concat([old, new]))
     poses = {n: path[-1] for n, path in perceived.world_from_object.items()}
     return replace(
         state,
-        **vars(everything),
+        **vars(points),
         step=max(state.step, perceived.step),
         names={**state.names, **perceived.names},
         world_from_object={**state.world_from_object, **poses},
     )
 
 
-def _observed(
-    perceived: Perceived, sure: Bool[np.ndarray, "f h w"], lost: set[int], fusion: Fusion
+def reconstruct(
+    perceived: Perceived, valid: Bool[np.ndarray, "f h w"], disappeared: set[int], fusion: Fusion
 ) -> _Points:
-    """Surfaces of the background and of every thing that is not lost, at the end of the clip."""
-    trusted = sure & ~widened(perceived.object_ids < 0, BORDER)
+    """Return surfaces of background and objects, except disappeared ones, at the clip's end."""
+    usable = valid & ~dilate(perceived.object_ids < 0, HAND_MARGIN)
     pieces = []
-    for number in sorted(set(np.unique(perceived.object_ids).tolist()) - lost):
+    for number in sorted(set(np.unique(perceived.object_ids).tolist()) - disappeared):
         if number < 0:
             continue
-        seen = trusted & (perceived.object_ids == number)
+        seen = usable & (perceived.object_ids == number)
         path = perceived.world_from_object.get(number)
         if path is None and number in perceived.interacted_frames:
-            seen = _last_view(seen)  # it moved, but how is not known
-        cameras = perceived.cameras if path is None else beside(perceived.cameras, path)
+            seen = _last_visible_frame(seen)  # it moved, by an unknown motion
+        cameras = (
+            perceived.cameras if path is None else cameras_in_object_frame(perceived.cameras, path)
+        )
         depth = np.where(seen, perceived.depth_m, 0).astype(np.float32)
         points, colors = surface(depth, perceived.frames, cameras, fusion=fusion)
         if path is not None:
@@ -98,11 +102,11 @@ def _observed(
                 last_seen=np.full_like(ids, perceived.step),
             )
         )
-    return _without_outliers(_together(pieces))
+    return _remove_outliers(concat(pieces))
 
 
-def widened(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, "f h w"]:
-    """The mask and what is within a border of it, a share of the width but at least a pixel."""
+def dilate(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, "f h w"]:
+    """Return masks dilated by a border, given as a fraction of the width, of at least a pixel."""
     import cv2
 
     border = max(1, round(border * mask.shape[2]))
@@ -110,22 +114,22 @@ def widened(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, 
     return np.stack([cv2.dilate(frame.astype(np.uint8), square) > 0 for frame in mask])
 
 
-def _last_view(seen: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+def _last_visible_frame(seen: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
     frames = np.flatnonzero(seen.any(axis=(1, 2)))
     last = np.arange(len(seen)) == (frames[-1] if len(frames) else -1)
     return seen & last[:, None, None]
 
 
-def _moved(state: SceneState, perceived: Perceived, lost: set[int]) -> _Points:
-    """The memory with tracked things where they ended, and without those that are lost."""
+def apply_motion(state: SceneState, perceived: Perceived, disappeared: set[int]) -> _Points:
+    """Return the state's points with tracked objects at their end, without disappeared ones."""
     points = state.points_m.copy()
     for number, path in perceived.world_from_object.items():
         before = state.world_from_object.get(number, np.eye(4))
         own = state.object_ids == number
         if own.any() and not np.array_equal(before, path[-1]):
-            there = transform(path[-1] @ invert(before), points[own].astype(np.float64))
-            points[own] = there.astype(np.float32)
-    kept = ~np.isin(state.object_ids, list(lost))
+            moved = transform(path[-1] @ invert(before), points[own].astype(np.float64))
+            points[own] = moved.astype(np.float32)
+    kept = ~np.isin(state.object_ids, list(disappeared))
     return _Points(
         points_m=points,
         colors=state.colors,
@@ -134,51 +138,54 @@ def _moved(state: SceneState, perceived: Perceived, lost: set[int]) -> _Points:
     )[kept]
 
 
-def _carved(old: _Points, perceived: Perceived, sure: Bool[np.ndarray, "f h w"]) -> _Points:
-    """The points that the last frames that could have seen them did not look through."""
-    verdict = np.zeros(len(old.points_m), int)
-    confirmed = np.zeros(len(verdict), bool)
-    depth = np.where(sure, perceived.depth_m, np.nan)
+def carve_free_space(
+    old: _Points, perceived: Perceived, valid: Bool[np.ndarray, "f h w"]
+) -> _Points:
+    """Return the points without those that the last frames with a view of them see through."""
+    votes = np.zeros(len(old.points_m), int)
+    observed = np.zeros(len(votes), bool)
+    depth = np.where(valid, perceived.depth_m, np.nan)
     for frame in range(len(depth)):
         behind = _surface_behind(old, perceived, depth[frame], frame)
-        here = np.abs(behind) <= THROUGH_M
-        verdict = np.clip(verdict + here - (behind > THROUGH_M), -DOUBT, DOUBT)
-        confirmed |= here
-    seen = np.where(confirmed, np.maximum(old.last_seen, perceived.step), old.last_seen)
-    return replace(old, last_seen=seen.astype(np.int32))[verdict >= 0]
+        here = np.abs(behind) <= FREE_SPACE_MARGIN_M
+        through = behind > FREE_SPACE_MARGIN_M
+        votes = np.clip(votes + here - through, -VOTE_LIMIT, VOTE_LIMIT)
+        observed |= here
+    seen = np.where(observed, np.maximum(old.last_seen, perceived.step), old.last_seen)
+    return replace(old, last_seen=seen.astype(np.int32))[votes >= 0]
 
 
 def _surface_behind(
     old: _Points, perceived: Perceived, depth_m: Float32[np.ndarray, "h w"], frame: int
 ) -> Float[np.ndarray, " n"]:
-    """How far behind each point the frame's surface lies; NaN where the frame says nothing."""
+    """Return the distance in meters of a frame's surface behind each point; NaN where unknown."""
     cameras = perceived.cameras
     camera_from_world = invert(cameras.world_from_camera[frame])
     local = transform(camera_from_world, old.points_m.astype(np.float64))
     for number, path in perceived.world_from_object.items():
         own = old.object_ids == number
-        then = camera_from_world @ path[frame] @ invert(path[-1])
-        local[own] = transform(then, old.points_m[own].astype(np.float64))
+        camera_from_end = camera_from_world @ path[frame] @ invert(path[-1])
+        local[own] = transform(camera_from_end, old.points_m[own].astype(np.float64))
     row, column, inside = pixels_of(cameras, local)
     behind = np.full(len(local), np.nan)
     behind[inside] = depth_m[row[inside], column[inside]] - local[inside, 2]
     return behind
 
 
-def _without_outliers(new: _Points) -> _Points:
+def _remove_outliers(new: _Points) -> _Points:
     import open3d as o3d
 
-    if len(new.points_m) <= NEIGHBORS:
+    if len(new.points_m) <= OUTLIER_NEIGHBORS:
         return new
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(new.points_m))
-    _, kept = cloud.remove_statistical_outlier(NEIGHBORS, DEVIATIONS)
+    _, kept = cloud.remove_statistical_outlier(OUTLIER_NEIGHBORS, OUTLIER_DEVIATIONS)
     return new[np.array(kept, int)]
 
 
-def _near(
+def _has_neighbor(
     points_m: Float32[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], radius_m: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which points have one of the others within the radius."""
+    """Return which points have one of the others within a radius in meters."""
     import open3d as o3d
 
     if not len(points_m) or not len(others_m):
@@ -187,23 +194,24 @@ def _near(
     return np.asarray(clouds[0].compute_point_cloud_distance(clouds[1])) <= radius_m
 
 
-def _remembered(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
-    """The colors of new points: of the nearest remembered one that they replace, or their own."""
+def transfer_colors(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
+    """Return colors of new points: those of the nearest old point they replace, if there is one."""
     import open3d as o3d
 
     colors = new.colors.copy()
     for number in np.intersect1d(new.object_ids, old.object_ids):
-        here = np.flatnonzero(new.object_ids == number)
-        there = np.flatnonzero(old.object_ids == number)
-        index = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(old.points_m[there]))
+        own = np.flatnonzero(new.object_ids == number)
+        candidates = np.flatnonzero(old.object_ids == number)
+        index = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(old.points_m[candidates]))
         index.knn_index()
-        nearest, square = (x.numpy() for x in index.knn_search(new.points_m[here], 1))
+        nearest, square = (x.numpy() for x in index.knn_search(new.points_m[own], 1))
         near = square[:, 0] <= REPLACE_M**2
-        colors[here[near]] = old.colors[there[nearest[near, 0]]]
+        colors[own[near]] = old.colors[candidates[nearest[near, 0]]]
     return colors
 
 
-def _together(pieces: list[_Points]) -> _Points:
+def concat(pieces: list[_Points]) -> _Points:
+    """Return the points of all pieces; without pieces, no points."""
     empty = _Points(
         points_m=np.zeros((0, 3), np.float32),
         colors=np.zeros((0, 3), np.uint8),
@@ -216,6 +224,6 @@ def _together(pieces: list[_Points]) -> _Points:
     )
 
 
-def _ordered(points: _Points) -> _Points:
-    """In one order whatever the history: by thing, place and color."""
+def canonical_sort(points: _Points) -> _Points:
+    """Return the points sorted by object, position and color, independent of their history."""
     return points[np.lexsort((*points.colors.T, *points.points_m.T, points.object_ids))]

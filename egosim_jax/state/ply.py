@@ -1,8 +1,8 @@
-"""PLY files of points: the header is held against the size of the file before anything is built.
+"""PLY files of points, whose header is checked against the file size before anything is built.
 
-A header of text names elements, their number and their properties, then come the values, as text
-or in binary of either byte order. Points are the element `vertex`; what follows them, such as
-faces, is not read, but has to be there.
+A text header names elements, their number and their properties; the values follow, as text or
+binary of either byte order. Points are the element `vertex`; elements after it, such as faces, are
+skipped, but must be complete.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from egosim_jax.io.untrusted import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_HEADER = 1 << 16
-"""Longest header, in bytes."""
+"""Largest header in bytes."""
 MAX_BYTES = 1 << 29
-"""Largest file in binary."""
+"""Largest binary file in bytes."""
 MAX_TEXT = 1 << 27
-"""Largest file of text."""
+"""Largest text file in bytes."""
 MAX_POINTS = 1 << 24
+"""Largest number of points."""
 MAX_PROPERTIES = 256
+"""Largest number of properties of all elements."""
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
           "float": "f4", "double": "f8"}  # fmt: skip
 _TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
@@ -39,14 +41,14 @@ class _Element:
     name: str
     count: int
     fields: list[tuple[str, str]] = field(default_factory=list)
-    """Names and dtypes; of a list, those of its length."""
+    """Names and dtypes of the properties; for a list, those of its length."""
     lists: bool = False
 
 
 def read_points(path: Path) -> np.ndarray:
     """Read the points of a PLY file: a structured array with a field for each property.
 
-    Raises `InputError` if it is no PLY, damaged, cut off or too large.
+    Raises `InputError` if it is not a PLY file, damaged, truncated or too large.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -55,24 +57,24 @@ def read_points(path: Path) -> np.ndarray:
             vertex = next((e for e in elements if e.name == "vertex"), None)
             if vertex is None or not 0 < vertex.count <= MAX_POINTS:
                 count = vertex.count if vertex else 0
-                raise ValueError(f"it has {quote(count)} points; 1 to {MAX_POINTS:,} are read")
+                raise ValueError(f"it has {quote(count)} points; expected 1 to {MAX_POINTS:,}")
             number = elements.index(vertex)
             if vertex.lists or any(element.lists for element in elements[:number]):
-                raise ValueError("a list stands before the points or in them")
+                raise ValueError("a list property precedes the points or belongs to them")
             limit = MAX_TEXT if order == "=" else MAX_BYTES
             data = file.read(limit + 1)
             if len(data) > limit:
-                raise ValueError(f"it has more than {limit:,} bytes, the most that is read")
+                raise ValueError(f"it has more than {limit:,} bytes, the limit")
             read = _text if order == "=" else _binary
             return read(data, order, elements, number)
         except ValueError as error:
-            raise InputError(f"{name} is no PLY that can be read: {quote_text(str(error))}.") from (
+            raise InputError(f"{name} is not a readable PLY file: {quote_text(str(error))}.") from (
                 error
             )
 
 
 def write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write points as binary PLY, whole or not at all; each column is a property."""
+    """Write points as binary PLY, atomically; each column is a property."""
     dtypes = {name: column.dtype.newbyteorder("<") for name, column in columns.items()}
     points = np.empty(len(next(iter(columns.values()))), list(dtypes.items()))
     for name, column in columns.items():
@@ -84,11 +86,11 @@ def write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def _header(file: io.BufferedReader) -> tuple[str, list[_Element]]:
-    """The byte order and the elements. Raises `ValueError`."""
+    """Return the byte order and the elements. Raises `ValueError`."""
     head = file.read(MAX_HEADER)
     lines = head.decode("latin-1").split("\n")
     if lines[0].rstrip("\r") != "ply":
-        raise ValueError("it does not begin with the line 'ply'")
+        raise ValueError("its first line is not 'ply'")
     order, elements, properties = "", [], 0
     end = len(lines[0]) + 1
     for line in lines[1:-1]:
@@ -127,7 +129,7 @@ def _binary(data: bytes, order: str, elements: list[_Element], number: int) -> n
     open_ended = any(element.lists for element in elements)
     if len(data) < sum(sizes) or (len(data) > sum(sizes) and not open_ended):
         raise ValueError(
-            f"{len(data):,} bytes follow the header, which tells of "
+            f"{len(data):,} bytes follow the header, which specifies "
             f"{'at least ' * open_ended}{quote(sum(sizes))}"
         )
     dtype = [(name, order + kind) for name, kind in elements[number].fields]
@@ -139,7 +141,7 @@ def _text(data: bytes, order: str, elements: list[_Element], number: int) -> np.
     wanted = sum(element.count for element in elements)
     lines = data.count(b"\n") + (not data.endswith(b"\n"))
     if wanted > lines:
-        raise ValueError(f"{lines:,} lines follow the header, which tells of {quote(wanted)}")
+        raise ValueError(f"{lines:,} lines follow the header, which specifies {quote(wanted)}")
     before = sum(element.count for element in elements[:number])
     rows = (line for line in io.BytesIO(data) if not line.isspace())
     points = np.loadtxt(
@@ -153,6 +155,6 @@ def _text(data: bytes, order: str, elements: list[_Element], number: int) -> np.
     left = sum(1 for _ in rows)
     if len(points) < elements[number].count or left != wanted - before - len(points):
         raise ValueError(
-            f"{before + len(points) + left:,} lines follow the header, which tells of {wanted:,}"
+            f"{before + len(points) + left:,} lines follow the header, which specifies {wanted:,}"
         )
     return points

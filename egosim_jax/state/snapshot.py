@@ -1,7 +1,7 @@
-"""The state on disk: a folder of `points.npz` and `state.json`, and PLY for other programs.
+"""Storage of a state: a folder of `points.npz` and `state.json`, and PLY for other programs.
 
 `state.json` names the version and the SHA-256 of `points.npz`; nothing is unpickled. Equal states
-have equal fingerprints, whatever wrote them.
+have equal fingerprints, independent of the file version.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from egosim_jax.state.ply import read_points, write_points
 from egosim_jax.types import InputError, SceneState
 
 VERSION = 3
-"""The version that is written."""
+"""Version of files that `save` writes."""
 READABLE = (1, 2, VERSION)
-"""Versions that are read: 1 has no hash of its description; 1 and 2 spell `colours`."""
+"""Versions that `load` reads: 1 has no description hash; 1 and 2 spell colors the British way."""
 POINTS, DESCRIPTION = "points.npz", "state.json"
 ARRAYS = ("points_m", "colors", "object_ids", "last_seen")
 CHANNELS = ("red", "green", "blue")
@@ -33,7 +33,7 @@ _DTYPES = {"points_m": "float32", "colors": "uint8", "object_ids": "int32", "las
 
 
 def fingerprint(state: SceneState) -> str:
-    """SHA-256 of all that the state holds."""
+    """Return the SHA-256 of all fields of a state."""
     digest = hashlib.sha256(json.dumps(_description(state), sort_keys=True).encode())
     for name in ARRAYS:
         digest.update(np.ascontiguousarray(getattr(state, name)).tobytes())
@@ -41,7 +41,7 @@ def fingerprint(state: SceneState) -> str:
 
 
 def save(folder: Path | str, state: SceneState) -> None:
-    """Write the state to a folder, which is complete or absent."""
+    """Write a state to a folder, atomically."""
     with atomic_folder(Path(folder)) as temporary:
         np.savez(temporary / POINTS, **{name: getattr(state, name) for name in ARRAYS})
         description = _description(state)
@@ -57,12 +57,12 @@ def save(folder: Path | str, state: SceneState) -> None:
 
 
 def load(folder: Path | str) -> SceneState:
-    """Read a state. Raises `InputError` if it is damaged, of another version or no state."""
+    """Read a state. Raises `InputError` if it is damaged, not a state, or of an unknown version."""
     folder = Path(folder)
     try:
         return _load(folder)
     except InputError as error:
-        raise InputError(f"{folder} holds no state that can be read: {error}") from error
+        raise InputError(f"{folder} is not a readable state: {error}") from error
 
 
 def _load(folder: Path) -> SceneState:
@@ -71,13 +71,11 @@ def _load(folder: Path) -> SceneState:
         raise InputError(f"{DESCRIPTION} is not the description of a state.")
     version = written["version"]
     if version not in READABLE or isinstance(version, (bool, float)):
-        raise InputError(
-            f"it is of version {quote(version)}; this program reads versions {READABLE}."
-        )
+        raise InputError(f"it has version {quote(version)}; readable versions are {READABLE}.")
     if sha256(folder / POINTS) != written.get("sha256"):
         raise InputError(
             f"{folder / POINTS} is damaged: it is not what {DESCRIPTION} was written for "
-            "(SHA-256). Take another copy."
+            "(SHA-256). Use another copy."
         )
     spelled = "colors" if version == VERSION else "colours"
     dtypes = {spelled if name == "colors" else name: dtype for name, dtype in _DTYPES.items()}
@@ -92,7 +90,7 @@ def _load(folder: Path) -> SceneState:
     changed = version > 1 and seal != _sealed(_description(state))
     if changed or written.get("points") != len(state.points_m):
         raise InputError(
-            f"{folder / DESCRIPTION} was changed after it was written. Take another copy."
+            f"{folder / DESCRIPTION} was changed after it was written. Use another copy."
         )
     return state
 
@@ -168,7 +166,7 @@ def write_ply(path: Path, state: SceneState) -> None:
 
 
 def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
-    """Read a state from a PLY of colored points; what PLY does not say comes from the template.
+    """Read a state from a PLY file of colored points; other fields come from the template.
 
     Raises `InputError` if it is damaged, or has no points or no colors.
     """
@@ -178,8 +176,7 @@ def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
     ]
     if missing:
         raise InputError(
-            f"{quote_path(path)} holds no points with colors: property {', '.join(missing)} is "
-            "missing."
+            f"{quote_path(path)} has no colored points: missing property {', '.join(missing)}."
         )
     try:
         arrays = {
@@ -196,7 +193,7 @@ def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
 
 
 def _channel(values: np.ndarray) -> np.ndarray:
-    """Levels of 0 to 255, from bytes or from floats of 0 to 1."""
+    """Return 8-bit levels of a color channel given as bytes or as floats from 0 to 1."""
     if values.dtype == np.uint8:
         return values
     if values.dtype.kind != "f" or not ((values >= 0) & (values <= 1)).all():

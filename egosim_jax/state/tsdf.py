@@ -1,8 +1,8 @@
-"""Depth images fused into a surface: a truncated signed distance field on a sparse voxel grid.
+"""TSDF fusion: depth images fused into a truncated signed distance field on a sparse voxel grid.
 
-Every voxel near a surface keeps the weighted mean of its signed distances to it along the rays that
-saw it, cut off at the truncation; the surface is where that mean is zero. Source: EgoSim, section
-3.3 and its implementation details: voxels of 3 mm, truncation 5 cm, depths up to 3 m.
+Every voxel near a surface stores the weighted mean of its signed distances to it along the rays
+that observed it, clipped at the truncation; the surface is the zero level set. Source: EgoSim,
+section 3.3 and its implementation details: voxels of 3 mm, truncation 5 cm, depths up to 3 m.
 """
 
 from __future__ import annotations
@@ -11,56 +11,56 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped, UInt8
-from numpy.lib.stride_tricks import sliding_window_view
 
 from egosim_jax.geometry import pixel_rays, transform
 from egosim_jax.types import Cameras, InputError
 
-WINDOW, LARGEST_STEP = 5, 0.1
-"""A depth counts if within so many pixels around it depths differ by less than this share."""
-BLOCK = 16
+DEPTH_WINDOW_PX = 5
+"""Window of pixels around a depth in which depths are compared."""
+MAX_DEPTH_STEP = 0.1
+"""Largest difference of depths in the window, as a fraction of the depth, of a reliable depth."""
+BLOCK_VOXELS = 16
 """Voxels along an edge of a block."""
-SHIFT = 0.37
-"""Voxels by which the grid is off the origin: where a surface passes exactly through the voxels,
-as a table at height 0 would, distances are 0 and change no sign, and it would be lost."""
+GRID_OFFSET_VOXELS = 0.37
+"""Offset of the grid from the origin, in voxels.
+
+A surface exactly on voxel centers, as a table at height 0 would be, has distances of 0 without a
+change of sign, and would be lost."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fusion:
-    """How finely depth is fused."""
+    """Parameters of TSDF fusion."""
 
     voxel_m: float = 0.003
+    """Voxel size in meters."""
     truncation_m: float = 0.05
+    """Truncation distance in meters."""
     max_depth_m: float = 3.0
-    """Farther depths are left out."""
+    """Farther depths are ignored, in meters."""
     observations: int = 3
-    """A voxel counts from so many frames on, or from all if there are fewer."""
+    """Fewest frames that must observe a voxel; all of them if there are fewer."""
 
     def __post_init__(self) -> None:
         """Check that the sizes are positive and the truncation spans voxels."""
         if not (0 < self.voxel_m <= self.truncation_m and self.max_depth_m > 0):
             raise InputError(
-                f"Voxels of {self.voxel_m} m, a truncation of {self.truncation_m} m and depths up "
-                f"to {self.max_depth_m} m make no surface: all must be positive, and the "
-                "truncation no less than a voxel."
+                f"Invalid fusion parameters: voxel_m {self.voxel_m}, truncation_m "
+                f"{self.truncation_m}, max_depth_m {self.max_depth_m}. All must be positive, and "
+                "the truncation at least one voxel."
             )
 
 
-def steady(depth_m: Float32[np.ndarray, "*f h w"]) -> Bool[np.ndarray, "*f h w"]:
-    """Where depth is known and changes little: not at the edge of a thing, whose depth is mixed."""
-    half = WINDOW // 2
-    border = [(0, 0)] * (depth_m.ndim - 2) + [(half, half)] * 2
+def valid_depth_mask(depth_m: Float32[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """Return the pixels whose depth is known and continuous: at depth edges it is mixed."""
+    import cv2
+
+    window = np.ones((DEPTH_WINDOW_PX, DEPTH_WINDOW_PX), np.uint8)
     known = np.isfinite(depth_m) & (depth_m > 0)
-    low = _around(np.pad(np.where(known, depth_m, np.inf), border, constant_values=np.inf), np.min)
-    high = _around(np.pad(np.where(known, depth_m, 0), border), np.max)
-    return known & (high - low < LARGEST_STEP * np.where(known, depth_m, 1))
-
-
-def _around(padded: np.ndarray, reduce: np.ufunc | object) -> np.ndarray:
-    """Least or greatest value in the window around each pixel: first along rows, then columns."""
-    for axis in (-1, -2):
-        padded = reduce(sliding_window_view(padded, WINDOW, axis=axis), axis=-1)  # type: ignore[operator]
-    return padded
+    nearest = [cv2.erode(frame, window) for frame in np.where(known, depth_m, np.inf)]
+    farthest = [cv2.dilate(frame, window) for frame in np.where(known, depth_m, 0)]
+    step = np.stack(farthest) - np.stack(nearest)
+    return known & (step < MAX_DEPTH_STEP * np.where(known, depth_m, 1))
 
 
 def surface(
@@ -70,9 +70,9 @@ def surface(
     *,
     fusion: Fusion,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Points and colors of the surface that the frames see, in the coordinates of the cameras.
+    """Return points and colors of the surface that the frames observe, in the cameras' world.
 
-    Depths that are 0, infinite or NaN are unknown; frames in which all are add nothing.
+    Depths that are 0, infinite or NaN are unknown; frames without any known depth are skipped.
     """
     import open3d as o3d
 
@@ -83,7 +83,7 @@ def surface(
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     focal_px = float(cameras.intrinsics_px[0, 0])
     poses = cameras.world_from_camera.copy()
-    poses[:, :3, 3] += SHIFT * fusion.voxel_m
+    poses[:, :3, 3] += GRID_OFFSET_VOXELS * fusion.voxel_m
     blocks = {
         frame: _blocks(depth_m[frame], known[frame], poses[frame], rays, focal_px, fusion)
         for frame in frames
@@ -94,15 +94,15 @@ def surface(
         attr_dtypes=(float32, float32, float32),
         attr_channels=(1, 1, 3),
         voxel_size=fusion.voxel_m,
-        block_resolution=BLOCK,
+        block_resolution=BLOCK_VOXELS,
         # A grid that has to grow copies itself each time; one that is too large zeroes gigabytes.
         block_count=len(_unique(np.concatenate(list(blocks.values())))),
     )
     # Open3D takes the pixel that a coordinate falls into, and pixel 0 begins at 0: with pixel
-    # centers at whole numbers the image lies half a pixel off, 2 mm on a table at 160 columns.
-    centerd = cameras.intrinsics_px.astype(np.float64)
-    centerd[:2, 2] += 0.5
-    intrinsics = o3d.core.Tensor(centerd)
+    # centers at whole numbers the image is half a pixel off, 2 mm on a table at 160 columns.
+    shifted = cameras.intrinsics_px.astype(np.float64)
+    shifted[:2, 2] += 0.5
+    intrinsics = o3d.core.Tensor(shifted)
     reach = fusion.truncation_m / fusion.voxel_m
     for frame in frames:
         depth = _image(np.where(known[frame], depth_m[frame], 0).astype(np.float32))
@@ -118,7 +118,7 @@ def surface(
     if cloud.is_empty():
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     shades = np.clip(np.rint(cloud.point.colors.numpy()), 0, 255).astype(np.uint8)
-    return cloud.point.positions.numpy() - np.float32(SHIFT * fusion.voxel_m), shades
+    return cloud.point.positions.numpy() - np.float32(GRID_OFFSET_VOXELS * fusion.voxel_m), shades
 
 
 def _blocks(
@@ -129,26 +129,26 @@ def _blocks(
     focal_px: float,
     fusion: Fusion,
 ) -> Int32[np.ndarray, "n 3"]:
-    """The blocks that the rays pass through within the truncation of the surface.
+    """Return the blocks that the rays pass through within the truncation of the surface.
 
-    Open3D's own looks at every fourth pixel only, and misses small things.
+    Open3D's function samples every fourth pixel only, and misses small objects.
     """
-    edge = BLOCK * fusion.voxel_m
-    apart = float(np.median(depth_m[known])) / focal_px
-    every = max(1, int(edge / 4 / apart))  # pixels whose rays are a quarter of a block apart
-    some = np.zeros_like(known)
-    some[::every, ::every] = True
-    if not (known & some).any():
-        some[:] = True
-    rays, depth = rays[known & some], depth_m[known & some]
+    edge = BLOCK_VOXELS * fusion.voxel_m
+    pixel_m = float(np.median(depth_m[known])) / focal_px
+    every = max(1, int(edge / 4 / pixel_m))  # pixels whose rays are a quarter of a block apart
+    sampled = np.zeros_like(known)
+    sampled[::every, ::every] = True
+    if not (known & sampled).any():
+        sampled[:] = True
+    rays, depth = rays[known & sampled], depth_m[known & sampled]
     steps = np.linspace(-1, 1, 1 + 2 * int(np.ceil(2 * fusion.truncation_m / edge)))
     depths = depth[:, None] + steps * fusion.truncation_m
-    places = transform(grid_from_camera, (rays[:, None] * depths[..., None]).reshape(-1, 3))
-    return _unique(np.floor(places / edge).astype(np.int32))
+    points = transform(grid_from_camera, (rays[:, None] * depths[..., None]).reshape(-1, 3))
+    return _unique(np.floor(points / edge).astype(np.int32))
 
 
 def _unique(cells: Int32[np.ndarray, "m 3"]) -> Int32[np.ndarray, "n 3"]:
-    """Each cell once, in order; many times faster than `np.unique` of rows."""
+    """Return the distinct rows, sorted; many times faster than `np.unique` with an axis."""
     low = cells.min(axis=0)
     size = tuple(cells.max(axis=0) - low + 1)
     numbers = np.unique(np.ravel_multi_index(tuple((cells - low).T), size))

@@ -159,7 +159,7 @@ def test_the_state_after_a_thing_was_carried_is_compared_with_the_truth(
     told = {name: value["mean"] for name, value in table["oracle, 160 x 96"].items()}
     assert told["accurate"] >= 95
     assert told["complete"] >= 80
-    assert told["left"] < 2
+    assert told["ghost"] < 2
     lost = table["classical, generated frames"]  # of random weights: nothing is found in noise
-    assert lost["left"]["mean"] > 90
-    assert "left behind" in capsys.readouterr().out
+    assert lost["ghost"]["mean"] > 90
+    assert "ghost points" in capsys.readouterr().out

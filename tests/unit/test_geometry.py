@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from egosim_jax.geometry import (
-    finer,
     invert,
     look_at,
     pixel_rays,
     pixels_of,
     project,
+    rotation_z,
     transform,
-    turned,
+    upsample_intrinsics,
 )
 from egosim_jax.types import Cameras
 
@@ -45,13 +45,13 @@ def test_a_pixels_ray_projects_to_its_center():
 @pytest.mark.parametrize("times", [2, 3])
 def test_the_parts_of_a_pixel_surround_its_center(times):
     coarse = pixel_rays(INTRINSICS, height=4, width=6)
-    parts = pixel_rays(finer(INTRINSICS, times), height=4 * times, width=6 * times)
+    parts = pixel_rays(upsample_intrinsics(INTRINSICS, times), height=4 * times, width=6 * times)
     means = parts.reshape(4, times, 6, times, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(means, coarse, atol=1e-12)
 
 
 def test_a_quarter_turn_takes_x_to_y():
-    np.testing.assert_allclose(turned(np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(rotation_z(np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
 
 
 def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_up_above():

@@ -14,7 +14,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import finer, look_at, pixel_rays, transform
+from egosim_jax.geometry import look_at, pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.reference import draw_hands, render
@@ -187,7 +187,7 @@ def _first_view(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
     """Render the first frame without hands, and unproject a finer rendering of it to points."""
     caster, pose = RayCaster(scene.placed()), cameras.world_from_camera[0]
     first = _render(caster, pose, cameras)
-    intrinsics = finer(cameras.intrinsics_px, POINTS_PER_PIXEL)
+    intrinsics = upsample_intrinsics(cameras.intrinsics_px, POINTS_PER_PIXEL)
     height, width = POINTS_PER_PIXEL * cameras.height, POINTS_PER_PIXEL * cameras.width
     fine = caster.render(pose, intrinsics, height=height, width=width)
     seen = np.isfinite(fine.depth_m)

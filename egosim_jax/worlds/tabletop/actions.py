@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.geometry import turned
+from egosim_jax.geometry import rotation_z
 from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Body, Part
 from egosim_jax.worlds.tabletop.hands import Side, closure_for, hand_meshes, joints_of, pinch
@@ -47,7 +47,9 @@ class Grip:
     def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Return joints in the world, and the unit vector of the back of the hand."""
         cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
-        rotation = turned(self.yaw) @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
+        rotation = rotation_z(self.yaw) @ np.array(
+            [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
+        )
         local = joints_of(kind, self.closure, side)
         return (local - pinch(local)[0]) @ rotation.T + self.point_m, rotation[:, 2]
 
@@ -250,7 +252,7 @@ def act(
 
 def _carry(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
     """Return the pose at `grip` of a body that was grasped at `grasp`."""
-    turn = turned(grip.yaw - grasp.yaw)
+    turn = rotation_z(grip.yaw - grasp.yaw)
     pose = np.eye(4)
     pose[:3, :3] = turn @ world_from_body[:3, :3]
     pose[:3, 3] = turn @ (world_from_body[:3, 3] - grasp.point_m) + grip.point_m

@@ -14,7 +14,7 @@ import numpy as np
 from einops import rearrange, reduce
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from egosim_jax.geometry import finer, pixel_rays, transform
+from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
 
@@ -105,7 +105,7 @@ class RayCaster:
     def _colors(
         self, pose: np.ndarray, intrinsics_px: np.ndarray, height: int, width: int
     ) -> UInt8[np.ndarray, "h w 3"]:
-        split = finer(intrinsics_px, RAYS)
+        split = upsample_intrinsics(intrinsics_px, RAYS)
         rays = _world_rays(pose, split, height=RAYS * height, width=RAYS * width)
         hits = self._cast(pose, rays)
         sky = ~np.isfinite(hits["t_hit"])

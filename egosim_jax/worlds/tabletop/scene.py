@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.geometry import turned
+from egosim_jax.geometry import rotation_z
 from egosim_jax.worlds.tabletop.bodies import (
     COLORS,
     LOOSE,
@@ -171,7 +171,7 @@ def _scatter(rng: np.random.Generator) -> Scene:
             continue
         pose = np.eye(4)
         if not body.articulated:
-            pose[:3, :3] = turned(rng.uniform(-np.pi, np.pi))
+            pose[:3, :3] = rotation_z(rng.uniform(-np.pi, np.pi))
         pose[:2, 3] = place
         scene = replace(
             scene,

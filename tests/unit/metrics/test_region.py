@@ -1,9 +1,10 @@
-"""Silhouettes and places by color, against what is known."""
+"""Silhouettes and positions by color, against known ones."""
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from egosim_jax.metrics.region import centroid_errors, label, opened, region_psnr, silhouette_iou
+from egosim_jax.metrics.region import centroid_errors, label, open_mask, region_psnr, silhouette_iou
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
@@ -14,7 +15,7 @@ def discs(*centers, radius=4):
     return np.stack([np.hypot(rows - y, columns - x) <= radius for y, x in centers])
 
 
-def test_a_pixel_shows_what_comes_nearest_to_its_color_in_some_light():
+def test_a_pixel_has_the_label_of_the_nearest_color_under_some_light():
     paints = {3: (200, 40, 40), 7: (40, 40, 200)}
     rng = np.random.default_rng(0)
     video, background = rng.integers(0, 256, (2, 1, 8, 8, 3), dtype=np.uint8)
@@ -57,7 +58,16 @@ def test_opening_removes_lines_and_specks_and_keeps_squares_and_the_border():
     mask[0, :2, 12:] = True
     kept = np.zeros_like(mask)
     kept[0, 3:6, 4:7] = kept[0, :2, 12:] = True
-    np.testing.assert_array_equal(opened(mask), kept)
+    np.testing.assert_array_equal(open_mask(mask), kept)
+
+
+@pytest.mark.parametrize("density", [0.4, 0.7, 0.95])
+def test_opening_of_random_masks_is_that_of_scipy(density):
+    masks = np.random.default_rng(0).random((20, 17, 23)) < density
+    square = np.ones((3, 3), bool)
+    eroded = [ndimage.binary_erosion(mask, square, border_value=True) for mask in masks]
+    expected = [ndimage.binary_dilation(mask, square) for mask in eroded]
+    np.testing.assert_array_equal(open_mask(masks), expected)
 
 
 def test_the_distance_of_centroids_leaves_stray_pixels_out():
@@ -68,7 +78,7 @@ def test_the_distance_of_centroids_leaves_stray_pixels_out():
 
 
 @pytest.mark.parametrize(("kind", "least"), [("human", 0.85), ("robot", 0.75)])
-def test_the_measures_find_hands_and_things_in_the_truth_itself(kind, least):
+def test_the_metrics_find_hands_and_objects_in_the_ground_truth(kind, least):
     """Less well those of a gray gripper over a table of slate."""
     spec = VideoSpec(frames=5, height=96, width=160)
     for seed in (100, 101, 102):
@@ -78,5 +88,5 @@ def test_the_measures_find_hands_and_things_in_the_truth_itself(kind, least):
         target = clip.body_ids[clip.target]
         movers = {n: c for n, c in clip.paints.items() if n == target or n >= FIRST_HAND}
         seen = label(clip.frames, bare.frames, movers)
-        assert silhouette_iou(opened(seen >= FIRST_HAND), clip.ids >= FIRST_HAND) > least
+        assert silhouette_iou(open_mask(seen >= FIRST_HAND), clip.ids >= FIRST_HAND) > least
         assert centroid_errors(seen == target, clip.ids == target).max() < 2

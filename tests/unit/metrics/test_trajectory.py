@@ -1,10 +1,10 @@
-"""Where a video was seen from, for true frames taken for one another."""
+"""Estimated cameras, for ground-truth frames taken for one another."""
 
 import numpy as np
 import pytest
 
 from egosim_jax.geometry import look_at
-from egosim_jax.metrics.trajectory import camera_errors, seen_from
+from egosim_jax.metrics.trajectory import camera_errors, estimate_cameras
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
@@ -43,25 +43,27 @@ def still(clip):
     return ~((clip.ids >= FIRST_HAND) | (clip.ids == clip.body_ids[clip.target]))
 
 
-def test_the_true_video_was_seen_from_the_true_cameras(clip):
-    found = seen_from(clip.frames, clip.frames, clip.depth_m, still(clip), clip.cameras)
+def test_the_ground_truth_has_its_own_cameras(clip):
+    found = estimate_cameras(clip.frames, clip.frames, clip.depth_m, still(clip), clip.cameras)
     meters, degrees = camera_errors(found, clip.cameras.world_from_camera)
     assert meters < 1e-6
     assert degrees < 1e-4
 
 
-def test_a_video_from_elsewhere_was_seen_from_there(clip):
+def test_a_video_from_elsewhere_has_the_cameras_there(clip):
     """Each frame is taken for the one after it."""
     late = np.concatenate([clip.frames[1:], clip.frames[-1:]])
     truth = clip.cameras.world_from_camera
-    found = seen_from(late, clip.frames, clip.depth_m, still(clip), clip.cameras)[:-1]
+    found = estimate_cameras(late, clip.frames, clip.depth_m, still(clip), clip.cameras)[:-1]
     moved, _ = camera_errors(truth[1:], truth[:-1])
     off, _ = camera_errors(found, truth[1:])
     assert off < 2 / 3 * moved
     assert moved > 0.01
 
 
-def test_a_video_without_features_was_seen_from_nowhere(clip):
+def test_a_video_without_features_has_no_cameras(clip):
     gray = np.full_like(clip.frames, 128)
-    found = seen_from(clip.frames, gray, clip.depth_m, np.zeros_like(still(clip)), clip.cameras)
+    found = estimate_cameras(
+        clip.frames, gray, clip.depth_m, np.zeros_like(still(clip)), clip.cameras
+    )
     assert np.isnan(found).all()

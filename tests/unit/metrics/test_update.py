@@ -1,9 +1,9 @@
-"""What became of a thing's points is measured against its true surface."""
+"""Points of an object after an update, against its ground-truth surface."""
 
 import numpy as np
 import pytest
 
-from egosim_jax.metrics.update import both_ways, distance_to_mesh, nearest, thing_accuracy
+from egosim_jax.metrics.update import distance_to_mesh, nearest, object_accuracy, symmetric_distance
 from egosim_jax.worlds.tabletop.bodies import box
 
 AT = np.array([0.3, 0.0, 0.0])
@@ -22,27 +22,27 @@ def cube_at(place):
 
 def judged(after):
     before = top().astype(np.float32)
-    return thing_accuracy(
+    return object_accuracy(
         before, after.astype(np.float32), surface=cube_at(AT), seen_m=top(0.003) + AT
     )
 
 
-def test_a_thing_that_moved_whole_is_accurate_and_complete_and_leaves_nothing():
+def test_an_object_that_moved_completely_is_accurate_and_complete():
     found = judged(top() + AT)
-    assert (found.accurate, found.complete, found.left) == (100, 100, 0)
+    assert (found.accurate, found.complete, found.ghost) == (100, 100, 0)
 
 
-def test_a_ghost_is_inaccurate_and_left():
+def test_a_ghost_is_inaccurate_and_remains():
     found = judged(top())
-    assert (found.accurate, found.complete, found.left) == (0, 0, 100)
+    assert (found.accurate, found.complete, found.ghost) == (0, 0, 100)
 
 
 def test_a_copy_is_half_accurate():
     found = judged(np.concatenate([top(), top() + AT]))
-    assert (found.accurate, found.complete, found.left) == (50, 100, 100)
+    assert (found.accurate, found.complete, found.ghost) == (50, 100, 100)
 
 
-def test_half_a_thing_is_half_complete():
+def test_half_an_object_is_half_complete():
     points = top() + AT
     found = judged(points[points[:, 0] < AT[0]])
     assert found.accurate == 100
@@ -54,9 +54,9 @@ def test_a_centimeter_is_the_limit(off):
     assert judged(top() + AT + [0, 0, off]).accurate == (100 if off < 0.01 else 0)
 
 
-def test_a_thing_that_is_gone_is_neither():
+def test_an_object_without_points_is_neither():
     found = judged(np.zeros((0, 3)))
-    assert (found.accurate, found.complete, found.left) == (0, 0, 0)
+    assert (found.accurate, found.complete, found.ghost) == (0, 0, 0)
 
 
 def test_distances_are_those_to_the_surface_inside_and_outside():
@@ -65,11 +65,11 @@ def test_distances_are_those_to_the_surface_inside_and_outside():
     np.testing.assert_allclose(distance_to_mesh(points, cube_at([0, 0, 0])), expected, atol=1e-6)
 
 
-def test_both_ways_sees_what_one_of_the_two_lacks():
+def test_the_symmetric_distance_sees_what_one_side_lacks():
     some = top()
-    assert both_ways(some, some) == 0
-    assert both_ways(some, some + [0, 0, 0.002]) == pytest.approx(0.002)
+    assert symmetric_distance(some, some) == 0
+    assert symmetric_distance(some, some + [0, 0, 0.002]) == pytest.approx(0.002)
     more = np.concatenate([some, some + AT])
-    assert both_ways(some, more) == both_ways(more, some) > 0.1
-    assert both_ways(some, some[:0]) == np.inf
+    assert symmetric_distance(some, more) == symmetric_distance(more, some) > 0.1
+    assert symmetric_distance(some, some[:0]) == np.inf
     assert np.isinf(nearest(some, some[:0])).all()

@@ -1,4 +1,4 @@
-"""Classical perception of true frames: what was carried, where it ended, what came to light."""
+"""Classical perception of ground-truth frames: moved objects, their ends, revealed surfaces."""
 
 from dataclasses import replace
 
@@ -44,14 +44,14 @@ def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
     assert np.linalg.norm(there.mean(axis=0) - points.mean(axis=0)) > 0.1
 
 
-def test_where_it_stood_the_table_comes_to_light(clip, found):
+def test_the_table_under_a_moved_object_is_revealed(clip, found):
     bared = np.isfinite(found.depth_m[-1]) & (found.object_ids[-1] == 0)
     assert bared.any()
     truth = clip.depth_m[-1][bared]
     assert np.median(np.abs(found.depth_m[-1][bared] - truth)) < 0.005
 
 
-def test_what_agrees_with_the_state_stays_unknown(clip, found):
+def test_depth_that_agrees_with_the_state_stays_unknown(clip, found):
     assert np.isfinite(found.depth_m).mean() < 0.1
 
 
@@ -83,11 +83,11 @@ def test_without_hands_nothing_is_found(clip):
     assert not np.isfinite(found.depth_m).any()
 
 
-def test_of_two_hands_on_one_thing_one_moved_it(clip, found):
-    """A second hand beside the first, that goes with it."""
+def test_of_two_hands_on_one_object_one_moved_it(clip, found):
+    """A second hand next to the first, with the same motion."""
     action = to_action(clip)
-    beside = action.joints_m + [0.02, 0, 0]
-    both = replace(action, joints_m=np.concatenate([beside, action.joints_m], axis=1))
+    second = action.joints_m + [0.02, 0, 0]
+    both = replace(action, joints_m=np.concatenate([second, action.joints_m], axis=1))
     twice = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), both, clip.state)
     assert twice.world_from_object.keys() == found.world_from_object.keys()
     target = clip.body_ids[clip.target]

@@ -1,4 +1,4 @@
-"""Artifacts in the official layout, written here by hand, come back as what they say."""
+"""Artifacts in the official layout are read back with their values."""
 
 import zipfile
 from pathlib import Path
@@ -50,7 +50,7 @@ def asked(step=0):
 
 
 def write(folder: Path, *, scale=1.0, frames=FRAMES, depth=0.5):
-    """What a reconstruction in coordinates and units of its own would have left."""
+    """Write the files of a reconstruction in its own coordinates and units."""
     for kind in ("pose", "intrinsics", "depth", "mask"):
         (folder / kind).mkdir(exist_ok=True)
     there = path()
@@ -86,7 +86,7 @@ def test_cameras_and_depth_come_into_the_world(tmp_path, alignment, scale):
     np.testing.assert_allclose(found.depth_m[:, 1:], 0.5, rtol=1e-3)
 
 
-def test_hands_are_negative_and_things_have_numbers_of_their_step(tmp_path):
+def test_hands_are_negative_and_objects_have_ids_of_their_step(tmp_path):
     write(tmp_path)
     found = RecordedConfig(folder=tmp_path, name="clip").build()(*asked(step=2))
     assert (found.object_ids[:, 2] == 3 * IDS_PER_STEP + 1).all()
@@ -110,7 +110,7 @@ def test_each_file_is_read_once(tmp_path, monkeypatch):
     assert len(opened) == len(set(opened)) == 5
 
 
-def test_what_is_missing_or_damaged_is_named(tmp_path):
+def test_missing_or_damaged_files_are_named(tmp_path):
     write(tmp_path)
     read = RecordedConfig(folder=tmp_path, name="clip").build()
     (tmp_path / "depth" / "clip.zip").write_bytes(b"not an archive")
@@ -156,10 +156,10 @@ def test_every_damaged_archive_of_pictures_is_refused_in_one_line(tmp_path, kind
         return getattr(pipeline(*asked()), field)
 
     path = tmp_path / kind / "clip.zip"
-    whole = path.read_bytes()
+    data = path.read_bytes()
     want = read()
     for _ in range(150):
-        path.write_bytes(random.choice(BYTES)(whole, random))
+        path.write_bytes(random.choice(BYTES)(data, random))
         messages = []
         try:
             np.testing.assert_array_equal(read(), want)

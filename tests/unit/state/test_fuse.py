@@ -74,7 +74,7 @@ HERE, THERE = np.array([-0.12, -0.04]), np.array([0.06, -0.04])
 
 
 def path():
-    """The plate slides over in the middle frames and lies still at the end."""
+    """The plate slides over in the middle frames and rests at the end."""
     shares = np.array([0, 0, 0.5, 1, 1, 1])
     poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
     poses[:, :2, 3] = shares[:, None] * (THERE - HERE)
@@ -82,7 +82,7 @@ def path():
 
 
 def at(state, corner, *, lower=0.0):
-    """How many points lie at the plate's height over a place."""
+    """Count the points at the plate's height over a place."""
     places = state.points_m[:, :2] - corner
     on = ((places >= lower) & (places <= 0.08 - lower)).all(axis=1)
     return int((on & (np.abs(state.points_m[:, 2] - PLATE_M) < 0.01)).sum())
@@ -93,7 +93,7 @@ def tracked(step=1):
     return perceived(plates, step=step, world_from_object={1: poses})
 
 
-def test_a_tracked_thing_is_at_its_new_place_alone():
+def test_a_tracked_object_is_at_its_new_place_alone():
     state = fuse(start(), tracked(), fusion=COARSE)
     assert at(start(), HERE) > 100
     assert at(state, HERE) == 0
@@ -103,7 +103,7 @@ def test_a_tracked_thing_is_at_its_new_place_alone():
     assert (np.abs(own[:, :2] - THERE - 0.04).max(axis=1) < 0.046).all()
 
 
-def test_where_it_lay_the_table_is_now_known():
+def test_the_table_under_a_moved_object_becomes_known():
     state = fuse(start(), tracked(), fusion=COARSE)
 
     def table_under_plate(state):
@@ -127,7 +127,7 @@ def test_what_was_seen_keeps_its_colors_and_what_is_new_has_those_of_the_clip():
     state = fuse(start(), drifted, fusion=COARSE)
     plate, table = state.object_ids == 1, state.object_ids == 0
     np.testing.assert_array_equal(state.colors[plate], np.tile([200, 30, 30], (plate.sum(), 1)))
-    # The table where the plate lay had not been seen before.
+    # The table under the plate had not been seen before.
     places = state.points_m[:, :2] - HERE
     bared = table & ((places > 0.02) & (places < 0.06)).all(axis=1)
     np.testing.assert_array_equal(state.colors[bared], np.tile([135, 145, 165], (bared.sum(), 1)))
@@ -137,7 +137,7 @@ def test_what_was_seen_keeps_its_colors_and_what_is_new_has_those_of_the_clip():
     assert painted.mean() > 0.95
 
 
-def test_a_thing_comes_back_by_the_way_it_went():
+def test_an_object_comes_back_by_the_way_it_went():
     poses, plates = path()
     there = fuse(start(), tracked(), fusion=COARSE)
     back = perceived(plates[::-1], step=2, world_from_object={1: poses[::-1]})
@@ -164,7 +164,7 @@ def test_its_back_that_no_frame_shows_moves_with_it():
     assert state.last_seen[row] == 0
 
 
-def test_a_thing_that_moved_unseen_leaves_no_ghost():
+def test_an_object_that_moved_untracked_leaves_no_ghost_points():
     """It was interacted with and not tracked: it is where it was seen last."""
     _, plates = path()
     interacted = np.array([False, True, True, True, False, False])
@@ -173,7 +173,7 @@ def test_a_thing_that_moved_unseen_leaves_no_ghost():
     assert at(state, THERE) > 100
 
 
-def test_a_thing_that_was_carried_away_is_gone():
+def test_an_object_that_was_carried_away_has_disappeared():
     plates = [HERE, HERE, None, None, None, None]
     interacted = np.array([False, True, True, False, False, False])
     state = fuse(start(), perceived(plates, interacted_frames={1: interacted}), fusion=COARSE)
@@ -181,7 +181,7 @@ def test_a_thing_that_was_carried_away_is_gone():
     assert not (state.object_ids == 1).any()
 
 
-def test_what_nobody_touched_and_nobody_looked_through_stays():
+def test_an_object_without_interaction_that_no_frame_sees_through_stays():
     plates = [HERE, HERE, HERE, None, None, None]
     hidden = perceived(plates)
     depth, ids = hidden.depth_m.copy(), hidden.object_ids.copy()
@@ -199,7 +199,7 @@ def test_hands_never_enter_the_state():
     assert (state.object_ids >= 0).all()
 
 
-def test_a_thing_that_leaves_the_view_is_where_it_was_carried():
+def test_an_object_that_leaves_the_view_is_where_it_was_carried():
     shares, aside = np.array([0, 0.2, 0.5, 1, 1, 1]), np.array([0.9, 0])
     poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
     poses[:, :2, 3] = shares[:, None] * aside
@@ -210,8 +210,8 @@ def test_a_thing_that_leaves_the_view_is_where_it_was_carried():
 
 
 @pytest.mark.parametrize("how", ["tracked", "interacted", "neither"])
-def test_an_empty_mask_where_depth_sees_through_takes_the_thing_away(how):
-    """No pixel is the thing's, and the table is seen where it was and where it should be now."""
+def test_an_empty_mask_where_depth_sees_through_removes_the_object(how):
+    """No pixel is the object's, and the table is seen where it was and where it should be now."""
     poses, _ = path()
     moved = {
         "tracked": {"world_from_object": {1: poses}},

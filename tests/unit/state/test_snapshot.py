@@ -1,4 +1,4 @@
-"""States on disk: what is read is what was written, and damage is named."""
+"""States read back equal what was written, and damaged files are refused by name."""
 
 import json
 from dataclasses import replace
@@ -26,7 +26,7 @@ def state(count=50):
     )
 
 
-def test_what_is_read_is_what_was_written(tmp_path):
+def test_a_state_that_is_read_equals_the_one_written(tmp_path):
     save(tmp_path / "state", state())
     again = load(tmp_path / "state")
     assert fingerprint(again) == fingerprint(state())
@@ -41,7 +41,7 @@ def test_what_is_read_is_what_was_written(tmp_path):
     np.testing.assert_array_equal(again.world_from_object[2], np.diag([-1.0, -1, 1, 1]))
 
 
-def test_a_state_is_replaced_as_a_whole(tmp_path):
+def test_a_state_is_replaced_atomically(tmp_path):
     save(tmp_path / "state", state(50))
     save(tmp_path / "state", state(20))
     assert len(load(tmp_path / "state").points_m) == 20
@@ -75,7 +75,7 @@ def test_another_version_is_named(tmp_path):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "version": 4}))
-    with pytest.raises(InputError, match=r"of version 4; this program reads versions \(1, 2, 3\)"):
+    with pytest.raises(InputError, match=r"has version 4; readable versions are \(1, 2, 3\)"):
         load(tmp_path / "state")
 
 
@@ -103,7 +103,7 @@ def test_a_changed_description_is_named(tmp_path, change):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(InputError, match="no state that can be read"):
+    with pytest.raises(InputError, match="not a readable state"):
         load(tmp_path / "state")
 
 
@@ -134,13 +134,13 @@ def test_a_save_that_fails_leaves_the_older_state(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1}'])
-def test_what_is_no_state_is_named(tmp_path, text):
+def test_files_that_are_not_a_state_are_named(tmp_path, text):
     (tmp_path / "state.json").write_text(text)
-    with pytest.raises(InputError, match="no state that can be read"):
+    with pytest.raises(InputError, match="not a readable state"):
         load(tmp_path)
 
 
-def test_ply_keeps_places_colors_and_ids(tmp_path):
+def test_ply_keeps_positions_colors_and_ids(tmp_path):
     write_ply(tmp_path / "a.ply", state())
     again = read_ply(tmp_path / "a.ply", state())
     for name in ("points_m", "colors", "object_ids", "last_seen"):
@@ -148,7 +148,7 @@ def test_ply_keeps_places_colors_and_ids(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_a_ply_of_another_program_needs_only_places_and_colors(tmp_path):
+def test_a_ply_of_another_program_needs_only_positions_and_colors(tmp_path):
     text = (
         "ply\nformat ascii 1.0\nelement vertex 2\n"
         + "".join(f"property float {c}\n" for c in "xyz")
@@ -169,7 +169,7 @@ def test_a_ply_without_colors_or_a_missing_one_is_named(tmp_path):
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         "property float z\nend_header\n0 1 2\n"
     )
-    with pytest.raises(InputError, match="no points with colors: property red"):
+    with pytest.raises(InputError, match="no colored points: missing property red"):
         read_ply(tmp_path / "c.ply")
 
 
@@ -180,7 +180,7 @@ def test_a_ply_without_colors_or_a_missing_one_is_named(tmp_path):
         ({"points_m": np.full((50, 3), np.nan, np.float32)}, "Point 0 of the state is not finite"),
     ],
 )
-def test_points_that_make_no_state_are_refused(change, message):
+def test_points_that_are_not_a_valid_state_are_refused(change, message):
     with pytest.raises(InputError, match=message):
         replace(state(), **change)
 

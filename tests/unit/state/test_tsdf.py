@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from egosim_jax.geometry import look_at, pixel_rays
-from egosim_jax.state.tsdf import Fusion, steady, surface
+from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
 from egosim_jax.types import Cameras, InputError
 
 HEIGHT, WIDTH = 120, 200
@@ -78,7 +79,7 @@ def to_box(points):
 def test_points_lie_within_half_a_voxel_of_the_true_surface(depth, distance):
     path = cameras()
     depths = np.stack([depth(*rays(path, k)) for k in range(9)]).astype(np.float32)
-    depths = np.where(steady(depths), depths, 0)
+    depths = np.where(valid_depth_mask(depths), depths, 0)
     colors = np.full((9, HEIGHT, WIDTH, 3), (10, 200, 77), np.uint8)
     points, shades = surface(depths, colors, path, fusion=Fusion())
     assert len(points) > 5000
@@ -107,11 +108,24 @@ def test_unknown_and_far_depths_leave_no_points():
         assert points.shape == shades.shape == (0, 3)
 
 
-def test_depth_is_not_steady_at_an_edge_nor_next_to_the_unknown():
-    depth = np.full((12, 20), 1.0, np.float32)
-    depth[:, 10:] = 0.8
-    depth[5, 3] = np.nan
-    found = steady(depth)
+@pytest.mark.parametrize("unknown", [0.0, np.inf, np.nan, -1.0])
+def test_valid_depth_of_random_images_is_that_of_scipys_filters(unknown):
+    rng = np.random.default_rng(0)
+    depth = rng.normal(1, 0.025, (9, 23, 31)).astype(np.float32)
+    known = rng.random(depth.shape) < 0.97
+    depth[~known] = unknown
+    near = ndimage.minimum_filter(np.where(known, depth, np.inf), (1, 5, 5), mode="nearest")
+    far = ndimage.maximum_filter(np.where(known, depth, 0), (1, 5, 5), mode="nearest")
+    valid = known & (far - near < 0.1 * np.where(known, depth, 1))
+    assert 0.1 < valid.mean() < 0.9
+    np.testing.assert_array_equal(valid_depth_mask(depth), valid)
+
+
+def test_depth_is_invalid_at_an_edge_and_next_to_unknown_depth():
+    depth = np.full((1, 12, 20), 1.0, np.float32)
+    depth[0, :, 10:] = 0.8
+    depth[0, 5, 3] = np.nan
+    (found,) = valid_depth_mask(depth)
     assert not found[:, 8:12].any()
     assert not found[5, 3]
     assert found[:3, :7].all()
@@ -122,5 +136,5 @@ def test_depth_is_not_steady_at_an_edge_nor_next_to_the_unknown():
     "sizes", [{"voxel_m": 0.0}, {"truncation_m": 0.001}, {"max_depth_m": -1.0}]
 )
 def test_sizes_that_make_no_surface_are_refused(sizes):
-    with pytest.raises(InputError, match="make no surface"):
+    with pytest.raises(InputError, match="Invalid fusion parameters"):
         Fusion(**sizes)
