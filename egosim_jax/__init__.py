@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
 
+    from egosim_jax.conditioning.condition import Condition
     from egosim_jax.configs import get as get_config
     from egosim_jax.data.clips import load_triplet
     from egosim_jax.data.metadata import read_metadata
     from egosim_jax.generator import Generator
     from egosim_jax.networks import ModelConfig, Networks
-    from egosim_jax.types import Clip, Condition, InputError, Triplet, VideoSpec
+    from egosim_jax.types import Clip, InputError, Triplet, VideoSpec
 
 __all__ = [
     "Clip",
@@ -35,15 +36,13 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Condition": ("conditioning.condition", "Condition"),
     "get_config": ("configs", "get"),
     "load_triplet": ("data.clips", "load_triplet"),
     "read_metadata": ("data.metadata", "read_metadata"),
     "Generator": ("generator", "Generator"),
     **{name: ("networks", name) for name in ("ModelConfig", "Networks")},
-    **{
-        name: ("types", name)
-        for name in ("Clip", "Condition", "InputError", "Triplet", "VideoSpec")
-    },
+    **{name: ("types", name) for name in ("Clip", "InputError", "Triplet", "VideoSpec")},
 }
 
 

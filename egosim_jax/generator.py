@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, no_type_check
+from typing import Any, TypeVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,8 @@ from flax import nnx
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from egosim_jax.conditioning import condition_channels, pack_mask
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import Condition
+from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.image import clip_pixels
 from egosim_jax.conditioning.video import to_model, to_uint8
 from egosim_jax.diffusion.process import DenoiseFn
@@ -39,7 +39,6 @@ from egosim_jax.rendering import Renderer, jitted
 from egosim_jax.types import (
     Action,
     Clip,
-    Condition,
     InputError,
     Triplet,
     View,
@@ -56,9 +55,9 @@ T = TypeVar("T")
 class Inputs:
     """A batch of triplets as arrays."""
 
-    prior: UInt8[Any, "b f h w 3"]
-    hands: UInt8[Any, "b f h w 3"]
-    mask: UInt8[Any, "b lf lh lw 4"]
+    prior: UInt8[Any, "b f h w 3"] | None
+    hands: UInt8[Any, "b f h w 3"] | None
+    mask: UInt8[Any, "b lf lh lw m"] | None
     ids: Int[Any, "b n"]
     ids_mask: Bool[Any, "b n"]
     pixels: Float[Any, "b s s 3"] | None
@@ -66,11 +65,12 @@ class Inputs:
     @classmethod
     def of(cls, triplets: Sequence[Triplet], config: ModelConfig) -> Inputs:
         """Tokenize the prompts, pack the masks and prepare the image for CLIP."""
-        tokens = config.tokenizer.tokenize([t.prompt for t in triplets])
+        tokens, layout = config.tokenizer.tokenize([t.prompt for t in triplets]), config.layout
+        masks = [layout.pack_mask(t.mask, config.grid) for t in triplets if "mask" in layout]
         return cls(
-            prior=np.stack([t.prior for t in triplets]),
-            hands=np.stack([t.hands for t in triplets]),
-            mask=np.stack([pack_mask(t.mask) for t in triplets]),
+            prior=np.stack([t.prior for t in triplets]) if "prior" in layout else None,
+            hands=np.stack([t.hands for t in triplets]) if "hands" in layout else None,
+            mask=np.stack(masks) if "mask" in layout else None,
             ids=tokens.ids,
             ids_mask=tokens.mask,
             pixels=config.image
@@ -85,13 +85,14 @@ class Inputs:
     def shapes(cls, batch: int, config: ModelConfig) -> Inputs:
         """The shapes and dtypes of a batch, to compile for before there is one."""
         shape = lambda dtype, *sizes: jax.ShapeDtypeStruct((batch, *sizes), dtype)  # noqa: E731
-        video, tokens = config.video, config.tokenizer.max_tokens
+        video, tokens, layout = config.video, config.tokenizer.max_tokens, config.layout
         frames = shape(np.uint8, video.frames, video.height, video.width, 3)
         size = config.image and config.image.image_size
+        mask = shape(np.uint8, *config.latent_shape, layout.count("mask"))
         return cls(
-            prior=frames,
-            hands=frames,
-            mask=shape(np.uint8, *video.latent_shape, 4),
+            prior=frames if "prior" in layout else None,
+            hands=frames if "hands" in layout else None,
+            mask=mask if "mask" in layout else None,
             ids=shape(np.int32, tokens),
             ids_mask=shape(np.bool_, tokens),
             pixels=size and shape(np.float32, size, size, 3),
@@ -100,10 +101,14 @@ class Inputs:
 
 def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
     """Run the frozen parts: videos to latents, prompt and image to tokens."""
+
+    def encode(video: Array | None) -> Array | None:
+        return None if video is None else networks.vae.encode(to_model(video))
+
     return Condition(
-        mask=inputs.mask.astype(jnp.float32),
-        prior=networks.vae.encode(to_model(inputs.prior)),
-        hands=networks.vae.encode(to_model(inputs.hands)),
+        mask=None if inputs.mask is None else inputs.mask.astype(jnp.float32),
+        prior=encode(inputs.prior),
+        hands=encode(inputs.hands),
         text=gathered(networks.text)(inputs.ids, inputs.ids_mask),
         image=None
         if networks.image is None or inputs.pixels is None
@@ -112,10 +117,10 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
 
 
 def denoise(
-    dit: Denoiser, condition: Condition, noise: Float[Array, "b f h w 16"], config: ModelConfig
-) -> Float[Array, "b f h w 16"]:
+    dit: Denoiser, condition: Condition, noise: Float[Array, "b f h w z"], config: ModelConfig
+) -> Float[Array, "b f h w z"]:
     """Walk from noise to latents; the unconditional branch knows no text."""
-    channels = condition_channels(condition)
+    channels = config.layout.condition_channels(condition, noise)
 
     def branch(text: Array) -> DenoiseFn:
         context = dit.prepare(channels, text, condition.image)
@@ -152,7 +157,7 @@ class Generator:
         self._latents = Program(
             lambda vae, video: vae.encode(to_model(video)), networks.vae, mesh=mesh
         )
-        shape = (*config.video.latent_shape, config.vae.z_dim)
+        shape = (*config.latent_shape, config.vae.latent_channels)
         self._noise = Program(
             lambda _, seeds: jax.vmap(lambda seed: jax.random.normal(jax.random.key(seed), shape))(
                 seeds
@@ -195,7 +200,7 @@ class Generator:
         triplets: Sequence[Triplet],
         seeds: Sequence[int],
         *,
-        without: Literal["prior", "mask", "hands", "text"] | None = None,
+        without: ConditionName | None = None,
     ) -> list[Clip]:
         """One clip for each triplet, from the noise of its seed.
 
@@ -210,12 +215,12 @@ class Generator:
         triplets: Sequence[Triplet],
         seeds: Sequence[int],
         *,
-        without: Literal["prior", "mask", "hands", "text"] | None = None,
-    ) -> Float[Array, "b f h w 16"]:
+        without: ConditionName | None = None,
+    ) -> Float[Array, "b f h w z"]:
         """What `generate` decodes; it raises the same."""
         condition = self._encode(Inputs.of(triplets, self.config))
         if without is not None:
-            condition = ConditionDropout(**{without: 1.0}).apply(condition, jax.random.key(0))
+            condition = condition.drop(without)
         latents = self._denoise(condition, self.noise(seeds))
         bad = [
             triplet.video_id
@@ -268,11 +273,11 @@ class Generator:
         """The truth through the autoencoder and back: the best any denoiser could give."""
         return self._clips(self._latents(truths(triplets)))
 
-    def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w 16"]:
+    def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
         """The starting noise of each seed, of which the last 32 bits count."""
         return self._noise(np.array([seed & 0xFFFFFFFF for seed in seeds], np.uint32))
 
-    def _clips(self, latents: Float[Array, "b f h w 16"]) -> list[Clip]:
+    def _clips(self, latents: Float[Array, "b f h w z"]) -> list[Clip]:
         frames = np.asarray(self._decode(latents))
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from flax import nnx
 from jax.sharding import Mesh
 
+from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
@@ -22,7 +23,7 @@ from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, VideoGrid, VideoSpec
 
 Name = Literal["dit", "vae", "text", "image"]
 """Role of a network in a model, which is also the stem of its file of weights."""
@@ -45,6 +46,8 @@ class ModelConfig:
     """Config of the text encoder."""
     image: CLIPVisionConfig | None = field(default_factory=CLIPVisionConfig)
     """Config of the image encoder; None for models without the image branch."""
+    layout: ChannelLayout = field(default_factory=ChannelLayout)
+    """Input channels of the denoiser."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
     """Tokenizer of the prompts."""
     encoders: Literal["frozen", "joint"] = "frozen"
@@ -61,15 +64,45 @@ class ModelConfig:
     """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
 
     def __post_init__(self) -> None:
-        """Check that the networks fit each other."""
+        """Check that networks, input channels and video fit each other."""
+        dit, layout, latents = self.dit, self.layout, self.vae.latent_channels
         pairs = [
-            ("dit.text_dim", self.dit.text_dim, "text.dim", self.text.dim),
-            ("dit.out_channels", self.dit.out_channels, "vae.z_dim", self.vae.z_dim),
-            ("dit.image_dim", self.dit.image_dim, "image.dim", self.image and self.image.dim),
+            ("dit.text_dim", dit.text_dim, "text.dim", self.text.dim),
+            ("dit.out_channels", dit.out_channels, "vae.latent_channels", latents),
+            ("dit.image_dim", dit.image_dim, "image.dim", self.image and self.image.dim),
+            ("dit.in_channels", dit.in_channels, "layout.channels", layout.channels),
         ]
+        for part in ("noisy", "prior", "hands"):
+            if part in layout:
+                channels = layout.count(part)
+                pairs.append((f"layout {part}", channels, "vae.latent_channels", latents))
+        if "mask" in layout and layout.mask_packing == "time":
+            stride = self.vae.temporal_stride
+            pairs.append(("layout mask", layout.count("mask"), "vae.temporal_stride", stride))
         for left, a, right, b in pairs:
             if a != b:
                 raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+        self.grid.check(self.video)
+        frames, patch = self.latent_shape[0], dit.patch[0]
+        if frames % patch:
+            raise InputError(
+                f"{self.name}: {frames} latent frames do not divide into tokens of {patch}. Change "
+                "the number of frames. (video.frames, dit.patch)"
+            )
+
+    @property
+    def grid(self) -> VideoGrid:
+        """Latent grid of the model's videos."""
+        return VideoGrid(
+            temporal_stride=self.vae.temporal_stride,
+            spatial_stride=self.vae.spatial_stride,
+            patch=self.dit.patch[1],
+        )
+
+    @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Frames, rows and columns of a clip's latents."""
+        return self.grid.latent_shape(self.video)
 
     @property
     def networks(self) -> Mapping[Name, NetworkConfig]:

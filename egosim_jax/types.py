@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, no_type_check
+from typing import Literal, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
@@ -107,6 +107,57 @@ class VideoSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VideoGrid:
+    """Latent grid of a video: the strides of the codec and the patch of the denoiser.
+
+    The defaults are Wan 2.1's. They apply where no model is known, as to raw clips.
+    """
+
+    temporal_stride: int = 4
+    """Pixel frames per latent frame, after the first."""
+    spatial_stride: int = 8
+    """Pixels per latent cell, along each axis."""
+    patch: int = 2
+    """Latent cells per token, along each axis."""
+
+    def check_frames(
+        self, frames: int, *, what: str = "a video", fix: str = "--num-frames"
+    ) -> None:
+        """Raise `InputError` unless the codec can encode so many frames, 4k+1 for a stride of 4."""
+        stride = self.temporal_stride
+        if frames < 1 or frames % stride != 1 % stride:
+            below = max(1, (frames - 1) // stride * stride + 1)
+            raise InputError(
+                f"{what} of {frames} frames cannot be encoded: the video VAE needs {stride}k+1 "
+                f"frames. Nearest: {below} or {below + stride}. ({fix})"
+            )
+
+    def check_size(self, size: int, *, name: str) -> None:
+        """Raise `InputError` unless a number of rows or columns is a multiple of a token's."""
+        unit = self.spatial_stride * self.patch
+        if size < unit or size % unit:
+            raise InputError(
+                f"{name} {size} does not fit the model: it must be a multiple of {unit} "
+                f"({self.spatial_stride} pixels a latent cell, {self.patch} cells a token). "
+                f"Nearest: {max(unit, round(size / unit) * unit)}."
+            )
+
+    def check(self, video: VideoSpec) -> None:
+        """Raise `InputError` unless a video has a latent grid."""
+        self.check_frames(video.frames)
+        self.check_size(video.height, name="height")
+        self.check_size(video.width, name="width")
+
+    def latent_shape(self, video: VideoSpec) -> tuple[int, int, int]:
+        """Return frames, rows and columns of a video's latents."""
+        return (
+            (video.frames - 1) // self.temporal_stride + 1,
+            video.height // self.spatial_stride,
+            video.width // self.spatial_stride,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class MeshConfig:
     """Sizes of the mesh axes; their product is the number of devices. One of them may be -1: it
     takes all devices that are left."""
@@ -180,23 +231,6 @@ class Triplet:
     """The video that was really recorded."""
     extra: Mapping[str, str] = field(default_factory=dict)
     """Further metadata columns, carried to the results."""
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Condition:
-    """What the denoiser is told, for a batch; the same at every step. Latents are normalized."""
-
-    mask: Float[Any, "b f h w 4"]
-    """1 = generate, 0 = keep; the four channels are a 2 x 2 block of the mask (space to depth)."""
-    prior: Float[Any, "b f h w 16"]
-    """Latents of the rendered scene, not yet masked."""
-    hands: Float[Any, "b f h w 16"]
-    """Latents of the hand skeletons."""
-    text: Float[Any, "b n d"]
-    """Prompt embeddings, zero after the prompt's end."""
-    image: Float[Any, "b m e"] | None = None
-    """CLIP tokens of the first frame; None for models without the image branch."""
 
 
 @no_type_check

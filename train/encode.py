@@ -71,9 +71,12 @@ class Encoding:
 
 def _encode(encoders: Networks, inputs: Inputs, target: jax.Array) -> dict[str, jax.Array]:
     """Encode one video after the other: the VAE is compiled once and needs little memory."""
-    videos = jnp.stack([target, jnp.asarray(inputs.prior), jnp.asarray(inputs.hands)])
-    latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), videos)
-    arrays = {"target": latents[0], "prior": latents[1], "hands": latents[2]}
+    videos = {"target": target, "prior": inputs.prior, "hands": inputs.hands}
+    videos = {name: jnp.asarray(video) for name, video in videos.items() if video is not None}
+    latents = jax.lax.map(
+        lambda video: encoders.vae.encode(to_model(video)), jnp.stack([*videos.values()])
+    )
+    arrays = dict(zip(videos, latents, strict=True))
     if encoders.text is not None:
         arrays["text"] = encoders.text(inputs.ids, inputs.ids_mask)
     if encoders.image is not None and inputs.pixels is not None:

@@ -14,6 +14,11 @@ opposite of the Wan 2.1 inpainting models. For a mask video of the model's size:
 
 The release's continuous runner omits the padding of rule 3, so that its 61 frames are selected as
 floor(61 i / 16) = 0, 3, 7, 11, 15, 19, ...; `padding="none"` reproduces it.
+
+These are the rules of the packing `space` with a codec of strides 4 and 8. The others keep rules 1
+and 2 and take one pixel of each latent cell: `single` that of the same frame, in one channel, and
+`time` those of all pixel frames that the latent frame encodes, a channel each (Wan 2.1).
+`observed` looks at no pixel: all is 0.
 """
 
 from __future__ import annotations
@@ -24,28 +29,49 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import UInt8
 
-from egosim_jax.types import SPATIAL_STRIDE, TEMPORAL_STRIDE, InputError, check_frame_count
+from egosim_jax.types import InputError, VideoGrid
 
+Packing = Literal["space", "time", "single", "observed"]
+WAN = VideoGrid()
+"""Latent grid of Wan 2.1 and EgoSim."""
 HALF_WHITE = 127
 """The last gray level that is not above one half of 255."""
 
 
 def pack_mask(
-    frames: UInt8[np.ndarray, "f h w"], *, padding: Literal["to-4f+1", "none"] = "to-4f+1"
-) -> UInt8[np.ndarray, "lf lh lw 4"]:
-    """Mask channels, 0 or 1, of a gray mask video (255 = not observed) of 4k+1 frames."""
+    frames: UInt8[np.ndarray, "f h w"],
+    *,
+    packing: Packing = "space",
+    channels: int = 4,
+    grid: VideoGrid = WAN,
+    padding: Literal["to-4f+1", "none"] = "to-4f+1",
+) -> UInt8[np.ndarray, "lf lh lw {channels}"]:
+    """Return mask channels, 0 or 1, of a gray mask video (255 = not observed).
+
+    Raises `InputError` for a number of frames or a size without latent cells of the grid.
+    """
     count, height, width = frames.shape
-    check_frame_count(count, what="a mask video")
-    if height % SPATIAL_STRIDE or width % SPATIAL_STRIDE:
+    time, space = grid.temporal_stride, grid.spatial_stride
+    grid.check_frames(count, what="a mask video")
+    if height % space or width % space:
         raise InputError(
-            f"a mask of {height} x {width} pixels has no whole latent cells: both must be "
-            f"multiples of {SPATIAL_STRIDE}. Resize it to the model's size first."
+            f"a mask of {height} x {width} pixels does not divide into latent cells: both must be "
+            f"multiples of {space}. Resize it to the model's size first."
         )
-    latent_frames = (count - 1) // TEMPORAL_STRIDE + 1
-    source_frames = count if padding == "none" else TEMPORAL_STRIDE * latent_frames + 1
-    # The repeated frames themselves are never selected: 4 (f - 1) is the clip's last frame.
-    selected = np.arange(latent_frames) * source_frames // latent_frames
-    stride = SPATIAL_STRIDE // 2
-    generate = (frames[selected, ::stride, ::stride] > HALF_WHITE).astype(np.uint8)
-    generate[0] = 0
-    return rearrange(generate, "f (h dh) (w dw) -> f h w (dh dw)", dh=2, dw=2)
+    latent_frames = (count - 1) // time + 1
+    if packing == "observed":
+        return np.zeros((latent_frames, height // space, width // space, channels), np.uint8)
+    if packing == "time":
+        # The first latent frame encodes one pixel frame.
+        selected = np.maximum(0, np.arange(1 - time, count).reshape(latent_frames, time))
+        generate = frames[selected, ::space, ::space] > HALF_WHITE
+        generate = rearrange(generate, "f t h w -> f h w t")
+    else:
+        source_frames = count if padding == "none" else time * latent_frames + 1
+        # The repeated frames themselves are never selected: 4 (f - 1) is the clip's last frame.
+        selected = np.arange(latent_frames) * source_frames // latent_frames
+        side = 2 if packing == "space" else 1
+        generate = frames[selected, :: space // side, :: space // side] > HALF_WHITE
+        generate = rearrange(generate, "f (h i) (w j) -> f h w (i j)", i=side, j=side)
+    generate[0] = False
+    return generate.astype(np.uint8)

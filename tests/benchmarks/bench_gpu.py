@@ -124,7 +124,7 @@ def forward(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         config = _model(options, kernel, "none")
         graph, params = nnx.split(nnx.eval_shape(lambda c=config: WanDiT(c.dit, rngs=nnx.Rngs(0))))
         dit = config.dit
-        size = (*config.video.latent_shape, dit.in_channels)
+        size = (*config.latent_shape, dit.in_channels)
         shapes = (
             jax.ShapeDtypeStruct((options.clips, *size), jnp.bfloat16),
             jax.ShapeDtypeStruct((options.clips,), jnp.float32),
@@ -288,7 +288,7 @@ def _stage(model: ModelConfig, clips: int) -> Stage:
 
 def _forward_flops(config: ModelConfig) -> float:
     """Those of one clip."""
-    text, latents = config.tokenizer.max_tokens, config.video.latent_shape
+    text, latents = config.tokenizer.max_tokens, config.latent_shape
     return count_forward(config.dit, latents=latents, text=text, image=IMAGE).total
 
 

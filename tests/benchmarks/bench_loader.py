@@ -225,7 +225,7 @@ def make_videos(config: ModelConfig, folder: Path) -> Path:
 def make_latents(config: ModelConfig, folder: Path) -> Path:
     """Shards of random latents and encoders' inputs."""
     rng = np.random.default_rng(0)
-    shape, tokens = config.video.latent_shape, config.tokenizer.max_tokens
+    shape, tokens = config.latent_shape, config.tokenizer.max_tokens
     size = config.image.image_size
     out = folder / "latents"
     with ShardWriter(out, kind="latents", spec=config.video) as writer:

@@ -85,7 +85,7 @@ def main(pairs: int = 9, threads: int = THREADS) -> None:
 def make_batch(config: ModelConfig) -> Batch:
     """A cached batch of random numbers, with noise and noise levels."""
     rng = np.random.default_rng(0)
-    shape = (BATCH, *config.video.latent_shape)
+    shape = (BATCH, *config.latent_shape)
     videos = {
         name: rng.standard_normal((*shape, config.vae.z_dim), np.float32)
         for name in ("target", "prior", "hands", "noise")
@@ -113,7 +113,6 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     import jax.numpy as jnp
     from flax import nnx
 
-    from egosim_jax.conditioning import assemble
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
     from egosim_jax.io.weights import fill
     from egosim_jax.networks import Networks
@@ -129,7 +128,8 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
             condition = condition_of(networks, batch)
 
             def velocity(x: jax.Array, t: jax.Array) -> jax.Array:
-                return networks.dit(assemble(x, condition), t, condition.text, condition.image)
+                channels = config.layout.assemble(x, condition)
+                return networks.dit(channels, t, condition.text, condition.image)
 
             parts = (batch[name] for name in ("target", "noise", "sigma"))
             return self.objective.loss_at(config.process, velocity, *parts).mean(), {}

@@ -17,7 +17,6 @@ from transformers import CLIPVisionModel, UMT5EncoderModel
 from transformers import UMT5Config as TheirUMT5
 
 from egosim_jax import configs
-from egosim_jax.conditioning import condition_channels
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
@@ -164,7 +163,8 @@ def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, trip
     ours = jax.jit(lambda net, c, x: denoise(net, c, x, CONFIG))(converted.dit, condition, noise)
 
     text, image, _, mean, std = encoded_by_theirs(theirs, inputs)
-    channels = np.asarray(condition_channels(condition))[..., :20]  # mask and prior
+    channels = np.asarray(CONFIG.layout.condition_channels(condition, condition.prior))
+    channels = channels[..., :20]  # mask and prior
     channels = torch.tensor(rearrange(channels, "b f h w c -> b c f h w"))
     scheduler = FlowMatchEulerDiscreteScheduler(shift=CONFIG.process.shift)
     scheduler.set_timesteps(sigmas=np.linspace(1, 0, CONFIG.steps + 1)[:-1])

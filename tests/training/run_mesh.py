@@ -38,7 +38,7 @@ def batch(seed: int) -> dict[str, np.ndarray]:
     def draw(*shape: int) -> np.ndarray:
         return rng.normal(size=(BATCH, *shape)).astype(np.float32)
 
-    shape, dit = MODEL.video.latent_shape, MODEL.dit
+    shape, dit = MODEL.latent_shape, MODEL.dit
     return {
         **{name: draw(*shape, 16) for name in ("target", "prior", "hands")},
         "mask": rng.integers(0, 2, (BATCH, *shape, 4)).astype(np.uint8),

@@ -49,7 +49,7 @@ def training(steps: int, save_every: int) -> TrainConfig:
 def write_latents(folder: Path, records: int = 7) -> None:
     """Shards of random latents in the shapes that `MODEL` is trained on."""
     rng = np.random.default_rng(0)
-    shape, dit = MODEL.video.latent_shape, MODEL.dit
+    shape, dit = MODEL.latent_shape, MODEL.dit
     with ShardWriter(folder, kind="latents", spec=MODEL.video) as writer:
         for number in range(records):
             arrays = {

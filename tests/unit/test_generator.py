@@ -83,7 +83,7 @@ def test_a_seed_gives_its_clip_again_and_another_seed_another(generator, triplet
 def test_each_condition_changes_the_latents(networks, triplets):
     """Text, image, prior, hands and mask all reach the denoiser."""
     condition = Program(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
-    noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.video.latent_shape, 16))
+    noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.latent_shape, 16))
     run = jax.jit(lambda condition: denoise(networks.dit, condition, noise, CONFIG))
     full = run(condition)
     for name in ("mask", "prior", "hands", "text", "image"):
@@ -93,7 +93,7 @@ def test_each_condition_changes_the_latents(networks, triplets):
 
 def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, triplets):
     condition = Program(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
-    noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.video.latent_shape, 16))
+    noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.latent_shape, 16))
     one_step = dataclasses.replace(CONFIG, steps=1)
 
     def run(condition, scale: float) -> np.ndarray:
@@ -133,7 +133,7 @@ def test_a_weights_folder_comes_back_bit_for_bit(networks, tmp_path: Path):
 def test_weights_of_another_model_are_refused(networks, tmp_path: Path):
     networks.save(tmp_path)
     wider = dataclasses.replace(CONFIG, dit=dataclasses.replace(CONFIG.dit, ffn_dim=100))
-    with pytest.raises(InputError, match=r"blocks\.mlp\.up\.kernel: have .*, want .*100"):
+    with pytest.raises(InputError, match=r"blocks\.mlp\.up\.kernel: has shape .*; expected .*100"):
         Networks.load(wider, tmp_path)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.conditioning import condition_channels
+from egosim_jax.conditioning import Condition
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
@@ -25,7 +25,6 @@ from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.encode import example_shapes
 from egosim_jax.train.flops import count_forward
 from egosim_jax.train.update import Batch, Metrics
-from egosim_jax.types import Condition
 
 VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)
 """Noise levels at which the validation loss is measured."""
@@ -83,19 +82,16 @@ class Denoising:
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout."""
         condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
-        denoise, process, target = (
-            _denoise(networks, condition),
-            self.model.process,
-            batch["target"],
-        )
+        process, target = self.model.process, batch["target"]
+        denoise = _denoise(self.model, networks, condition, target)
         weights = loss_weights(target, batch["prior"], self.change_loss_weight)
         loss, _ = self.objective.loss(process, denoise, target, keys[:, 1], loss_weights=weights)
         return loss, {}
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return the errors at fixed noise levels with fixed noise, under the full condition."""
-        denoise = _denoise(networks, condition_of(networks, batch))
         target = batch["target"]
+        denoise = _denoise(self.model, networks, condition_of(networks, batch), target)
         noise = jax.random.normal(jax.random.key(0), target.shape)
         errors = {
             f"loss_{sigma}": self.objective.loss_at(
@@ -110,7 +106,7 @@ class Denoising:
         image = self.model.image
         forward = count_forward(
             self.model.dit,
-            latents=self.model.video.latent_shape,
+            latents=self.model.latent_shape,
             text=self.model.tokenizer.max_tokens,
             image=0 if image is None else 1 + (image.image_size // image.patch) ** 2,
         )
@@ -126,9 +122,9 @@ def condition_of(networks: Networks, batch: Batch) -> Condition:
     )
     image = batch.get("image") if networks.image is None else networks.image(batch["pixels"])
     return Condition(
-        mask=batch["mask"].astype(jnp.float32),
-        prior=batch["prior"],
-        hands=batch["hands"],
+        mask=batch.get("mask"),
+        prior=batch.get("prior"),
+        hands=batch.get("hands"),
         text=text,
         image=image,
     )
@@ -147,7 +143,9 @@ def loss_weights(
     return weight / weight.mean(axis=(1, 2, 3), keepdims=True)
 
 
-def _denoise(networks: Networks, condition: Condition) -> DenoiseFn:
-    dit = networks.dit
-    context = dit.prepare(condition_channels(condition), condition.text, condition.image)
+def _denoise(
+    model: ModelConfig, networks: Networks, condition: Condition, latents: Float[Array, "b f h w c"]
+) -> DenoiseFn:
+    dit, channels = networks.dit, model.layout.condition_channels(condition, latents)
+    context = dit.prepare(channels, condition.text, condition.image)
     return lambda x, t: dit.denoise(x, t, context)

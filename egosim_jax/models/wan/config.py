@@ -88,6 +88,11 @@ class WanDiTConfig:
         return WanDiT(self, rngs=rngs)
 
     @property
+    def patch(self) -> tuple[int, int, int]:
+        """Latent frames, rows and columns of a token."""
+        return 1, PATCH, PATCH
+
+    @property
     def head_dim(self) -> int:
         """Size of an attention head."""
         return self.dim // self.heads

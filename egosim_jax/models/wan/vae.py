@@ -95,6 +95,21 @@ class WanVAEConfig:
                     "channels (z_dim): give one number per channel."
                 )
 
+    @property
+    def spatial_stride(self) -> int:
+        """Pixels per latent cell, along each axis."""
+        return 2 ** len(self.temporal_downsample)
+
+    @property
+    def temporal_stride(self) -> int:
+        """Pixel frames per latent frame, after the first."""
+        return 2 ** sum(self.temporal_downsample)
+
+    @property
+    def latent_channels(self) -> int:
+        """Channels of the latents."""
+        return self.z_dim
+
     def build(self, *, rngs: nnx.Rngs) -> WanVAE:
         """Build the network with random weights."""
         return WanVAE(self, rngs=rngs)

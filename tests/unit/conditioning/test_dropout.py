@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.conditioning import ConditionDropout
-from egosim_jax.types import Condition, InputError
+from egosim_jax.conditioning import Condition, ConditionDropout
+from egosim_jax.types import InputError
 
 NAMES = ["prior", "mask", "hands", "text"]
 
@@ -105,3 +105,9 @@ def test_a_batch_with_its_own_keys_equals_batches_of_one():
 def test_a_rate_that_is_no_probability_is_refused(rate):
     with pytest.raises(InputError, match="hands"):
         ConditionDropout(hands=rate)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_dropping_a_condition_is_what_training_does(name):
+    trained = ConditionDropout(**{name: 1.0}).apply(CONDITION, jax.random.key(0))
+    assert not differing(CONDITION.drop(name), trained)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.conditioning import pack_mask
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, VideoGrid
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +92,32 @@ def test_a_length_that_the_vae_cannot_encode_is_refused():
 def test_a_size_without_whole_latent_cells_is_refused():
     with pytest.raises(InputError, match="16 x 20"):
         pack_mask(np.zeros((5, 16, 20), np.uint8))
+
+
+def test_a_single_channel_holds_the_pixel_of_the_cell_in_the_frame_of_its_latent(frames):
+    packed = pack_mask(frames, packing="single", channels=1)
+    expected = frames[::4, ::8, ::8, None] > 127
+    np.testing.assert_array_equal(packed[1:], expected[1:])
+    assert packed[0].max() == 0
+
+
+def test_channels_in_time_hold_the_four_frames_that_a_latent_frame_encodes(frames):
+    packed = pack_mask(frames, packing="time")
+    for latent in range(1, 4):
+        for channel in range(4):
+            source = frames[4 * (latent - 1) + 1 + channel, ::8, ::8]
+            np.testing.assert_array_equal(packed[latent, ..., channel], source > 127)
+    assert packed[0].max() == 0
+
+
+def test_another_codec_has_other_cells(frames):
+    grid = VideoGrid(temporal_stride=2, spatial_stride=4)
+    packed = pack_mask(frames, grid=grid)
+    assert packed.shape == (7, 8, 12, 4)
+    np.testing.assert_array_equal(packed[3, 2, 5].reshape(2, 2), frames[6, 8:12:2, 20:24:2] > 127)
+
+
+def test_a_mask_that_is_always_observed_looks_at_no_pixel(frames):
+    packed = pack_mask(frames, packing="observed", channels=3)
+    assert packed.shape == (4, 4, 6, 3)
+    assert packed.max() == 0

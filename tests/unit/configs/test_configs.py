@@ -31,4 +31,4 @@ def test_egosim_14b_turns_on_the_quirks_of_the_release():
     assert config.image_range == "unit"
     assert config.process.timestep_rounding == "bfloat16"
     assert (config.process.shift, config.steps, config.guidance.scale) == (5.0, 50, 1.0)
-    assert config.video.latent_shape == (16, 60, 104)
+    assert config.latent_shape == (16, 60, 104)

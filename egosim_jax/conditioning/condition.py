@@ -1,0 +1,58 @@
+"""Conditioning inputs of the denoiser, and what stands for an absent one.
+
+    prior   latents 0 and mask 1: nothing was observed, everything is to be generated
+    mask    0: everything counts as observed, as in the EgoSim release without a mask file;
+            the prior stays
+    hands   latents 0
+    text    embeddings 0, the empty prompt of the EgoSim release's continuous runner
+
+The CLIP tokens of the first frame are never dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, no_type_check
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+Name = Literal["prior", "mask", "hands", "text"]
+"""Condition that can be dropped."""
+
+
+@no_type_check
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """Conditioning inputs of the denoiser, for a batch; latents are normalized.
+
+    Mask, prior and hands are None where the model's `ChannelLayout` does not have them.
+    """
+
+    mask: Float[Array, "b f h w m"] | None = None
+    """Packed mask: 1 = not observed, generate; 0 = observed, keep (`conditioning/mask.py`)."""
+    prior: Float[Array, "b f h w z"] | None = None
+    """Latents of the rendered scene, not masked."""
+    hands: Float[Array, "b f h w z"] | None = None
+    """Latents of the drawn hands."""
+    text: Float[Array, "b n d"]
+    """Prompt embeddings."""
+    image: Float[Array, "b m e"] | None = None
+    """Image tokens of the first frame; None for models without the image branch."""
+
+    def drop(self, name: Name, where: Bool[Array, " b"] | bool = True) -> Condition:
+        """Return the condition without one of its inputs, in the samples of `where`."""
+        dropped = {name: _fill(getattr(self, name), where, 0)}
+        if name == "prior":
+            dropped["mask"] = _fill(self.mask, where, 1)
+        return replace(self, **dropped)
+
+
+def _fill(x: Array | None, where: Bool[Array, " b"] | bool, value: int) -> Array | None:
+    """Replace whole samples by a constant."""
+    if x is None:
+        return None
+    where = jnp.asarray(where).reshape(-1, *[1] * (x.ndim - 1))
+    return jnp.where(where, jnp.asarray(value, x.dtype), x)

@@ -1,0 +1,157 @@
+"""Input channels of the denoiser against plain loops."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from egosim_jax.conditioning import ChannelLayout, Condition
+from egosim_jax.conditioning.layout import EGOSIM, WAN_INPAINT, WAN_TEXT
+from egosim_jax.types import InputError, VideoGrid
+
+GRID = (2, 3, 2, 4)
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    rng = np.random.default_rng(0)
+    arrays = {
+        name: rng.standard_normal((*GRID, 16)).astype(np.float32)
+        for name in ("noisy", "prior", "hands")
+    }
+    return {**arrays, "mask": rng.integers(0, 2, (*GRID, 4)).astype(np.float32)}
+
+
+@pytest.fixture(scope="module")
+def condition(arrays):
+    return Condition(
+        mask=jnp.asarray(arrays["mask"]),
+        prior=jnp.asarray(arrays["prior"]),
+        hands=jnp.asarray(arrays["hands"]),
+        text=jnp.zeros((2, 5, 8)),
+    )
+
+
+def test_the_order_is_noisy_mask_prior_hands(arrays, condition):
+    assembled = EGOSIM.assemble(jnp.asarray(arrays["noisy"]), condition)
+    assert assembled.shape == (*GRID, 52)
+    for cell in np.ndindex(*GRID):
+        expected = [arrays["noisy"][cell][c] for c in range(16)]
+        expected += [arrays["mask"][cell][c] for c in range(4)]
+        expected += [arrays["prior"][cell][c] * (1 - arrays["mask"][cell][0]) for c in range(16)]
+        expected += [arrays["hands"][cell][c] for c in range(16)]
+        np.testing.assert_array_equal(assembled[cell], expected)
+
+
+def test_the_slices_name_what_they_hold(arrays, condition):
+    assembled = EGOSIM.assemble(jnp.asarray(arrays["noisy"]), condition)
+    np.testing.assert_array_equal(assembled[..., EGOSIM.slice("noisy")], arrays["noisy"])
+    np.testing.assert_array_equal(assembled[..., EGOSIM.slice("mask")], arrays["mask"])
+    np.testing.assert_array_equal(
+        assembled[..., EGOSIM.slice("prior")], arrays["prior"] * (1 - arrays["mask"][..., :1])
+    )
+    np.testing.assert_array_equal(assembled[..., EGOSIM.slice("hands")], arrays["hands"])
+    assert EGOSIM.channels == 52
+
+
+@pytest.mark.parametrize(("channel", "kept"), [(0, False), (1, True), (2, True), (3, True)])
+def test_only_the_first_mask_channel_masks_the_prior(channel, kept):
+    ones = jnp.ones((1, 1, 1, 1, 16))
+    mask = jnp.zeros((1, 1, 1, 1, 4)).at[..., channel].set(1)
+    condition = Condition(mask=mask, prior=ones, hands=ones, text=jnp.zeros((1, 1, 1)))
+    prior = EGOSIM.assemble(ones, condition)[..., EGOSIM.slice("prior")]
+    assert (prior == (1 if kept else 0)).all()
+
+
+def test_an_unobserved_cell_is_latent_zero_and_its_hands_stay():
+    prior, hands = jnp.full((1, 1, 1, 1, 16), 3.0), jnp.full((1, 1, 1, 1, 16), 2.0)
+    condition = Condition(
+        mask=jnp.ones((1, 1, 1, 1, 4)), prior=prior, hands=hands, text=jnp.zeros((1, 1, 1))
+    )
+    channels = np.ravel(EGOSIM.condition_channels(condition, prior))
+    assert channels.tolist() == [1] * 4 + [0] * 16 + [2] * 16
+
+
+def test_the_channels_take_the_dtype_of_the_prior(condition):
+    half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), condition)
+    packed = np.asarray(condition.mask).astype(np.uint8)
+    channels = EGOSIM.condition_channels(
+        Condition(mask=packed, prior=half.prior, hands=condition.hands, text=half.text),
+        condition.hands,
+    )
+    assert channels.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(channels[..., :4], packed)
+
+
+def test_a_condition_is_a_pytree_with_and_without_an_image(condition):
+    assert len(jax.tree.leaves(condition)) == 4
+    doubled = jax.jit(lambda c: jax.tree.map(lambda x: 2 * x, c))(condition)
+    np.testing.assert_array_equal(doubled.hands, 2 * condition.hands)
+    assert doubled.image is None
+
+
+DWM_COGVIDEOX = ChannelLayout(
+    parts=(("noisy", 16), ("mask", 1), ("prior", 16), ("hands", 16)),
+    mask_packing="observed",
+    mask_one="keep",
+    mask_scale=0.7,
+    mask_prior=False,
+)
+DWM_WAN = ChannelLayout(mask_packing="observed", mask_one="keep", mask_prior=False)
+
+
+@pytest.mark.parametrize(
+    ("layout", "channels"),
+    [(EGOSIM, 52), (WAN_INPAINT, 36), (WAN_TEXT, 16), (DWM_COGVIDEOX, 49), (DWM_WAN, 52)],
+)
+def test_layouts_of_published_models_have_their_channels(layout, channels):
+    rng = np.random.default_rng(0)
+    latents = jnp.asarray(rng.standard_normal((1, 3, 2, 4, 16)), jnp.float32)
+    condition = Condition(prior=latents, hands=-latents, text=jnp.zeros((1, 1, 1)))
+    if "mask" in layout:
+        mask = layout.pack_mask(rng.integers(0, 256, (9, 16, 32), np.uint8), VideoGrid())
+        condition = replace(condition, mask=jnp.asarray(mask)[None])
+    assembled = layout.assemble(2 * latents, condition)
+    assert assembled.shape == (1, 3, 2, 4, channels) == (*latents.shape[:-1], layout.channels)
+
+
+def test_a_mask_of_dwm_on_cogvideox_is_seven_tenths_and_leaves_the_prior():
+    latents = jnp.full((1, 2, 2, 2, 16), 3.0)
+    mask = DWM_COGVIDEOX.pack_mask(np.full((5, 16, 16), 255, np.uint8), VideoGrid())
+    condition = Condition(
+        mask=jnp.asarray(mask)[None], prior=latents, hands=latents, text=jnp.zeros((1, 1, 1))
+    )
+    assembled = DWM_COGVIDEOX.assemble(latents, condition)
+    np.testing.assert_allclose(assembled[..., DWM_COGVIDEOX.slice("mask")], 0.7)
+    assert (assembled[..., DWM_COGVIDEOX.slice("prior")] == 3).all()
+
+
+def test_a_mask_of_wan_is_one_where_pixels_are_kept():
+    condition = Condition(
+        mask=jnp.asarray([0.0, 1.0, 1.0, 0.0]).reshape(1, 1, 1, 1, 4),
+        prior=jnp.ones((1, 1, 1, 1, 16)),
+        text=jnp.zeros((1, 1, 1)),
+    )
+    channels = WAN_INPAINT.condition_channels(condition, jnp.zeros((1, 1, 1, 1, 16)))
+    assert channels.ravel().tolist() == [1, 0, 0, 1] + [1] * 16
+
+
+def test_a_condition_that_lacks_a_part_is_refused(condition):
+    with pytest.raises(InputError, match="hands"):
+        EGOSIM.condition_channels(replace(condition, hands=None), condition.prior)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"parts": (("mask", 4), ("noisy", 16))}, "noisy must come first"),
+        ({"parts": (("noisy", 16), ("mask", 4), ("mask", 4))}, "every part once"),
+        ({"parts": (("noisy", 16), ("prior", 0))}, "needs a channel"),
+        ({"mask_packing": "single"}, "gives 1"),
+    ],
+)
+def test_a_layout_that_cannot_be_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        ChannelLayout(**changes)
