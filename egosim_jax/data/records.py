@@ -39,7 +39,7 @@ class Record:
 
 def to_bytes(record: Record) -> bytes:
     """Serialize a record; `from_bytes` returns bit-identical arrays."""
-    arrays = {name: np.ascontiguousarray(array) for name, array in record.arrays.items()}
+    arrays = {name: np.asarray(array, order="C") for name, array in record.arrays.items()}
     return safetensors.numpy.save(arrays, metadata={"json": json.dumps(dict(record.metadata))})
 
 

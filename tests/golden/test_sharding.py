@@ -1,4 +1,4 @@
-"""Where every weight lies. To accept a change: `python -m tests.golden.test_sharding`."""
+"""Shards of every weight. To accept a change: `python -m tests.golden.test_sharding`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,7 +28,7 @@ def dump() -> Iterator[str]:
             yield f"  {'.'.join(map(str, path))}  {'  '.join(map(str, [leaf.shape, *parts]))}"
 
 
-def test_every_weight_lies_where_it_did():
+def test_every_weight_is_sharded_as_before():
     assert list(dump()) == GOLDEN.read_text("utf-8").splitlines()
 
 
