@@ -1,4 +1,4 @@
-"""What flows between the parts of the simulator, and the glossary of shapes.
+"""Data types passed between the parts of the simulator, and the glossary of shapes.
 
 Shapes are channel-last everywhere:
 
@@ -9,10 +9,10 @@ Shapes are channel-last everywhere:
 
 Videos on disk and in `Triplet` are uint8 RGB; models see RGB in [-1, 1]. A video of F = 4k+1
 frames has k+1 latent frames: the first latent frame encodes one frame, the others four each.
-Masks say 1 (or 255) where nothing was observed, so that it must be generated, and 0 where the
-prior is to be kept.
+Masks are 1 (or 255) where nothing was observed and pixels must be generated, and 0 where the prior
+is kept.
 
-This module knows no jax: any generator, in JAX or not, can speak these types.
+This module does not import JAX: generators in any framework can use these types.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TEMPORAL_STRIDE = 4
 SPATIAL_STRIDE = 8
 """Pixels per latent cell, along each axis."""
 Kind = Literal["human", "robot"]
-"""Whose hands: 21 keypoints, or a gripper's three."""
+"""Kind of hands: human with 21 keypoints, or robot grippers with 3."""
 
 
 class InputError(ValueError):
@@ -173,19 +173,19 @@ class MeshConfig:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Cameras:
-    """A camera's path: where it is at each frame, in OpenCV axes (x right, y down, z forward)."""
+    """Camera trajectory: one pose per frame, in OpenCV axes (x right, y down, z forward)."""
 
     world_from_camera: Float[np.ndarray, "f 4 4"]
-    """Rigid, in meters."""
+    """Rigid transforms, in meters."""
     intrinsics_px: Float[np.ndarray, "3 3"]
-    """Focal lengths and principal point, with pixel centers at integer coordinates."""
+    """Focal lengths and principal point in pixels, with pixel centers at integer coordinates."""
     height: int
-    """Rows of a picture."""
+    """Image rows in pixels."""
     width: int
-    """Columns of a picture."""
+    """Image columns in pixels."""
 
     def __post_init__(self) -> None:
-        """Check shapes, that every pose is rigid and that the camera has a picture."""
+        """Check shapes, that every pose is a rigid transform, and the intrinsics and image size."""
         for name, shape in (("world_from_camera", (4, 4)), ("intrinsics_px", (3, 3))):
             have = np.shape(getattr(self, name))
             if have[-2:] != shape or len(have) != (3 if name == "world_from_camera" else 2):
@@ -200,35 +200,35 @@ class Cameras:
         if not rigid.all():
             frame = int(np.argmin(rigid))
             raise InputError(
-                f"The camera of frame {frame} is no rigid motion: its matrix must be finite, with "
+                f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with "
                 f"a rotation of determinant 1, not {self.world_from_camera[frame].tolist()}."
             )
         focal = self.intrinsics_px[0, 0], self.intrinsics_px[1, 1]
         if not (np.isfinite(self.intrinsics_px).all() and min(*focal, self.height, self.width) > 0):
             raise InputError(
-                f"A camera with intrinsics {self.intrinsics_px.tolist()} and {self.width}x"
-                f"{self.height} pixels has no picture: all must be finite, focal lengths and sizes "
-                "positive."
+                f"Cameras have invalid intrinsics or image size: intrinsics_px "
+                f"{self.intrinsics_px.tolist()}, width {self.width}, height {self.height}. All "
+                "must be finite, focal lengths and sizes positive."
             )
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Triplet:
-    """One clip's conditions, already at the model's length and size, and the truth if known."""
+    """Conditions of one clip at the model's length and size, and its target video if known."""
 
     video_id: str
     prompt: str
     prior: UInt8[np.ndarray, "f h w 3"]
     """The scene rendered along the camera path, without hands."""
     mask: UInt8[np.ndarray, "f h w"]
-    """Where the render shows nothing: 255 not observed, 0 observed, gray where it was resized."""
+    """Unobserved pixels of the prior: 255 not observed, 0 observed, gray where it was resized."""
     hands: UInt8[np.ndarray, "f h w 3"]
     """The hand skeletons on black."""
     first_frame: UInt8[np.ndarray, "h w 3"]
     """The image for CLIP: the scene at the first frame."""
     target: UInt8[np.ndarray, "f h w 3"] | None = None
-    """The video that was really recorded."""
+    """The recorded video."""
     extra: Mapping[str, str] = field(default_factory=dict)
     """Further metadata columns, carried to the results."""
 
@@ -249,29 +249,28 @@ class Clip:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class SceneState:
-    """The 3D memory: colored points in the world, and what is known of each."""
+    """State of the world: colored 3D points, with object instance and last observation of each."""
 
     points_m: Float32[np.ndarray, "n 3"]
-    """In the world."""
+    """Positions in the world, in meters."""
     colors: UInt8[np.ndarray, "n 3"]
     object_ids: Int32[np.ndarray, " n"]
-    """The thing that each point belongs to; 0 is the background."""
+    """Object instance of each point; 0 is the background."""
     last_seen: Int32[np.ndarray, " n"]
-    """The step at which each point was last seen."""
+    """Step in which each point was last observed."""
     intrinsics_px: Float[np.ndarray, "3 3"]
-    """Of the camera that the scene is looked at with."""
+    """Intrinsics of the camera that observed the scene, in pixels."""
     step: int = 0
-    """Clips that the state has seen."""
+    """Number of clips fused into the state."""
     names: Mapping[int, str] = field(default_factory=dict)
-    """What the things are called, by id."""
+    """Names of object instances, by id."""
     world_from_object: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """Where each thing that has moved is now; an object's own coordinates are the world's when it
-    was first seen."""
+    """Poses of the objects that have moved, relative to where they were first observed."""
     provenance: Mapping[str, str] = field(default_factory=dict)
-    """Where the state comes from."""
+    """Origin of the state, as free key-value pairs."""
 
     def __post_init__(self) -> None:
-        """Check that there are points, all finite, and as much of everything as of points."""
+        """Check that there is at least one point, that all are finite, and all array lengths."""
         count = len(self.points_m)
         for name in ("colors", "object_ids", "last_seen"):
             if len(getattr(self, name)) != count:
@@ -280,7 +279,7 @@ class SceneState:
                     "be one for each point."
                 )
         if not count:
-            raise InputError("A state without points shows nothing: it needs at least one.")
+            raise InputError("SceneState must contain at least one point.")
         finite = np.isfinite(self.points_m).all(axis=1)
         if not finite.all():
             raise InputError(
@@ -290,11 +289,11 @@ class SceneState:
 
 
 JOINTS: Mapping[str, int] = {"human": 21, "robot": 3}
-"""Keypoints of a hand, by kind."""
+"""Number of keypoints of a hand, by kind."""
 HAND_SIZE_M = (0.01, 1.0)
-"""Smallest and largest extent of a hand that is taken for one in meters."""
+"""Smallest and largest plausible extent of a hand, in meters."""
 NEAR_PICTURE = 0.25
-"""How far outside the picture, in widths and heights, a joint counts as near the view."""
+"""Margin around the image in which a joint counts as near the view, in widths and heights."""
 
 
 @no_type_check
@@ -303,13 +302,16 @@ class Action:
     """The wearer's camera path, hands and caption for one clip."""
 
     cameras: Cameras
-    """The head's path."""
+    """Trajectory of the head's camera."""
     joints_m: Float[np.ndarray, "f n j 3"]
-    """Joints of n hands in the world, in meters: 21 of a human hand, 3 of a gripper. A hand is
-    missing from a frame if all its joints are NaN; without hands, all of one hand are."""
+    """Joints of n hands in the world, in meters: 21 of a human hand, 3 of a gripper.
+
+    All joints of a hand are NaN in frames in which it is missing; without hands, give one hand that
+    is missing from all frames."""
     kind: Kind
-    """Whose hands."""
+    """Kind of hands."""
     prompt: str
+    """Caption of the clip."""
 
     def __post_init__(self) -> None:
         """Check kind, joint count, frame count, units and frame of reference.
@@ -330,7 +332,7 @@ class Action:
             raise InputError(
                 f"joints_m is {joints.dtype} {joints.shape}: {self.kind} hands of a path of "
                 f"{frames} cameras must be floats ({frames}, hands, {wanted}, 3), at least one "
-                "hand. A hand that is not there has joints of NaN."
+                "hand. A missing hand has joints of NaN."
             )
         finite = np.isfinite(joints)
         given = np.asarray(finite.all(axis=(2, 3)))
@@ -358,7 +360,7 @@ class Action:
             )
 
     def _check_place(self, joints: np.ndarray, given: np.ndarray) -> None:
-        """Refuse hands of which no joint is in front of a camera and near its picture."""
+        """Raise `InputError` if no joint of any hand is in front of a camera and near its image."""
         cameras, poses = self.cameras, self.cameras.world_from_camera
         where = np.where(given[:, :, None, None], joints, 0.0) - poses[:, None, None, :3, 3]
         rotations = poses[:, :3, :3]
@@ -380,35 +382,34 @@ class Action:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A state seen along a camera path."""
+    """Rendering of a state along a camera trajectory."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Black where no point is seen."""
+    """Rendered colors; black where no point is visible."""
     mask: UInt8[np.ndarray, "f h w"]
-    """255 where nothing was observed, 0 where something was."""
+    """Unobserved pixels: 255 not observed, 0 observed."""
     depth_m: Float32[np.ndarray, "f h w"]
-    """Infinite where no point is seen."""
+    """Depth along the camera's z axis in meters; infinite where no point is visible."""
     object_ids: Int32[np.ndarray, "f h w"]
-    """The thing that each pixel sees; 0 for the background and where nothing is seen."""
+    """Object instance of each pixel; 0 for the background and where no point is visible."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Perceived:
-    """What was read from a clip: everything in the world, frame by frame."""
+    """Reconstruction of a clip in world coordinates, frame by frame."""
 
     step: int
     """Number of the clip, from 1."""
     frames: UInt8[np.ndarray, "f h w 3"]
     cameras: Cameras
     depth_m: Float32[np.ndarray, "f h w"]
-    """Infinite where it is unknown."""
+    """Depth along the camera's z axis in meters; infinite where unknown."""
     object_ids: Int32[np.ndarray, "f h w"]
-    """0 for the background; negative for hands and arms, one id a part, which never enter the
-    state."""
+    """Object instance of each pixel: 0 background, negative hands and arms, never fused."""
     names: Mapping[int, str]
-    """What the things are called, by id."""
+    """Names of object instances, by id."""
     world_from_object: Mapping[int, Float[np.ndarray, "f 4 4"]]
-    """Poses of the things that were tracked; the first is that in the state before."""
+    """Poses of tracked objects; the first frame's is that in the state before."""
     interacted_frames: Mapping[int, Bool[np.ndarray, " f"]]
     """Frames in which hands acted on each object; only objects with at least one."""

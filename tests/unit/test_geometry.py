@@ -1,4 +1,4 @@
-"""Cameras and rigid motions, each against a formula written apart."""
+"""Cameras and rigid transforms, each against an independent formula."""
 
 import numpy as np
 import pytest

@@ -186,5 +186,5 @@ def test_points_that_are_not_a_valid_state_are_refused(change, message):
 
 
 def test_a_state_without_points_is_refused():
-    with pytest.raises(InputError, match="at least one"):
+    with pytest.raises(InputError, match="at least one point"):
         state(0)

@@ -212,9 +212,9 @@ def test_hands_and_objects_may_leave_the_view(clips):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda pose: pose * np.nan, "frame 1 is no rigid"),
-        (lambda pose: pose * [[2], [2], [2], [1]], "frame 1 is no rigid"),
-        (lambda pose: pose * [[1], [1], [-1], [1]], "frame 1 is no rigid"),
+        (lambda pose: pose * np.nan, "frame 1 is not a rigid"),
+        (lambda pose: pose * [[2], [2], [2], [1]], "frame 1 is not a rigid"),
+        (lambda pose: pose * [[1], [1], [-1], [1]], "frame 1 is not a rigid"),
     ],
 )
 def test_cameras_that_are_not_rigid_are_refused(clips, change, message):
@@ -225,7 +225,7 @@ def test_cameras_that_are_not_rigid_are_refused(clips, change, message):
 
 
 def test_a_camera_without_a_picture_is_refused(clips):
-    with pytest.raises(InputError, match="has no picture"):
+    with pytest.raises(InputError, match="invalid intrinsics or image size"):
         replace(clips[0].cameras, intrinsics_px=np.diag([0.0, 60.0, 1.0]))
 
 
