@@ -1,1 +1,1 @@
-"""Weights in and out: PyTorch checkpoints to ours and back."""
+"""Conversion of weights and LoRAs from and to the checkpoints of PyTorch projects."""

@@ -1,4 +1,4 @@
-"""`egosim-convert`: PyTorch checkpoints to ours and back."""
+"""Command line of `egosim-convert`: conversion of PyTorch checkpoints to weights and back."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Commands = (
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `egosim-convert`."""
+    """Run `egosim-convert` and return its exit code."""
     return command.main(
         Commands,
         program="egosim-convert",
-        description="Weights in and out.",
+        description="Convert weights and LoRAs from and to PyTorch checkpoints.",
         args=args,
     )
 

@@ -1,12 +1,12 @@
-"""LoRA files, in all names that people train them in, and out in one that all load.
+"""Read LoRA files in every common naming, and write one that ComfyUI and diffusers both load.
 
-A file names a layer of the video transformer as Wan's or diffusers' table does, behind a prefix
+A file names a layer of the denoiser in one of its table's namings, behind a prefix
 (`diffusion_model.`, `transformer.`, `base_model.model.`, `lora_unet_`), with dots or, in kohya's
-names, underscores; then says what it is: `lora_A` or `lora_down`, `lora_B` or `lora_up`, `alpha`,
-or what is added to a whole weight, bias or modulation: `diff`, `diff_b`, `diff_m`. Without an alpha
-it is the rank, unless PEFT's `adapter_config.json` or the file's header says so. What is written
-has Wan's names behind `diffusion_model.`, as ComfyUI and diffusers both read them, with an alpha
-for each layer, and rank, alpha and the base's hash in the header.
+files, underscores, and then the role of the tensor: `lora_A` or `lora_down`, `lora_B` or `lora_up`,
+`alpha`, or a full difference of a weight, bias or modulation: `diff`, `diff_b`, `diff_m`. Without
+an alpha it is the rank, unless PEFT's `adapter_config.json` or the file's header has one. Files are
+written in the naming that has a `lora_prefix`, with an alpha for each layer, and rank, alpha and
+the hash of the base weights in the header.
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ import math
 import os
 import re
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from einops import EinopsError
 
 from egosim_jax.convert.rules import Rule, shape_only
-from egosim_jax.convert.skeleton import shapes
 from egosim_jax.convert.source import Source, sources
-from egosim_jax.convert.tables import wan_dit
+from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
 from egosim_jax.io.untrusted import listing, parse_json, quote, quote_path, quote_text, read_json
 from egosim_jax.models.lora import (
@@ -40,39 +39,42 @@ from egosim_jax.models.lora import (
     pairs,
     refuse,
 )
-from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.models import NetworkConfig
 
 PREFIXES = (
     "base_model.model.", "diffusion_model.", "model.", "transformer.", "pipe.dit.", "dit.",
     "lora_unet_", "lora_transformer_", "_",
 )  # fmt: skip
-TEXT = ("lora_te", "text_encoder.", "text_encoders.")
-"""How the names of layers of a text encoder begin."""
+TEXT_PREFIXES = ("lora_te", "text_encoder.", "text_encoders.")
+"""Prefixes of the layers of a text encoder, which are skipped."""
 LOW_RANK = {
     "lora_A": "down", "lora_down": "down", "lora_B": "up", "lora_up": "up", "alpha": "alpha",
 }  # fmt: skip
-WHOLE = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
-"""What the end of a name stands for."""
-END = re.compile(rf"\.({'|'.join((*LOW_RANK, *WHOLE))})(\.default)?(\.weight)?$")
+"""Role of a low-rank tensor by the suffix of its name."""
+FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
+"""Weight that a full difference is added to by the suffix of its name."""
+SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
 ADAPTER, ADAPTER_ENTRY = "adapter_config.json", "lora_adapter_metadata"
-"""PEFT's settings: a file, and what diffusers calls them in a header."""
-EXPORTED = "diffusion_model."
+"""Settings of PEFT: file next to the weights, and diffusers' entry in a header."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """A weight and, in a stack of blocks, which of them."""
+class Location:
+    """Weight or, of stacked blocks, one layer of it."""
 
     target: str
-    """Our path of it."""
+    """Path of the weight."""
     layer: int | None
+    """Index of the block; None for weights that are not stacked."""
     rule: Rule = field(compare=False)
-    """How it is written in the names that it was found under."""
+    """Conversion rule of the naming that it was found in."""
 
     @property
     def path(self) -> str:
-        """Of a kernel that of its layer."""
+        """Path of the layer if the weight is a kernel, else of the weight."""
         return self.target.removesuffix(".kernel")
 
     def __str__(self) -> str:
@@ -81,59 +83,60 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What a LoRA says of itself as a whole."""
+    """Settings of a LoRA that hold for all its layers."""
 
     alpha: float | None = None
-    """That of layers that do not say theirs; None: the rank."""
-    root: bool = False
-    """Whether the scale is alpha / sqrt(r), as rsLoRA's, and not alpha / r."""
+    """Alpha of layers without one; None: the rank."""
+    rank_stabilized: bool = False
+    """True for a scale of alpha / sqrt(r), as in rsLoRA, instead of alpha / r."""
 
     def scale(self, alpha: float | None, rank: int) -> float:
-        """What a product of a rank counts."""
-        said = self.alpha if alpha is None else alpha
-        return 1.0 if said is None else said / (math.sqrt(rank) if self.root else rank)
+        """Return the factor of a low-rank product."""
+        alpha = self.alpha if alpha is None else alpha
+        if alpha is None:
+            return 1.0
+        return alpha / (math.sqrt(rank) if self.rank_stabilized else rank)
 
 
-def read_lora(path: Path, config: WanDiTConfig) -> dict[str, Change]:
-    """The summands of a LoRA by our paths, in float32; one that we trained has them already.
+def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
+    """Return the changes of a LoRA by path, in float32; files in our format have the same paths.
 
-    `path` is a file, or PEFT's folder of one with its config. Blocks that it does not have get 0,
-    lower ranks than the highest of a stack are filled up with 0. Layers of a text encoder are left
-    out, which is said. Raises `InputError` listing every tensor that is of nothing else in the
-    network or does not fit, and every value that is not finite.
+    `path` is a file, or PEFT's folder of one with its config. Missing blocks are 0, and ranks lower
+    than the highest of a stack are padded with 0. Layers of a text encoder are skipped with a
+    message. Raises `InputError` listing every tensor that is not of the network or does not fit,
+    and every value that is not finite.
     """
     source = _only(path)
-    want = shapes("dit", config)
-    about = metadata_of(source.files[0])
-    if about.get("format") == OURS:
+    want = weight_shapes(config)
+    metadata = metadata_of(source.files[0])
+    if metadata.get("format") == OURS:
         found = pairs(source.tensors)
         whys = {at: misfit(want, at, down.shape, up.shape) for at, (down, up) in found.items()}
         refuse([f"{at}: {why}" for at, why in whys.items() if why])
         arrays = {name: tensor.array() for name, tensor in source.tensors.items()}
         changes: dict[str, Change] = {**from_tensors(arrays)}
     else:
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
-            changes = _translated(source, config, want, _settings(path, about))
+        with np.errstate(over="ignore", invalid="ignore"):  # `check` refuses values not finite
+            changes = _translated(source, config, want, _settings(path, metadata))
     if not changes:
-        raise InputError(f"{quote_path(path)} holds nothing of the network's layers. (--lora)")
+        raise InputError(f"{quote_path(path)} has no layers of this network. (--lora)")
     check(want, changes)
     return changes
 
 
 def metadata_of(file: Path) -> dict[str, str]:
-    """What the header of a file says, if it can."""
+    """Return the text metadata of a file; empty for formats without."""
     return read_metadata(file) if file.suffix == ".safetensors" else {}
 
 
 def check_base(path: Path, known: Collection[str]) -> None:
-    """Raise `InputError` if a LoRA says that it was trained on weights of another hash."""
-    said = metadata_of(_only(path).files[0]).get(BASE)
-    if said is not None and said not in known:
+    """Raise `InputError` if a LoRA's header names base weights of another hash."""
+    base = metadata_of(_only(path).files[0]).get(BASE)
+    if base is not None and base not in known:
         raise InputError(
-            f"{quote_path(path)} was trained on other weights: those have {BASE} "
-            f"{quote_text(said[:12])}…, these {', '.join(f'{name[:12]}…' for name in known)}. Take "
-            "the weights that it was trained on; or, to merge it into others, name those, too. "
-            "(--base)"
+            f"{quote_path(path)} was trained on other weights: their {BASE} is "
+            f"{quote_text(base[:12])}…, not {', '.join(f'{name[:12]}…' for name in known)}. Use "
+            "the weights that it was trained on; to merge it into others, also give those. (--base)"
         )
 
 
@@ -141,150 +144,156 @@ def _only(path: Path) -> Source:
     found = list(sources(path))
     if len(found) != 1:
         raise InputError(
-            f"{quote_path(path)} holds {len(found)} files of weights; a LoRA is one. (--lora)"
+            f"{quote_path(path)} holds {len(found)} weight files; expected one. (--lora)"
         )
     return found[0]
 
 
-def _settings(path: Path, about: Mapping[str, str]) -> Settings:
-    """What the adapter's config or the header says."""
+def _settings(path: Path, metadata: Mapping[str, str]) -> Settings:
+    """Read the settings from the adapter's config or from the header."""
     adapter = (path if path.is_dir() else path.parent) / ADAPTER
     if os.path.lexists(adapter):
         return _peft(read_json(adapter), source=quote_path(adapter))
-    if ADAPTER_ENTRY in about:
+    if ADAPTER_ENTRY in metadata:
         source = f"{ADAPTER_ENTRY} of {quote_path(path)}"
-        said = parse_json(about[ADAPTER_ENTRY].encode(), source=source)
+        adapted = parse_json(metadata[ADAPTER_ENTRY].encode(), source=source)
         return _peft(
-            {name.removeprefix("transformer."): value for name, value in said.items()}
-            if isinstance(said, dict)
-            else said,
+            {name.removeprefix("transformer."): value for name, value in adapted.items()}
+            if isinstance(adapted, dict)
+            else adapted,
             source=source,
         )
-    said = about.get("alpha", about.get("ss_network_alpha", "None"))
-    if said in ("None", ""):
+    alpha = metadata.get("alpha", metadata.get("ss_network_alpha", "None"))
+    if alpha in ("None", ""):
         return Settings()
-    return Settings(alpha=_number(said, f"The alpha of {quote_path(path)}"))
+    return Settings(alpha=_number(alpha, f"The alpha of {quote_path(path)}"))
 
 
-def _peft(said: Any, *, source: str) -> Settings:
-    match said:
+def _peft(adapter: Any, *, source: str) -> Settings:
+    match adapter:
         case {"lora_alpha": alpha}:
             pass
         case _:
             raise InputError(f"{source} has no lora_alpha, which PEFT writes. Add it.")
-    if said.get("alpha_pattern"):
-        raise InputError(f"{source} has an alpha_pattern, which is not read: give one lora_alpha.")
+    if adapter.get("alpha_pattern"):
+        raise InputError(
+            f"{source} has an alpha_pattern, which is not supported: set one lora_alpha."
+        )
     return Settings(
-        alpha=_number(alpha, f"lora_alpha of {source}"), root=said.get("use_rslora") is True
+        alpha=_number(alpha, f"lora_alpha of {source}"),
+        rank_stabilized=adapter.get("use_rslora") is True,
     )
 
 
 def _number(value: Any, what: str) -> float:
-    """A finite number. Raises `InputError` for everything else."""
+    """Return a finite number. Raises `InputError` for everything else."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise InputError(f"{what} is {quote(value)}, which is no finite number.")
+        raise InputError(f"{what} is {quote(value)}, which is not a finite number.")
     return number
 
 
 def _translated(
     source: Source,
-    config: WanDiTConfig,
+    config: NetworkConfig,
     want: Mapping[str, tuple[int, ...]],
     settings: Settings,
 ) -> dict[str, Change]:
-    """What a file in foreign names adds; shapes are checked before values are read."""
-    known = _places(config)
-    low: dict[Place, dict[str, Tensor]] = {}
-    whole: dict[Place, Tensor] = {}
+    """Convert a file in a foreign naming; shapes are checked before values are read."""
+    known = _locations(config, want)
+    low_rank: dict[Location, dict[str, Tensor]] = {}
+    full: dict[Location, Tensor] = {}
     problems, text = [], 0
     for key, tensor in source.tensors.items():
-        if key.startswith(TEXT):
+        if key.startswith(TEXT_PREFIXES):
             text += 1
             continue
-        end = END.search(key)
-        kind = end[1] if end else ""
-        stem = f"{_plain(key[: end.start()])}_{WHOLE.get(kind, 'weight')}" if end else ""
-        place = known.get(stem)
-        if place is None or (kind in LOW_RANK and place.rule.transform != "linear"):
+        suffix = SUFFIX.search(key)
+        kind = suffix[1] if suffix else ""
+        stem = f"{_plain(key[: suffix.start()])}_{FULL.get(kind, 'weight')}" if suffix else ""
+        location = known.get(stem)
+        if location is None or (kind in LOW_RANK and location.rule.transform != "linear"):
             problems.append(f"{key}: not of a layer of this network")
-        elif (kind in WHOLE and place in whole) or LOW_RANK.get(kind) in low.get(place, {}):
-            problems.append(f"{key}: is there twice, under another name")
+        elif (kind in FULL and location in full) or LOW_RANK.get(kind) in low_rank.get(
+            location, {}
+        ):
+            problems.append(f"{key}: duplicate of another name")
         elif kind in LOW_RANK:
-            low.setdefault(place, {})[LOW_RANK[kind]] = tensor
+            low_rank.setdefault(location, {})[LOW_RANK[kind]] = tensor
         else:
-            whole[place] = tensor
+            full[location] = tensor
     if text:
-        print(f"{source.name}: {text} tensors of a text encoder are left out", file=sys.stderr)
+        print(f"{source.name}: skipped {text} tensors of a text encoder", file=sys.stderr)
     pairs = {}
-    for place, found in low.items():
+    for location, found in low_rank.items():
         try:
-            pairs[place] = _pair(place, found, want[f"{place.path}.kernel"][-2:], settings)
+            kernel = want[f"{location.path}.kernel"][-2:]
+            pairs[location] = _pair(location, found, kernel, settings)
         except RefusedError as error:
-            problems.append(f"{place}: {error}")
-    for place, tensor in whole.items():
-        shape = want[place.target][place.layer is not None :]
+            problems.append(f"{location}: {error}")
+    for location, tensor in full.items():
+        shape = want[location.target][location.layer is not None :]
         try:
-            have = place.rule.to_jax(shape_only(tensor)).shape
+            have = location.rule.to_jax(shape_only(tensor)).shape
         except (EinopsError, ValueError):
             have = tensor.shape
         if have != shape:
-            problems.append(f"{place}: have {have}, want {shape}")
+            problems.append(f"{location}: has shape {have}; expected {shape}")
     if problems:
-        what = f"{len(problems)} tensors of {source.name} are no LoRA of the network"
+        what = f"{len(problems)} tensors of {source.name} are not of a LoRA of this network"
         raise InputError(f"{what}: {listing(problems)}.")
     changes: dict[str, Change] = {}
-    for path in dict.fromkeys(place.path for place in pairs):
+    for path in dict.fromkeys(location.path for location in pairs):
         shape = want[f"{path}.kernel"]
         changes[path] = _stacked({p.layer: v for p, v in pairs.items() if p.path == path}, shape)
-    for target in dict.fromkeys(place.target for place in whole):
+    for target in dict.fromkeys(location.target for location in full):
         values = np.zeros(want[target], np.float32)
-        for place in (place for place in whole if place.target == target):
-            layer = ... if place.layer is None else place.layer
-            values[layer] = place.rule.to_jax(whole[place].array())
+        for location in (location for location in full if location.target == target):
+            layer = ... if location.layer is None else location.layer
+            values[layer] = location.rule.to_jax(full[location].array())
         changes[target] = values
     return changes
 
 
 class Pair(NamedTuple):
-    """The two of a layer, not read yet, and what their product counts."""
+    """Low-rank tensors of a layer, not read yet, and the factor of their product."""
 
     down: Tensor
-    """`[r, in]`."""
+    """Down projection `[r, in]`."""
     up: Tensor
-    """`[out, r]`."""
+    """Up projection `[out, r]`."""
     scale: float
 
 
 def _pair(
-    place: Place, found: Mapping[str, Tensor], kernel: tuple[int, ...], settings: Settings
+    location: Location, found: Mapping[str, Tensor], kernel: tuple[int, ...], settings: Settings
 ) -> Pair:
-    """The two of a layer. Raises `RefusedError` unless they are of its size."""
-    for end, name in (("down", "lora_A"), ("up", "lora_B")):
-        if end not in found:
+    """Return the low-rank tensors of a layer. Raises `RefusedError` unless they fit its kernel."""
+    for role, name in (("down", "lora_A"), ("up", "lora_B")):
+        if role not in found:
             raise RefusedError(f"has no {name}")
     down, up = found["down"], found["up"]
     rank = down.shape[0] if down.shape else 0
     if not 1 <= rank <= MOST_RANK:
-        raise RefusedError(f"has rank {rank}, want 1 to {MOST_RANK}")
+        raise RefusedError(f"has rank {rank}; expected 1 to {MOST_RANK}")
     wide, out = kernel
     if (down.shape, up.shape) != ((rank, wide), (out, rank)):
         raise RefusedError(
-            f"have {down.shape} and {up.shape}, want {(rank, wide)} and {(out, rank)}"
+            f"has shapes {down.shape} and {up.shape}; expected {(rank, wide)} and {(out, rank)}"
         )
     alpha = None
-    if (said := found.get("alpha")) is not None:
-        if math.prod(said.shape) != 1:
-            raise RefusedError(f"has {math.prod(said.shape)} numbers as alpha")
-        alpha = _number(float(said.array().item()), f"The alpha of {place}")
+    if (scalar := found.get("alpha")) is not None:
+        if math.prod(scalar.shape) != 1:
+            raise RefusedError(f"has {math.prod(scalar.shape)} numbers as alpha; expected one")
+        alpha = _number(float(scalar.array().item()), f"The alpha of {location}")
     return Pair(down, up, settings.scale(alpha, rank))
 
 
 def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delta:
-    """Ours, with the scale in the second."""
+    """Stack the low-rank tensors of all layers, the scale multiplied into the second."""
     rank = max(pair.down.shape[0] for pair in layers.values())
     *stacked, wide, out = kernel
     down = np.zeros((*stacked, wide, rank), np.float32)
@@ -296,48 +305,59 @@ def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delt
     return Delta(down=down, up=up)
 
 
-def exported(changes: Mapping[str, Change], config: WanDiTConfig) -> dict[str, np.ndarray]:
-    """The tensors of a LoRA file; alpha is the rank, since the second has it in it."""
-    tensors = {}
-    ends = {kind: end for end, kind in WHOLE.items()}
-    for theirs, place in _by_name(wan_dit.wan(config), config).items():
-        name, _, kind = theirs.rpartition(".")
-        layer = ... if place.layer is None else place.layer
-        delta, whole = changes.get(place.path), changes.get(place.target)
-        if isinstance(delta, Delta) and place.rule.transform == "linear":
+def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, np.ndarray]:
+    """Return the tensors of a LoRA file to write; alpha is the rank, as the scale is in `up`.
+
+    Raises `InputError` if no naming of the network's table is one of LoRA files.
+    """
+    namings = table_of(config).namings.values()
+    naming = next((naming for naming in namings if naming.lora_prefix is not None), None)
+    if naming is None:
+        raise InputError(f"{config.table} has no naming of LoRA files.")
+    tensors, prefix = {}, naming.lora_prefix
+    suffixes = {kind: suffix for suffix, kind in FULL.items()}
+    known = _by_name(naming.rules(config), weight_shapes(config))
+    for key, location in known.items():
+        name, _, kind = key.rpartition(".")
+        layer = ... if location.layer is None else location.layer
+        delta, full = changes.get(location.path), changes.get(location.target)
+        if isinstance(delta, Delta) and location.rule.transform == "linear":
             down, up = delta.down[layer], delta.up[layer]
-            tensors[f"{EXPORTED}{name}.lora_A.weight"] = np.ascontiguousarray(down.T)
-            tensors[f"{EXPORTED}{name}.lora_B.weight"] = np.ascontiguousarray(up.T)
-            tensors[f"{EXPORTED}{name}.alpha"] = np.array(down.shape[-1], np.float32)
-        if isinstance(whole, np.ndarray) and whole[layer].any():
-            values = place.rule.to_torch(whole[layer])
-            tensors[f"{EXPORTED}{name}.{ends[kind]}"] = np.ascontiguousarray(values)
+            tensors[f"{prefix}{name}.lora_A.weight"] = np.ascontiguousarray(down.T)
+            tensors[f"{prefix}{name}.lora_B.weight"] = np.ascontiguousarray(up.T)
+            tensors[f"{prefix}{name}.alpha"] = np.array(down.shape[-1], np.float32)
+        if isinstance(full, np.ndarray) and full[layer].any():
+            values = location.rule.to_torch(full[layer])
+            tensors[f"{prefix}{name}.{suffixes[kind]}"] = np.ascontiguousarray(values)
     return tensors
 
 
-def about_lora(changes: Mapping[str, Change]) -> dict[str, str]:
-    """What the header of a LoRA file says."""
+def exported_metadata(changes: Mapping[str, Change]) -> dict[str, str]:
+    """Return the header metadata of a LoRA file to write."""
     ranks = {change.down.shape[-1] for change in changes.values() if isinstance(change, Delta)}
     rank = str(max(ranks, default=0))
     return {"format": "pt"} | ({"rank": rank, "alpha": rank} if ranks else {})
 
 
-def _places(config: WanDiTConfig) -> dict[str, Place]:
-    """The weights by both tables' names, without what files write differently."""
-    both = _by_name(wan_dit.diffusers(config), config) | _by_name(wan_dit.wan(config), config)
-    return {_plain(name): place for name, place in both.items()}
+def _locations(config: NetworkConfig, want: Mapping[str, tuple[int, ...]]) -> dict[str, Location]:
+    """Return the weights by their plain names in all namings; earlier ones take precedence."""
+    known: dict[str, Location] = {}
+    for naming in table_of(config).namings.values():
+        named = _by_name(naming.rules(config), want)
+        known = {_plain(name): location for name, location in named.items()} | known
+    return known
 
 
-def _by_name(rules: list[Rule], config: WanDiTConfig) -> dict[str, Place]:
+def _by_name(rules: Sequence[Rule], want: Mapping[str, tuple[int, ...]]) -> dict[str, Location]:
     return {
-        rule.source.replace("*", str(layer)): Place(rule.target, layer, rule)
+        rule.source.replace("*", str(layer)): Location(rule.target, layer, rule)
         for rule in rules
-        for layer in (range(config.layers) if rule.stacked else (None,))
+        for layer in (range(want[rule.target][0]) if rule.stacked else (None,))
     }
 
 
 def _plain(name: str) -> str:
-    """A layer's name without prefixes, and with underscores for dots."""
+    """Return a layer's name without prefixes and with underscores for dots."""
     while prefix := next((p for p in PREFIXES if name.startswith(p)), None):
         name = name.removeprefix(prefix)
     return name.replace(".", "_")

@@ -1,87 +1,76 @@
-"""What a conversion will write, weight by weight, before anything is read but headers."""
+"""Plan a conversion weight by weight, from the headers of files alone."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from egosim_jax.convert.layouts import Found, Naming, Network
+from egosim_jax.convert.detect import DetectedNetwork
 from egosim_jax.convert.rules import Leaf, Rule, assign, shape_only
-from egosim_jax.convert.skeleton import shapes
 from egosim_jax.convert.stream import Weight, stored_as
+from egosim_jax.convert.tables import table_of, weight_shapes
+from egosim_jax.convert.widen import Widening
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import WeightsError, mismatches
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.models import NetworkConfig
     from egosim_jax.models.lora import Change
-    from egosim_jax.models.wan.config import WanDiTConfig
     from egosim_jax.networks import ModelConfig
 
-TABLES: dict[Network, str] = {
-    "dit": "wan_dit",
-    "vae": "wan_vae",
-    "text": "umt5",
-    "image": "clip_vision",
-}
-"""Name table of each network of a model."""
-Widening = Literal["copy", "polarity"]
-BASE_CHANNELS, MASK = 36, slice(16, 20)
-"""Channels that the Wan image-to-video models read, and those of the mask among them."""
-KERNEL, BIAS = "patch.kernel", "patch.bias"
 
-
-def to_ours(
-    found: Found, config: ModelConfig, *, dtype: str | None = None, widen: Widening | None = None
+def to_jax(
+    found: DetectedNetwork,
+    config: ModelConfig,
+    *,
+    dtype: str | None = None,
+    widening: Widening | None = None,
 ) -> list[Weight]:
-    """The weights of the config's network, made from a foreign checkpoint.
+    """Return the weights of a config's network, converted from a foreign checkpoint.
 
-    `widen` takes a video transformer of 36 channels for one of 52: the kernel of the hands'
-    channels is 0. With `copy` the others are as they were; with `polarity` the mask's are
-    re-expressed, since the base models' mask is 1 where ours is 0. Raises `WeightsError` with all
-    that differs.
+    With a `widening` the checkpoint is one of the base model. Raises `WeightsError` listing all
+    mismatches.
     """
-    shape = _shape(config, found.network)
-    read = _narrow(config, found) if widen else shape
-    leaves, tensors = _leaves(found, read), found.tensors
+    network = network_config(config, found.network)
+    if widening is not None:
+        network = replace(network, in_channels=widening.base.channels)
+    leaves, tensors = _leaves(found, network), found.tensors
     weights = {
         path: Weight(
             name=path,
             shape=leaf.shape,
             dtype=stored_as(leaf.dtype, dtype),
-            pieces=tuple(partial(_ours, leaf.rule, tensors[name]) for name in leaf.names),
+            pieces=tuple(partial(_to_jax, leaf.rule, tensors[name]) for name in leaf.names),
         )
         for path, leaf in leaves.items()
     }
-    if widen:
-        _widen(weights, channels=shape.in_channels, how=widen)
+    if widening is not None:
+        widening.apply(weights)
     return list(weights.values())
 
 
-def to_theirs(
+def to_torch(
     tensors: Mapping[str, Tensor],
-    config: ModelConfig,
-    network: Network,
-    naming: Naming,
+    config: NetworkConfig,
+    naming: str,
     *,
     dtype: str | None = None,
+    source: str = "the weights",
 ) -> list[Weight]:
-    """The foreign tensors of a naming, made from a file of ours.
+    """Return the foreign tensors of a naming, converted from the weights of a network's config.
 
-    Raises `WeightsError` if the file is not of the config's network, and `InputError` for a naming
-    that the network does not have.
+    Raises `WeightsError` if the weights are of another network, and `InputError` for a naming that
+    its table does not have.
     """
-    shape = _shape(config, network)
-    if problems := mismatches(tensors, shapes(network, shape)):
-        raise WeightsError(problems, source=f"{network}.safetensors")
+    if problems := mismatches(tensors, weight_shapes(config)):
+        raise WeightsError(problems, source=source)
     parts: dict[str, dict[int, _Part]] = {}
-    for rule in _rules(network, naming, shape):
+    for rule in table_of(config).rules(naming, config):
         tensor = tensors[rule.target]
         for layer in range(tensor.shape[0]) if rule.stacked else (None,):
             name = rule.source if layer is None else rule.source.replace("*", str(layer))
@@ -95,7 +84,7 @@ def to_theirs(
                 name=name,
                 shape=_fused([part.shape() for part in group]).shape,
                 dtype=stored_as(group[0].tensor.dtype, dtype),
-                pieces=(partial(_theirs, group),),
+                pieces=(partial(_to_torch, group),),
             )
         )
     return weights
@@ -104,17 +93,17 @@ def to_theirs(
 def merged(
     tensors: Mapping[str, Tensor],
     changes: Mapping[str, Change],
-    config: WanDiTConfig,
+    config: NetworkConfig,
     *,
     scale: float,
 ) -> list[Weight]:
-    """The weights of a video transformer with a LoRA in them, in their own dtypes.
+    """Return the weights of a denoiser with a LoRA merged into them, in their own dtypes.
 
-    Raises `InputError` if the weights or the LoRA are not of the config.
+    Raises `InputError` if the weights or the LoRA are of another network.
     """
     from egosim_jax.models import lora
 
-    want = shapes("dit", config)
+    want = weight_shapes(config)
     if problems := mismatches(tensors, want):
         raise WeightsError(problems, source="dit.safetensors")
     lora.check_scale(scale)
@@ -123,55 +112,69 @@ def merged(
     def piece(path: str, layer: int | None) -> np.ndarray:
         at = ... if layer is None else layer
         weight = tensors[path].array()[at]
-        low, whole = changes.get(path.removesuffix(".kernel")), changes.get(path)
+        low_rank, full = changes.get(path.removesuffix(".kernel")), changes.get(path)
         added = []
-        if path.endswith(".kernel") and isinstance(low, lora.Delta):
-            added.append(low.down[at] @ low.up[at])
-        if isinstance(whole, np.ndarray):
-            added.append(whole[at])
+        if path.endswith(".kernel") and isinstance(low_rank, lora.Delta):
+            added.append(low_rank.down[at] @ low_rank.up[at])
+        if isinstance(full, np.ndarray):
+            added.append(full[at])
         return weight.astype(np.float32) + scale * sum(added) if added else weight
 
+    table = table_of(config)
+    rules = table.rules(next(iter(table.namings)), config)
+    stacked = {rule.target for rule in rules if rule.stacked}
     weights = []
     for path, tensor in tensors.items():
-        layers = range(tensor.shape[0]) if path.startswith("blocks.") else (None,)
+        layers = range(tensor.shape[0]) if path in stacked else (None,)
         pieces = tuple(partial(piece, path, layer) for layer in layers)
         weights.append(Weight(name=path, shape=tensor.shape, dtype=tensor.dtype, pieces=pieces))
     return weights
 
 
-def fits(found: Found, config: ModelConfig) -> bool:
-    """Whether the checkpoint fills the config's network."""
+def fits(found: DetectedNetwork, config: ModelConfig) -> bool:
+    """Return True if the checkpoint has exactly the weights of the config's network."""
     try:
-        _leaves(found, _shape(config, found.network))
+        _leaves(found, network_config(config, found.network))
     except InputError:
         return False
     return True
 
 
+def network_config(config: ModelConfig, network: str) -> Any:
+    """Return the config of a model's network. Raises `InputError` if it has none of that name."""
+    networks = {str(name): found for name, found in config.networks.items()}
+    if network not in networks:
+        raise InputError(
+            f"{config.name} has no network {network}; it has {', '.join(config.networks)}. "
+            "(--config, --only)"
+        )
+    return networks[network]
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Part:
-    """What one rule gives to a foreign tensor."""
+    """Contribution of one rule to a foreign tensor."""
 
     rule: Rule
     tensor: Tensor
     layer: int | None
 
     def array(self) -> np.ndarray:
-        """Its values."""
-        ours = self.tensor.array()
-        return self.rule.to_torch(ours if self.layer is None else ours[self.layer])
+        """Return the values."""
+        weight = self.tensor.array()
+        return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
 
     def shape(self) -> np.ndarray:
-        """An array of its shape that takes no memory."""
-        ours = shape_only(self.tensor)
-        return self.rule.to_torch(ours if self.layer is None else ours[self.layer])
+        """Return an array of the same shape that takes no memory."""
+        weight = shape_only(self.tensor)
+        return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
 
 
-def _ours(rule: Rule, tensor: Tensor) -> np.ndarray:
+def _to_jax(rule: Rule, tensor: Tensor) -> np.ndarray:
     return rule.to_jax(tensor.array())
 
 
-def _theirs(parts: Sequence[_Part]) -> np.ndarray:
+def _to_torch(parts: Sequence[_Part]) -> np.ndarray:
     return _fused([part.array() for part in parts])
 
 
@@ -179,62 +182,17 @@ def _fused(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(arrays) if len(arrays) > 1 else arrays[0]
 
 
-def _leaves(found: Found, shape: Any) -> dict[str, Leaf]:
+def _leaves(found: DetectedNetwork, network: NetworkConfig) -> dict[str, Leaf]:
+    table = table_of(network)
+    if table is not found.table:
+        raise InputError(
+            f"{found.source.name} holds another {found.network} network than {network.table} "
+            "converts. (--config, --only)"
+        )
     return assign(
         found.tensors,
-        _rules(found.network, found.naming, shape),
-        ignore=_table(found.network).ignored(shape),
-        want=shapes(found.network, shape),
+        table.rules(found.naming, network),
+        ignore=table.ignored(network),
+        want=weight_shapes(network),
         source=found.source.name,
     )
-
-
-def _shape(config: ModelConfig, network: Network) -> Any:
-    """The network's own config."""
-    shape = getattr(config, network)
-    if shape is None:
-        raise InputError(f"{config.name} has no network {network}. (--config, --only)")
-    return shape
-
-
-def _rules(network: Network, naming: Naming, shape: Any) -> list[Rule]:
-    rules = getattr(_table(network), naming, None)
-    if rules is None:
-        raise InputError(f"There are no {naming} names of the network {network}. (--naming)")
-    return rules(shape)
-
-
-def _table(network: Network) -> ModuleType:
-    return importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
-
-
-def _narrow(config: ModelConfig, found: Found) -> Any:
-    """The config of the base model of a wider one."""
-    if found.network != "dit" or config.dit.in_channels <= BASE_CHANNELS:
-        raise InputError(
-            f"{config.name} reads {config.dit.in_channels} channels: only a video transformer of "
-            f"more than {BASE_CHANNELS} is widened. (--widen, --only dit)"
-        )
-    return replace(config.dit, in_channels=BASE_CHANNELS)
-
-
-def _widen(weights: dict[str, Weight], *, channels: int, how: Widening) -> None:
-    """Read more channels: further ones do not count until they are trained."""
-    kernel, bias = weights[KERNEL], weights[BIAS]
-    (make_kernel,), (make_bias,) = kernel.pieces, bias.pieces
-    more = channels - BASE_CHANNELS
-
-    def wide() -> np.ndarray:
-        base = make_kernel().copy()
-        if how == "polarity":
-            base[MASK] = -base[MASK]
-        return np.pad(base, [(0, more), (0, 0), (0, 0), (0, 0)])
-
-    def shifted() -> np.ndarray:
-        # k m = k - k (1 - m): what the mask's kernel sums to goes into the bias.
-        mask = make_kernel()[MASK].astype(np.float64).sum(axis=(0, 1, 2))
-        return make_bias().astype(np.float64) + mask
-
-    weights[KERNEL] = replace(kernel, shape=(channels, *kernel.shape[1:]), pieces=(wide,))
-    if how == "polarity":
-        weights[BIAS] = replace(bias, pieces=(shifted,))

@@ -2,7 +2,7 @@
 
 A `.pth` is a zip archive of uncompressed entries: `NAME/data.pkl`, a pickle of dictionaries, lists
 and references to tensors, and `NAME/data/KEY`, the bytes of each storage. A pickle is a program;
-here an interpreter of its own supports plain containers, numbers, text and tensors, refuses every
+here a separate interpreter supports plain containers, numbers, text and tensors, refuses every
 global that is not on its allow-list, and never calls any. Every tensor is checked against its
 storage and stays in the memory-mapped file until it is accessed.
 """

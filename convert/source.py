@@ -1,7 +1,7 @@
-"""Foreign checkpoints, opened: their tensors by name, mapped and not yet read.
+"""Open foreign checkpoints: their tensors by name, memory-mapped and not yet read.
 
-A checkpoint is one file, safetensors or `.pth`, or several with an index that says which tensor
-lies in which. Nothing is read but headers until a tensor is asked for its values.
+A checkpoint is one file, safetensors or `.pth`, or several, with an index that maps each tensor to
+its file. Only headers are read until the values of a tensor are accessed.
 """
 
 from __future__ import annotations
@@ -25,39 +25,42 @@ PTH = (".pth", ".pt", ".bin")
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """One checkpoint."""
+    """Checkpoint of one or several files."""
 
     name: str
-    """The file's, or what the names of its parts have in common."""
+    """Name of the file, or common part of the files' names."""
     files: tuple[Path, ...]
+    """Files that have the tensors."""
     tensors: Mapping[str, Tensor]
+    """Tensors by name."""
 
     @property
     def bytes(self) -> int:
-        """Of all tensors."""
+        """Size of all tensors."""
         return sum(math.prod(t.shape) * t.dtype.itemsize for t in self.tensors.values())
 
 
 def sources(path: Path) -> Iterator[Source]:
-    """The checkpoints of a file or folder, without those of folders in it.
+    """Yield the checkpoints of a file or folder; subfolders are not searched.
 
-    Files of one index, or numbered `NAME-00001-of-00003`, are one. Raises `InputError` if a file is
-    damaged or a numbered one is missing, and for a name that two files of one have.
+    Files of one index, or numbered `NAME-00001-of-00003`, are one checkpoint. Raises `InputError`
+    if a file is damaged, a numbered one is missing, or two files of a checkpoint have the same
+    tensor.
     """
     if not path.is_dir():
         yield _joined(quote_path(path.name), [path])
         return
     left = {f for f in path.iterdir() if f.suffix in (".safetensors", *PTH) and f.is_file()}
-    left = {file for file in left if not file.name.startswith(".")}  # half written ones
+    left = {file for file in left if not file.name.startswith(".")}  # incomplete files
     for index in sorted(path.glob(f"*{INDEX}")):
-        places = _indexed(index)
-        files = sorted({index.parent / place for place in places.values()})
+        weight_map = _indexed(index)
+        files = sorted({index.parent / name for name in weight_map.values()})
         left -= set(files)
         source = _joined(quote_path(index.name.removesuffix(INDEX)), files)
-        if lost := places.keys() - source.tensors.keys():
+        if lost := weight_map.keys() - source.tensors.keys():
             raise InputError(
-                f"{quote_path(index)} names {len(lost)} tensors that its files lack, such as "
-                f"{quote(min(lost))}: the files are not all of one download."
+                f"{quote_path(index)} lists {len(lost)} tensors that its files lack, such as "
+                f"{quote(min(lost))}: the files are not of the same download."
             )
         yield source
     groups: dict[str, list[Path]] = {}
@@ -74,30 +77,33 @@ def sources(path: Path) -> Iterator[Source]:
 
 
 def _indexed(index: Path) -> dict[str, str]:
-    """The file, beside the index and there, of each tensor."""
+    """Return the existing file, next to the index, of each tensor."""
     match read_json(index):
-        case {"weight_map": dict(places)} if places:
+        case {"weight_map": dict(weight_map)} if weight_map:
             pass
         case _:
-            raise InputError(f"{quote_path(index)} is no index of safetensors: no weight_map.")
-    for place in set(map(type, places.values())) - {str}:
-        raise InputError(f"{quote_path(index)} names a {place.__name__} where a file has to be.")
-    beside = set(os.listdir(index.parent))
-    for place in sorted(set(places.values())):
-        if place not in beside or not place.endswith(".safetensors"):
             raise InputError(
-                f"{quote_path(index)} names {quote(place)}, which is no safetensors beside it."
+                f"{quote_path(index)} is not a safetensors index: it has no weight_map."
             )
-    return places
+    for kind in set(map(type, weight_map.values())) - {str}:
+        raise InputError(f"{quote_path(index)} has a {kind.__name__} where a file is expected.")
+    siblings = set(os.listdir(index.parent))
+    for name in sorted(set(weight_map.values())):
+        if name not in siblings or not name.endswith(".safetensors"):
+            raise InputError(
+                f"{quote_path(index)} names {quote(name)}, not a safetensors file next to it."
+            )
+    return weight_map
 
 
 def _joined(name: str, files: Sequence[Path]) -> Source:
     tensors: dict[str, Tensor] = {}
     for file in files:
         found = read_pth(file) if file.suffix in PTH else read_safetensors(file)
-        if twice := tensors.keys() & found.keys():
+        if duplicates := tensors.keys() & found.keys():
             raise InputError(
-                f"{quote_path(file)} has {quote(min(twice))}, which another file of {name} has."
+                f"{quote_path(file)} has {quote(min(duplicates))}, which another file of {name} "
+                "also has."
             )
         tensors |= found
     return Source(name=name, files=tuple(files), tensors=tensors)

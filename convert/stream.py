@@ -1,9 +1,9 @@
 """Write safetensors piece by piece: in bounded memory, resumable after an interruption.
 
 A weight consists of pieces, such as the layers of a stack, whose offsets in the file are known in
-advance; they are read, converted and written a few at a time. A log beside the growing file has the
-hash of each piece that is written; the file gets its name when all are. The same hashes are the
-checksums in its header.
+advance; they are read, converted and written a few at a time. A log next to the growing file has
+the hash of each piece that is written; the file gets its name when all are. The same hashes are
+the checksums in its header.
 """
 
 from __future__ import annotations

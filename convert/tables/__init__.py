@@ -1,1 +1,151 @@
-"""One name table per network, as data: foreign name, our path, transform."""
+"""Conversion tables: the names of a network's weights in checkpoints of other projects.
+
+A network's config names the module of its table (`config.table`), in this package or elsewhere,
+whose `TABLE` declares the namings that checkpoints of the network come in, how each is detected
+and written, and the PyTorch implementation that a conversion is verified against.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from egosim_jax.convert.rules import Rule
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.conditioning.layout import ChannelLayout
+    from egosim_jax.convert.widen import Widening
+    from egosim_jax.models import NetworkConfig
+    from egosim_jax.networks import ModelConfig
+
+Reader = Callable[[], np.ndarray]
+"""Function that reads the values of one tensor."""
+SHORT_LAYERS, SHORT_VOCAB = 2, 512
+"""Layers and rows of the token table in a reference forward."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Naming:
+    """Names of a network's weights in the checkpoints of one project, and their files."""
+
+    rules: Callable[[Any], list[Rule]]
+    """Conversion rules for a network's config."""
+    signature: str
+    """Key that every checkpoint in this naming has and no other network's."""
+    layout: str
+    """Layout of checkpoint folders that uses this naming, as `--layout` calls it."""
+    stem: str
+    """File name without its extension."""
+    folder: str = ""
+    """Folder of the file in that layout; empty if files of all networks are side by side."""
+    lora_prefix: str | None = None
+    """Prefix of layer names in LoRA files, for the naming that LoRAs are written in."""
+    to_reference: Callable[[Mapping[str, Reader], Any], Mapping[str, Reader] | None] | None = None
+    """Renaming to the reference's names that does not use the rules; None where it has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Converted network and the checkpoint that a PyTorch module is loaded from."""
+
+    network: Any
+    """Converted network in float32, of the short config."""
+    config: Any
+    """Config of the network, shortened."""
+    load: Callable[..., Any]
+    """Fill a PyTorch module from the checkpoint; see `reference.Checkpoint.load`."""
+    widening: Widening | None
+    """Change of the input channels in the conversion, if any."""
+
+    def output(self, *inputs: Any, call: Callable[..., Any] | None = None) -> np.ndarray:
+        """Return the output of the network, or of `call(network, *inputs)`."""
+        from egosim_jax.program import Program
+
+        return np.asarray(Program(call or (lambda network, *x: network(*x)), self.network)(*inputs))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference:
+    """PyTorch implementation of a network in diffusers or transformers."""
+
+    naming: str
+    """Naming of its parameters."""
+    library: str
+    """Library that has the class."""
+    kind: str
+    """Name of the class."""
+    arguments: Callable[[Any], dict[str, Any]]
+    """Arguments of the class, or of its config, for a network's config."""
+    shorten: Callable[[Any], Any]
+    """Float32 config with fewer layers and rows, for a quick forward."""
+    outputs: Callable[[Comparison], tuple[np.ndarray, np.ndarray]]
+    """Outputs of the converted network and of the PyTorch module for the same random input."""
+    model_type: str | None = None
+    """Name of the architecture in the configs of transformers."""
+
+    def config_json(self, config: Any) -> dict[str, Any]:
+        """Return the `config.json` that `from_pretrained` reads."""
+        if self.model_type is None:
+            return {"_class_name": self.kind} | self.arguments(config)
+        header = {"architectures": [self.kind], "model_type": self.model_type}
+        return header | self.arguments(config)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Table:
+    """Conversions of one kind of network from and to other projects' checkpoints."""
+
+    namings: Mapping[str, Naming]
+    """Namings that checkpoints come in."""
+    ignored: Callable[[Any], list[str]] = lambda config: []
+    """Patterns of keys, in any naming, that the network does not use, for its config."""
+    reference: Reference | None = None
+    """Implementation that conversions are verified against."""
+    base: ChannelLayout | None = None
+    """Input channels of the base models that `--widen` converts from."""
+    input_layer: str = "patch"
+    """Path of the layer that reads the input channels, the first axis of its kernel."""
+    pipeline: Callable[[ModelConfig], dict[str, dict[str, Any]]] | None = None
+    """JSON files by path of a diffusers pipeline around this denoiser, without its networks."""
+
+    def rules(self, naming: str, config: Any) -> list[Rule]:
+        """Return the rules of a naming. Raises `InputError` if the table does not have it."""
+        if naming not in self.namings:
+            raise InputError(
+                f"The network has no {naming} naming. Available: {', '.join(self.namings)}."
+            )
+        return self.namings[naming].rules(config)
+
+    def naming_in(self, layout: str) -> str:
+        """Return the naming that a layout uses. Raises `InputError` if there is none."""
+        for name, naming in self.namings.items():
+            if naming.layout == layout:
+                return name
+        known = ", ".join(naming.layout for naming in self.namings.values())
+        raise InputError(f"The network has no layout {layout}. Available: {known}. (--layout)")
+
+
+def table_of(config: NetworkConfig) -> Table:
+    """Return the conversion table that a network's config names."""
+    return importlib.import_module(config.table).TABLE
+
+
+def tables_of(models: Iterable[ModelConfig]) -> list[tuple[str, Table]]:
+    """Return each network name of the models with its table, without repetition."""
+    pairs = ((n, table_of(network)) for model in models for n, network in model.networks.items())
+    return list(dict.fromkeys(pairs))
+
+
+@cache  # building the module takes most of a second
+def weight_shapes(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every weight of a config's network by its path."""
+    from egosim_jax.io.weights import flat_shapes
+    from egosim_jax.models import abstract
+
+    return flat_shapes(abstract(config))

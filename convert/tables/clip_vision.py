@@ -1,19 +1,22 @@
-"""Names of the CLIP image encoder's weights: Wan's official file and transformers' CLIP.
-
-Like every table: `wan` and `transformers` give the rules of a naming, `ignored` the patterns of
-names, in any naming, that the network does not use.
-"""
+"""Conversion table of the CLIP image encoder: Wan's official file and transformers' CLIP."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from einops import rearrange
+
 from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 
 
 def wan(config: CLIPVisionConfig) -> list[Rule]:
-    """Rules for `models_clip_open-clip-xlm-roberta-large-vit-huge-14.pth`, the same for any size.
+    """Return the rules for `models_clip_open-clip-xlm-roberta-large-vit-huge-14.pth`.
 
-    Without the prefix `model.` that some copies of it have.
+    They are the same for any size, and without the prefix `model.` of some copies.
     """
     block = "visual.transformer.*"
     fused = f"{block}.attn.to_qkv"
@@ -32,9 +35,9 @@ def wan(config: CLIPVisionConfig) -> list[Rule]:
 
 
 def transformers(config: CLIPVisionConfig) -> list[Rule]:
-    """Rules for the state dict of transformers' `CLIPVisionModel`, the same for any size.
+    """Return the rules for the state dict of transformers' `CLIPVisionModel`.
 
-    Without the prefix `vision_model.` that files of older versions have.
+    They are the same for any size, and without the prefix `vision_model.` of older versions.
     """
     block = "encoder.layers.*"
     projections = {"q_proj": "q", "k_proj": "k", "v_proj": "v", "out_proj": "o"}
@@ -56,8 +59,8 @@ def transformers(config: CLIPVisionConfig) -> list[Rule]:
 
 
 def ignored(config: CLIPVisionConfig) -> list[str]:
-    """The text half of CLIP, what the two are compared by, and what follows our last block."""
-    left_out = range(config.blocks, config.layers)
+    """Return the keys of CLIP's text half, of its projections and of the last, unused blocks."""
+    unused = range(config.blocks, config.layers)
     return [
         "log_scale",
         "logit_scale",
@@ -69,9 +72,49 @@ def ignored(config: CLIPVisionConfig) -> list[str]:
         "visual.post_norm.*",
         "post_layernorm.*",
         "embeddings.position_ids",
-        *(f"visual.transformer.{layer}.*" for layer in left_out),
-        *(f"encoder.layers.{layer}.*" for layer in left_out),
+        *(f"visual.transformer.{layer}.*" for layer in unused),
+        *(f"encoder.layers.{layer}.*" for layer in unused),
     ]
+
+
+def arguments(config: CLIPVisionConfig) -> dict[str, Any]:
+    """Return the arguments of transformers' `CLIPVisionConfig`."""
+    return {
+        "hidden_size": config.dim,
+        "intermediate_size": config.ffn_dim,
+        "num_hidden_layers": config.layers,
+        "num_attention_heads": config.heads,
+        "image_size": config.image_size,
+        "patch_size": config.patch,
+        "layer_norm_eps": config.eps,
+        "hidden_act": "gelu",
+    }
+
+
+def shorten(config: CLIPVisionConfig) -> CLIPVisionConfig:
+    """Return a float32 config with fewer blocks, all of which are used."""
+    layers = min(SHORT_LAYERS, config.blocks)
+    return replace(config, dtype="float32", layers=layers, skip_last=0)
+
+
+def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Return both token grids of a random image."""
+    import torch
+    from transformers import CLIPVisionConfig as TorchConfig
+    from transformers import CLIPVisionModel
+
+    config = comparison.config
+    size = (1, config.image_size, config.image_size, 3)
+    pixels = np.random.default_rng(0).standard_normal(size, np.float32)
+    have = comparison.output(pixels)
+    torch_config = TorchConfig(**arguments(config))
+    with torch.no_grad():
+        module = comparison.load(
+            CLIPVisionModel(torch_config), prefix="vision_model.", unused="post_layernorm"
+        )
+        theirs = torch.from_numpy(rearrange(pixels, "b h w c -> b c h w").copy())
+        states = module(theirs, output_hidden_states=True)
+    return have, states.hidden_states[-1].numpy()
 
 
 def _linear(source: str, target: str, part: tuple[int, int] = (0, 1)) -> list[Rule]:
@@ -86,3 +129,33 @@ def _norm(source: str, target: str) -> list[Rule]:
         Rule(f"{source}.weight", f"{target}.scale"),
         Rule(f"{source}.bias", f"{target}.bias"),
     ]
+
+
+TABLE = Table(
+    namings={
+        "wan": Naming(
+            rules=wan,
+            signature="visual.cls_embedding",
+            layout="wan",
+            stem="models_clip_open-clip-xlm-roberta-large-vit-huge-14",
+        ),
+        "transformers": Naming(
+            rules=transformers,
+            signature="embeddings.class_embedding",
+            layout="diffusers",
+            folder="image_encoder",
+            stem="model",
+        ),
+    },
+    ignored=ignored,
+    reference=Reference(
+        naming="transformers",
+        library="transformers",
+        kind="CLIPVisionModel",
+        arguments=arguments,
+        shorten=shorten,
+        outputs=outputs,
+        model_type="clip_vision_model",
+    ),
+)
+"""Conversions of the CLIP image encoder."""

@@ -1,17 +1,29 @@
-"""Names of the umT5 encoder's weights: Wan's official file and transformers' `UMT5EncoderModel`.
-
-Like every table: `wan` and `transformers` give the rules of a naming, `ignored` the patterns of
-names, in any naming, that the network does not use.
-"""
+"""Conversion table of the umT5 text encoder: Wan's official file and transformers' model."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
 from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.tables import (
+    SHORT_LAYERS,
+    SHORT_VOCAB,
+    Comparison,
+    Naming,
+    Reference,
+    Table,
+)
 from egosim_jax.models.wan.umt5 import UMT5Config
+
+TOKENS = 128
+"""Length of the prompt in a reference forward."""
 
 
 def wan(config: UMT5Config) -> list[Rule]:
-    """Rules for `models_t5_umt5-xxl-enc-bf16.pth`, the same for any size."""
+    """Return the rules for `models_t5_umt5-xxl-enc-bf16.pth`, the same for any size."""
     return [
         Rule("token_embedding.weight", "embed.embedding"),
         Rule("blocks.*.norm1.weight", "blocks.norm1.scale"),
@@ -24,7 +36,7 @@ def wan(config: UMT5Config) -> list[Rule]:
 
 
 def transformers(config: UMT5Config) -> list[Rule]:
-    """Rules for the state dict of transformers' `UMT5EncoderModel`, the same for any size."""
+    """Return the rules for transformers' `UMT5EncoderModel`, the same for any size."""
     attention = "encoder.block.*.layer.0.SelfAttention"
     ffn = "encoder.block.*.layer.1.DenseReluDense"
     return [
@@ -39,8 +51,47 @@ def transformers(config: UMT5Config) -> list[Rule]:
 
 
 def ignored(config: UMT5Config) -> list[str]:
-    """The token table under its second name; the rules read it as `shared.weight`."""
+    """Return the second name of the token table, which the rules read as `shared.weight`."""
     return ["encoder.embed_tokens.weight"]
+
+
+def arguments(config: UMT5Config) -> dict[str, Any]:
+    """Return the arguments of transformers' `UMT5Config`."""
+    return {
+        "vocab_size": config.vocab,
+        "d_model": config.dim,
+        "d_kv": config.head_dim,
+        "d_ff": config.ffn_dim,
+        "num_layers": config.layers,
+        "num_heads": config.heads,
+        "relative_attention_num_buckets": config.buckets,
+        "relative_attention_max_distance": config.max_distance,
+        "layer_norm_epsilon": config.eps,
+        "feed_forward_proj": "gated-gelu",
+    }
+
+
+def shorten(config: UMT5Config) -> UMT5Config:
+    """Return a float32 config with fewer layers and a shorter token table."""
+    layers, vocab = min(SHORT_LAYERS, config.layers), min(SHORT_VOCAB, config.vocab)
+    return replace(config, dtype="float32", layers=layers, vocab=vocab)
+
+
+def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Return both embeddings of random tokens."""
+    import torch
+    from transformers import UMT5Config as TorchConfig
+    from transformers import UMT5EncoderModel
+
+    config = comparison.config
+    ids = np.random.default_rng(0).integers(0, config.vocab, (1, TOKENS), np.int32)
+    mask = np.ones(ids.shape, bool)
+    have = comparison.output(ids, mask)
+    torch_config = TorchConfig(**arguments(config))
+    with torch.no_grad():
+        module = comparison.load(UMT5EncoderModel(torch_config))
+        want = module(torch.from_numpy(ids).long(), torch.from_numpy(mask).long())
+    return have, want.last_hidden_state.numpy()
 
 
 def _linears(source: str, target: str, names: dict[str, str]) -> list[Rule]:
@@ -48,3 +99,33 @@ def _linears(source: str, target: str, names: dict[str, str]) -> list[Rule]:
         Rule(f"{source}.{theirs}.weight", f"{target}.{ours}.kernel", "linear")
         for theirs, ours in names.items()
     ]
+
+
+TABLE = Table(
+    namings={
+        "wan": Naming(
+            rules=wan,
+            signature="blocks.0.ffn.gate.0.weight",
+            layout="wan",
+            stem="models_t5_umt5-xxl-enc-bf16",
+        ),
+        "transformers": Naming(
+            rules=transformers,
+            signature="encoder.block.0.layer.0.SelfAttention.q.weight",
+            layout="diffusers",
+            folder="text_encoder",
+            stem="model",
+        ),
+    },
+    ignored=ignored,
+    reference=Reference(
+        naming="transformers",
+        library="transformers",
+        kind="UMT5EncoderModel",
+        arguments=arguments,
+        shorten=shorten,
+        outputs=outputs,
+        model_type="umt5",
+    ),
+)
+"""Conversions of the umT5 encoder."""

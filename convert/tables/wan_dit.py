@@ -1,21 +1,44 @@
-"""Names of the video transformer's weights: Wan 2.1's official files and diffusers' model.
+"""Conversion table of the video transformer: Wan 2.1's official files and diffusers' model.
 
-EgoSim and Wan 2.1 Fun InP have the official names. Like every table: `wan` and `diffusers` give
-the rules of a naming, `ignored` the patterns of names, in any naming, that the network does not
-use.
+EgoSim and Wan 2.1 Fun InP have the official names.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from einops import rearrange
+
+from egosim_jax.conditioning.layout import WAN_INPAINT
 from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.tables import (
+    SHORT_LAYERS,
+    Comparison,
+    Naming,
+    Reader,
+    Reference,
+    Table,
+)
+from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.networks import ModelConfig
 
 PATCH_KERNEL = "o c 1 i j -> c i j o"
 MODULATION = "1 k d -> k d"
+TEXT_TOKENS, IMAGE_TOKENS = 512, 257
+"""Tokens that diffusers' transformer takes, by which it separates text from image."""
+SCHEDULER = "FlowMatchEulerDiscreteScheduler"
+"""Class of the scheduler in diffusers."""
 
 
 def wan(config: WanDiTConfig) -> list[Rule]:
-    """Rules for the official state dict, for any input width."""
+    """Return the rules for the official state dict, for any number of input channels."""
     rules = [
         Rule("patch_embedding.weight", "patch.kernel", PATCH_KERNEL),
         Rule("patch_embedding.bias", "patch.bias"),
@@ -52,7 +75,7 @@ def wan(config: WanDiTConfig) -> list[Rule]:
 
 
 def diffusers(config: WanDiTConfig) -> list[Rule]:
-    """Rules for the state dict of diffusers' `WanTransformer3DModel`."""
+    """Return the rules for the state dict of diffusers' `WanTransformer3DModel`."""
     embedder = "condition_embedder"
     rules = [
         Rule("patch_embedding.weight", "patch.kernel", PATCH_KERNEL),
@@ -92,9 +115,79 @@ def diffusers(config: WanDiTConfig) -> list[Rule]:
     return rules
 
 
-def ignored(config: WanDiTConfig) -> list[str]:
-    """Nothing: the network uses every weight of these files."""
-    return []
+def arguments(config: WanDiTConfig) -> dict[str, Any]:
+    """Return the arguments of diffusers' `WanTransformer3DModel`."""
+    return {
+        "num_attention_heads": config.heads,
+        "attention_head_dim": config.head_dim,
+        "in_channels": config.in_channels,
+        "out_channels": config.out_channels,
+        "text_dim": config.text_dim,
+        "freq_dim": config.freq_dim,
+        "ffn_dim": config.ffn_dim,
+        "num_layers": config.layers,
+        "cross_attn_norm": True,
+        "eps": config.eps,
+        "image_dim": config.image_dim,
+        "added_kv_proj_dim": config.image_dim and config.dim,
+    }
+
+
+def shorten(config: WanDiTConfig) -> WanDiTConfig:
+    """Return a float32 config with fewer layers."""
+    return replace(config, dtype="float32", layers=min(SHORT_LAYERS, config.layers))
+
+
+def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Return both velocities of one small random clip."""
+    import torch
+    from diffusers import WanTransformer3DModel
+
+    config, widening = comparison.config, comparison.widening
+    draw = np.random.default_rng(0).standard_normal
+    latents = draw((1, 2, 8, 8, config.in_channels), np.float32)
+    text = draw((1, TEXT_TOKENS, config.text_dim), np.float32)
+    image = config.image_dim and draw((1, IMAGE_TOKENS, config.image_dim), np.float32)
+    t = np.full(1, 500, np.float32)
+    have = comparison.output(latents, t, text, image)
+    theirs = latents if widening is None else widening.narrow(latents)
+    module = WanTransformer3DModel(**arguments(replace(config, in_channels=theirs.shape[-1])))
+    with torch.no_grad():
+        velocity = comparison.load(module)(
+            torch.from_numpy(rearrange(theirs, "b f h w c -> b c f h w").copy()),
+            torch.from_numpy(t),
+            torch.from_numpy(text),
+            None if image is None else torch.from_numpy(image),
+            return_dict=False,
+        )[0]
+    return have, rearrange(velocity.numpy(), "b c f h w -> b f h w c")
+
+
+def to_diffusers(arrays: Mapping[str, Reader], config: WanDiTConfig) -> Mapping[str, Reader]:
+    """Rename official tensors by diffusers' own table."""
+    from diffusers.loaders import single_file_utils
+
+    return single_file_utils.convert_wan_transformer_to_diffusers(dict(arrays))
+
+
+def pipeline(config: ModelConfig) -> dict[str, dict[str, Any]]:
+    """Return the JSON files of a diffusers pipeline around the transformer.
+
+    Raises `InputError` for a diffusion process that diffusers' scheduler does not have.
+    """
+    if not isinstance(config.process, RectifiedFlow):
+        raise InputError(f"{SCHEDULER} has no {type(config.process).__name__}. (--layout wan)")
+    name = "WanPipeline" if config.image is None else "WanImageToVideoPipeline"
+    parts = ("tokenizer",) if config.image is None else ("tokenizer", "image_processor")
+    return {
+        "model_index.json": {"_class_name": name, "scheduler": ["diffusers", SCHEDULER]}
+        # They hold no weights: the caller passes them.
+        | {part: [None, None] for part in parts},
+        "scheduler/scheduler_config.json": {
+            "_class_name": SCHEDULER,
+            "shift": config.process.shift,
+        },
+    }
 
 
 def _linear(theirs: str, ours: str) -> list[Rule]:
@@ -106,3 +199,35 @@ def _linear(theirs: str, ours: str) -> list[Rule]:
 
 def _norm(theirs: str, ours: str) -> list[Rule]:
     return [Rule(f"{theirs}.weight", f"{ours}.scale"), Rule(f"{theirs}.bias", f"{ours}.bias")]
+
+
+TABLE = Table(
+    namings={
+        "wan": Naming(
+            rules=wan,
+            signature="blocks.0.self_attn.q.weight",
+            layout="wan",
+            stem="diffusion_pytorch_model",
+            lora_prefix="diffusion_model.",
+            to_reference=to_diffusers,
+        ),
+        "diffusers": Naming(
+            rules=diffusers,
+            signature="condition_embedder.time_proj.weight",
+            layout="diffusers",
+            folder="transformer",
+            stem="diffusion_pytorch_model",
+        ),
+    },
+    reference=Reference(
+        naming="diffusers",
+        library="diffusers",
+        kind="WanTransformer3DModel",
+        arguments=arguments,
+        shorten=shorten,
+        outputs=outputs,
+    ),
+    base=WAN_INPAINT,
+    pipeline=pipeline,
+)
+"""Conversions of the video transformer; its base models are Wan 2.1's image-to-video models."""

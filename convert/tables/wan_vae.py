@@ -1,16 +1,26 @@
-"""Names of the video VAE's weights: Wan 2.1's official file and diffusers' `AutoencoderKLWan`.
+"""Conversion table of the video VAE: Wan 2.1's official file and diffusers' `AutoencoderKLWan`.
 
-Both follow our module tree, so that a rule is our path with its words replaced. Like every table:
-`wan` and `diffusers` give the rules of a naming, `ignored` the patterns of names, in any naming,
-that the network does not use.
+Both follow our module tree, so that a rule is our path with its words replaced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from einops import rearrange
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.convert.skeleton import shapes
+from egosim_jax.convert.tables import (
+    Comparison,
+    Naming,
+    Reader,
+    Reference,
+    Table,
+    weight_shapes,
+)
 from egosim_jax.models.wan.vae import WanVAEConfig
 
 LEAVES = {"kernel": "weight", "bias": "bias", "scale": "gamma"}
@@ -31,10 +41,12 @@ DIFFUSERS = SHARED | {
     "from_latents": "post_quant_conv",
     "shortcut": "conv_shortcut",
 }
+RELEASED_RES_BLOCKS = 2
+"""Residual blocks per encoder level that diffusers' own renaming supports."""
 
 
 def wan(config: WanVAEConfig) -> list[Rule]:
-    """Rules for `Wan2.1_VAE.pth`, without the prefix `model.` that some copies of it have."""
+    """Return the rules for `Wan2.1_VAE.pth`, without the prefix `model.` of some copies."""
 
     def place(half: str, group: str, index: int) -> str:
         levels = {"encoder": "downsamples", "decoder": "upsamples"}[half]
@@ -44,7 +56,7 @@ def wan(config: WanVAEConfig) -> list[Rule]:
 
 
 def diffusers(config: WanVAEConfig) -> list[Rule]:
-    """Rules for the state dict of diffusers' `AutoencoderKLWan`."""
+    """Return the rules for the state dict of diffusers' `AutoencoderKLWan`."""
 
     def place(half: str, group: str, index: int) -> str:
         if group == "middle":
@@ -60,17 +72,54 @@ def diffusers(config: WanVAEConfig) -> list[Rule]:
     return _rules(config, DIFFUSERS, place)
 
 
-def ignored(config: WanVAEConfig) -> list[str]:
-    """Nothing: the network uses every weight of these files."""
-    return []
+def arguments(config: WanVAEConfig) -> dict[str, Any]:
+    """Return the arguments of diffusers' `AutoencoderKLWan`."""
+    return {
+        "base_dim": config.dim,
+        "z_dim": config.z_dim,
+        "dim_mult": list(config.dim_mult),
+        "num_res_blocks": config.res_blocks,
+        "temperal_downsample": list(config.temporal_downsample),
+        "latents_mean": list(config.latent_mean),
+        "latents_std": list(config.latent_std),
+    }
+
+
+def shorten(config: WanVAEConfig) -> WanVAEConfig:
+    """Return the config in float32, with all its layers."""
+    return replace(config, dtype="float32")
+
+
+def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Return both reconstructions of a small random video."""
+    import torch
+    from diffusers import AutoencoderKLWan
+
+    module = comparison.load(AutoencoderKLWan(**arguments(comparison.config)))
+    video = np.random.default_rng(0).uniform(-1, 1, (1, 5, 32, 32, 3)).astype(np.float32)
+    have = comparison.output(video, call=lambda vae, x: vae.decode(vae.encode(x)))
+    with torch.no_grad():
+        theirs = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
+        (posterior,) = module.encode(theirs, return_dict=False)
+        (decoded,) = module.decode(posterior.mode(), return_dict=False)
+    return have, rearrange(decoded.numpy(), "b c f h w -> b f h w c")
+
+
+def to_diffusers(arrays: Mapping[str, Reader], config: WanVAEConfig) -> Mapping[str, Reader] | None:
+    """Rename official tensors by diffusers' own table, which is for the released size only."""
+    from diffusers.loaders import single_file_utils
+
+    if config.res_blocks != RELEASED_RES_BLOCKS:
+        return None
+    return single_file_utils.convert_wan_vae_to_diffusers(dict(arrays))
 
 
 def _rules(
     config: WanVAEConfig, words: dict[str, str], place: Callable[[str, str, int], str]
 ) -> list[Rule]:
-    """A rule for each of our paths, `[half.[group.index.]]part.leaf`."""
+    """Return a rule for each weight path, `[half.[group.index.]]part.leaf`."""
     rules = []
-    for path, shape in shapes("vae", config).items():
+    for path, shape in weight_shapes(config).items():
         *where, part, leaf = path.split(".")
         if len(where) == 3:
             half, group, index = where
@@ -81,10 +130,39 @@ def _rules(
 
 
 def _layout(part: str, leaf: str, axes: int) -> str:
-    """The transform of one weight; attention is written for images, all else for videos."""
+    """Return the transform of one weight; attention is 2D, everything else 3D."""
     ones = "1 1" if part in ("qkv", "out", "norm") else "1 1 1"
     if leaf == "scale":
         return f"c {ones} -> c"
     if leaf == "bias":
         return "same"
     return {2: f"o i {ones} -> i o", 4: "conv2d", 5: "conv3d"}[axes]
+
+
+TABLE = Table(
+    namings={
+        "wan": Naming(
+            rules=wan,
+            signature="decoder.upsamples.0.residual.2.weight",
+            layout="wan",
+            stem="Wan2.1_VAE",
+            to_reference=to_diffusers,
+        ),
+        "diffusers": Naming(
+            rules=diffusers,
+            signature="decoder.up_blocks.0.resnets.0.conv1.weight",
+            layout="diffusers",
+            folder="vae",
+            stem="diffusion_pytorch_model",
+        ),
+    },
+    reference=Reference(
+        naming="diffusers",
+        library="diffusers",
+        kind="AutoencoderKLWan",
+        arguments=arguments,
+        shorten=shorten,
+        outputs=outputs,
+    ),
+)
+"""Conversions of the video VAE."""

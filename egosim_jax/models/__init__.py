@@ -78,7 +78,7 @@ class NetworkConfig(Protocol):
     """Config of a network, which builds it."""
 
     table: ClassVar[str]
-    """Module under `egosim_jax.convert.tables` with the names of its weights in other formats."""
+    """Module whose `TABLE` maps its weights to the names of other formats (`convert.tables`)."""
 
     @property
     def dtype(self) -> str:

@@ -36,14 +36,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from egosim_jax import configs
-from egosim_jax.convert.commands import STEMS
-from egosim_jax.convert.layouts import Network
-from egosim_jax.convert.plan import TABLES, to_theirs
-from egosim_jax.convert.skeleton import skeleton
+from egosim_jax.convert.plan import to_torch
+from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import Tensor, read_safetensors
-from egosim_jax.io.weights import flat_shapes
 
-DTYPES: dict[Network, torch.dtype] = {
+DTYPES = {
     "dit": torch.bfloat16, "vae": torch.float32, "text": torch.bfloat16, "image": torch.float16,
 }  # fmt: skip
 """Of the released files."""
@@ -65,12 +62,12 @@ class Memory:
         source, out = self.folder / "EgoSim-14B", self.folder / "converted"
         source.mkdir(parents=True)
         try:
-            files = [make_holes(source, network) for network in TABLES]
+            files = [make_holes(source, network) for network in DTYPES]
             total = sum(file.stat().st_size for file in files) / 1e9
             taken = sum(512 * file.stat().st_blocks for file in files) / 1e9
             print(f"{total:.1f} GB of files that take {taken:.2f} GB")
             seconds, peak = convert(source, "egosim_14b", out)
-            for network in TABLES:
+            for network in DTYPES:
                 converted = read_safetensors(out / f"{network}.safetensors")
                 assert {p: t.shape for p, t in converted.items()} == ours("egosim_14b", network)
         finally:
@@ -124,12 +121,12 @@ class Speed:
             print(f"converting / {doing}: {ratio:.2f}; goal {RATIO}: {verdict}")
 
 
-def ours(config: str, network: Network) -> dict[str, tuple[int, ...]]:
-    """The shapes of a network's weights."""
-    return flat_shapes(skeleton(network, getattr(configs.get(config), network)))
+def ours(config: str, network: str) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a network's weights by path."""
+    return weight_shapes(configs.get(config).networks[network])
 
 
-def theirs(config: str, network: Network) -> dict[str, tuple[int, ...]]:
+def theirs(config: str, network: str) -> dict[str, tuple[int, ...]]:
     """The names and shapes of the released file."""
     outlines = {
         path: Tensor(
@@ -137,14 +134,15 @@ def theirs(config: str, network: Network) -> dict[str, tuple[int, ...]]:
         )
         for path, shape in ours(config, network).items()
     }
-    weights = to_theirs(outlines, configs.get(config), network, "wan")
+    weights = to_torch(outlines, configs.get(config).networks[network], "wan")
     return {weight.name: weight.shape for weight in weights}
 
 
-def make_holes(folder: Path, network: Network) -> Path:
+def make_holes(folder: Path, network: str) -> Path:
     """A released file whose values are all 0, and not there."""
     shapes, dtype = theirs("egosim_14b", network), DTYPES[network]
-    stem = folder / STEMS[network, "wan"]
+    table = table_of(configs.get("egosim_14b").networks[network])
+    stem = folder / table.namings["wan"].stem
     if network == "dit":
         return write_holes(stem.with_suffix(".safetensors"), shapes)
     file = Path(f"{stem}.pth")

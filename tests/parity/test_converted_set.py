@@ -96,7 +96,7 @@ def saved_as_released(theirs, folder):
 
     def renamed(network, table, naming, shape):
         state = {name: tensor.numpy() for name, tensor in theirs[network].state_dict().items()}
-        ours = translate(state, getattr(table, naming)(shape), ignore=table.ignored(shape))
+        ours = translate(state, getattr(table, naming)(shape), ignore=table.TABLE.ignored(shape))
         back = translate_back(ours, table.wan(shape))
         return {name: torch.tensor(np.ascontiguousarray(x)) for name, x in back.items()}
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 from egosim_jax import configs
-from egosim_jax.convert.lora import about_lora, exported, read_lora
+from egosim_jax.convert.lora import exported, exported_metadata, read_lora
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.lora import Delta
 from egosim_jax.networks import Networks
@@ -40,7 +40,7 @@ def test_a_lora_is_read_as_it_was_written(layers, rank, seed):
         deltas[name] = Delta(down=down, up=up)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "lora.safetensors"
-        save_file(exported(deltas, CONFIG), path, metadata=about_lora(deltas))
+        save_file(exported(deltas, CONFIG), path, metadata=exported_metadata(deltas))
         back = read_lora(path, CONFIG)
     assert back.keys() == deltas.keys()
     for name, delta in deltas.items():

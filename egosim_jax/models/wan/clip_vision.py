@@ -32,8 +32,8 @@ from egosim_jax.types import InputError
 class CLIPVisionConfig:
     """Sizes of the image encoder; the defaults are those of ViT-H/14."""
 
-    table: ClassVar[str] = "clip_vision"
-    """Name table of conversion."""
+    table: ClassVar[str] = "egosim_jax.convert.tables.clip_vision"
+    """Module of the conversion table."""
 
     image_size: int = 224
     """Rows and columns of the picture in pixels, a multiple of `patch`."""

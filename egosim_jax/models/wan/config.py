@@ -22,8 +22,8 @@ Remat = Literal["none", "products", "projections", "attention", "full", "offload
 class WanDiTConfig:
     """Shape and numerics of the transformer; the defaults are EgoSim's 14B."""
 
-    table: ClassVar[str] = "wan_dit"
-    """Name table of conversion."""
+    table: ClassVar[str] = "egosim_jax.convert.tables.wan_dit"
+    """Module of the conversion table."""
     numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "attention", "remat")
     """Fields that change only how values are computed, which a resumed training may change."""
     remat_levels: ClassVar[tuple[Remat, ...]] = (

@@ -37,8 +37,8 @@ from egosim_jax.types import InputError
 class UMT5Config:
     """Sizes of the text encoder; the defaults are umT5-XXL's."""
 
-    table: ClassVar[str] = "umt5"
-    """Name table of conversion."""
+    table: ClassVar[str] = "egosim_jax.convert.tables.umt5"
+    """Module of the conversion table."""
 
     vocab: int = 256384
     """Rows of the token table; the tokenizer may use fewer."""

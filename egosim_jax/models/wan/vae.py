@@ -49,8 +49,8 @@ from egosim_jax.types import SPATIAL_STRIDE, TEMPORAL_STRIDE, InputError, check_
 class WanVAEConfig:
     """Sizes of the video VAE; the defaults are the released one's."""
 
-    table: ClassVar[str] = "wan_vae"
-    """Name table of conversion."""
+    table: ClassVar[str] = "egosim_jax.convert.tables.wan_vae"
+    """Module of the conversion table."""
 
     dim: int = 96
     """Channels at full resolution."""

@@ -1,6 +1,5 @@
 """`egosim-convert`: checkpoints as they are released, to weights folders."""
 
-import importlib
 import json
 import math
 import re
@@ -25,9 +24,8 @@ from safetensors.torch import save_file
 from egosim_jax import configs
 from egosim_jax.convert import commands
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.layouts import recognize
-from egosim_jax.convert.plan import TABLES
-from egosim_jax.convert.tables import wan_dit
+from egosim_jax.convert.detect import detect
+from egosim_jax.convert.tables import table_of, wan_dit
 from egosim_jax.io.weights import flat_shapes, hashes, load
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.networks import Networks
@@ -50,8 +48,8 @@ def foreign(network, naming, dtype=torch.float32) -> dict[str, torch.Tensor]:
         path: rng.normal(size=shape).astype(np.float32)
         for path, shape in all_shapes()[network].items()
     }
-    table = importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
-    theirs = translate_back(ours, getattr(table, naming)(getattr(CONFIG, network)))
+    config = CONFIG.networks[network]
+    theirs = translate_back(ours, table_of(config).rules(naming, config))
     return {
         name: torch.from_numpy(np.ascontiguousarray(tensor)).to(dtype)
         for name, tensor in theirs.items()
@@ -126,10 +124,9 @@ def test_every_network_of_every_layout_is_converted_bit_for_bit(checkpoint, tmp_
     assert convert(checkpoint, tmp_path / "out") == 0
     for network in NETWORKS:
         ours = load_file(tmp_path / "out" / f"{network}.safetensors")
-        table = importlib.import_module(f"egosim_jax.convert.tables.{TABLES[network]}")
-        naming = next(n for n in ("wan", "transformers", "diffusers") if hasattr(table, n))
-        back = translate_back(ours, getattr(table, naming)(getattr(CONFIG, network)))
-        expected = foreign(network, naming)
+        config = CONFIG.networks[network]
+        back = translate_back(ours, table_of(config).rules("wan", config))
+        expected = foreign(network, "wan")
         assert back.keys() == expected.keys()
         assert all(np.array_equal(back[name], expected[name].numpy()) for name in back)
     Networks.load(CONFIG, tmp_path / "out")
@@ -150,7 +147,7 @@ def test_inspect_says_what_is_there_and_which_config_fits(checkpoint, capsys):
 
 
 def of_any(checkpoint, network):
-    return recognize(checkpoint).network(network).tensors.values()
+    return detect(checkpoint).network(network).tensors.values()
 
 
 def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
@@ -192,7 +189,7 @@ def test_a_network_or_tokenizer_that_is_asked_for_must_be_there(tmp_path, capsys
     assert "network dit" in capsys.readouterr().err
     save_file({"a": torch.rand(1)}, source / "vae.safetensors")
     assert convert(source, tmp_path / "out") == 2
-    assert "no network of ours" in capsys.readouterr().err
+    assert "no known network" in capsys.readouterr().err
 
 
 def test_the_hash_in_the_header_tells_weights_apart(tmp_path):
@@ -280,7 +277,7 @@ def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
     only = ["--layout", "diffusers", "--only", "text", "image"]
     assert back(tmp_path / "ours", tmp_path / "back", *only) == 0
     for network in ("text", "image"):
-        tensors = recognize(tmp_path / "back").network(network).tensors
+        tensors = detect(tmp_path / "back").network(network).tensors
         expected = foreign(network, "transformers")
         assert tensors.keys() == expected.keys()
         assert all(np.array_equal(t.array(), expected[n].numpy()) for n, t in tensors.items())
@@ -292,12 +289,12 @@ def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, m
     assert convert(checkpoint, tmp_path / "ours") == 0
     assert back(tmp_path / "ours", tmp_path / "theirs", "--layout", layout) == 0
     for network in NETWORKS:
-        found = recognize(tmp_path / "theirs").network(network)
+        found = detect(tmp_path / "theirs").network(network)
         expected = foreign(network, found.naming)
         assert found.tensors.keys() == expected.keys()
         for name, tensor in found.tensors.items():
             np.testing.assert_array_equal(tensor.array(), expected[name].numpy())
-    dit = recognize(tmp_path / "theirs").network("dit").source.files
+    dit = detect(tmp_path / "theirs").network("dit").source.files
     assert len(dit) > 1
     assert all(file.stat().st_size < 250_000 for file in dit)
     assert convert(tmp_path / "theirs", tmp_path / "again") == 0
@@ -365,11 +362,11 @@ def test_verify_finds_one_changed_value(tmp_path, capsys):
     data[-1] ^= 1
     file.write_bytes(data)
     assert main(check) == 1
-    assert "is not what was written" in capsys.readouterr().out
+    assert "does not match its checksum" in capsys.readouterr().out
     save_flax(load_flax(file), file)  # as before there were checksums
     assert main(check) == 1
     said = capsys.readouterr().out
-    assert "dit: carries no checksums" in said
+    assert "dit: no checksums" in said
     assert "differs" in said
 
 

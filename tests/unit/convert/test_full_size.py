@@ -1,4 +1,4 @@
-"""Every name and shape of the released files at their real size, without their values."""
+"""Names and shapes of the released files at their real size, without their values."""
 
 import hashlib
 from dataclasses import replace
@@ -8,30 +8,26 @@ import numpy as np
 import pytest
 import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
-from flax import nnx
 from transformers import CLIPVisionConfig, CLIPVisionModel, UMT5Config, UMT5EncoderModel
 
 from egosim_jax import configs
-from egosim_jax.convert.layouts import networks_of
-from egosim_jax.convert.plan import to_ours, to_theirs
+from egosim_jax.convert.detect import known_tables, networks_of
+from egosim_jax.convert.plan import to_jax, to_torch
 from egosim_jax.convert.source import Source
+from egosim_jax.convert.tables import weight_shapes
 from egosim_jax.io.mapped import Tensor
-from egosim_jax.io.weights import flat_shapes
-from egosim_jax.models.wan.dit import WanDiT
-from egosim_jax.models.wan.umt5 import UMT5
-from egosim_jax.models.wan.vae import WanVAE
 
 EGOSIM_14B, EGOSIM_1_3B = configs.get("egosim_14b"), configs.get("egosim_1_3b")
 
 
 def changed(config, network, **changes):
-    """A config of one network."""
-    shape = replace(getattr(config, network), **changes)
-    return SimpleNamespace(name="changed", **{network: shape})
+    """Return a model config of one changed network."""
+    networks = {network: replace(config.networks[network], **changes)}
+    return SimpleNamespace(name="changed", networks=networks)
 
 
 def shaped(shapes):
-    """Tensors that have shapes alone."""
+    """Return tensors of these shapes without values."""
     return {
         name: Tensor(
             shape=tuple(shape),
@@ -44,19 +40,20 @@ def shaped(shapes):
 
 
 def there_and_back(config, network, naming, theirs):
-    """The names and shapes that come back after a conversion of the given ones."""
-    (found,) = networks_of(Source(name="released", files=(), tensors=shaped(theirs)))
+    """Return the names and shapes of tensors after a conversion to JAX and back."""
+    source = Source(name="released", files=(), tensors=shaped(theirs))
+    (found,) = networks_of(source, known_tables())
     assert (found.network, found.naming) == (network, naming)
-    ours = shaped({weight.name: weight.shape for weight in to_ours(found, config)})
-    return {weight.name: weight.shape for weight in to_theirs(ours, config, network, naming)}
+    ours = shaped({weight.name: weight.shape for weight in to_jax(found, config)})
+    back = to_torch(ours, config.networks[network], naming)
+    return {weight.name: weight.shape for weight in back}
 
 
 def leaves(config, network, naming):
-    """What the network's table says that the foreign file holds."""
-    network_of = {"dit": WanDiT, "vae": WanVAE, "text": UMT5}[network]
-    made = nnx.eval_shape(lambda: network_of(getattr(config, network), rngs=nnx.Rngs(0)))
-    ours = shaped(flat_shapes(made))
-    return {weight.name: weight.shape for weight in to_theirs(ours, config, network, naming)}
+    """Return the names and shapes of a foreign file by the network's table."""
+    ours = shaped(weight_shapes(config.networks[network]))
+    written = to_torch(ours, config.networks[network], naming)
+    return {weight.name: weight.shape for weight in written}
 
 
 @pytest.mark.parametrize(

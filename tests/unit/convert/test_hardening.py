@@ -15,7 +15,7 @@ import torch
 from safetensors.numpy import save_file
 
 from egosim_jax.convert import pth
-from egosim_jax.convert.layouts import recognize
+from egosim_jax.convert.detect import detect
 from egosim_jax.convert.pth import read_pth
 from egosim_jax.convert.rules import Rule, assign
 from egosim_jax.convert.source import sources
@@ -130,11 +130,11 @@ INDICES = {
     "no JSON": (b"{", "not valid JSON"),
     "a list": (b"[]", "no weight_map"),
     "an empty map": (b'{"weight_map": {}}', "no weight_map"),
-    "a number as file": (b'{"weight_map": {"a": 1}}', "names a int"),
+    "a number as file": (b'{"weight_map": {"a": 1}}', "has a int"),
     "lists in lists": (50_000 * b"[", "nested too deeply"),
-    "a file outside": (b'{"weight_map": {"a": "../x.safetensors"}}', "beside it"),
-    "a long name": (b'{"weight_map": {"a": "%s"}}' % ((1 << 20) * b"a"), "beside it"),
-    "a NUL": (b'{"weight_map": {"a": "x\\u0000.safetensors"}}', "beside it"),
+    "a file outside": (b'{"weight_map": {"a": "../x.safetensors"}}', "next to it"),
+    "a long name": (b'{"weight_map": {"a": "%s"}}' % ((1 << 20) * b"a"), "next to it"),
+    "a NUL": (b'{"weight_map": {"a": "x\\u0000.safetensors"}}', "next to it"),
     "a tensor that is not there": (b'{"weight_map": {"b": "x.safetensors"}}', "tensors that its"),
 }
 
@@ -170,7 +170,7 @@ def test_a_file_of_many_networks_is_refused(tmp_path):
     empty = np.zeros(0, np.float32)
     tensors = {f"{number}.visual.cls_embedding": empty for number in range(1000)}
     save_file(tensors, tmp_path / "x.safetensors")
-    assert "1000 networks" in refused(recognize, tmp_path)
+    assert "1000 networks" in refused(detect, tmp_path)
 
 
 # Pickles.

@@ -1,4 +1,4 @@
-"""What `egosim-convert` refuses, keeps out of the weights, and hands on to others."""
+"""Inputs that `egosim-convert` refuses, and the outputs that other projects load."""
 
 import errno
 import json
@@ -23,7 +23,7 @@ from egosim_jax import configs
 from egosim_jax.convert import stream
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.lora import read_lora
-from egosim_jax.convert.skeleton import shapes
+from egosim_jax.convert.tables import weight_shapes
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_metadata
 from egosim_jax.models import lora
@@ -48,7 +48,7 @@ def one_line(capsys, code, *args):
 @cache
 def arrays(network):
     rng = np.random.default_rng(0)
-    found = shapes(network, getattr(CONFIG, network))
+    found = weight_shapes(CONFIG.networks[network])
     return {path: 0.2 * rng.normal(size=s).astype(np.float32) for path, s in found.items()}
 
 
@@ -102,7 +102,7 @@ def test_a_link_in_a_tokenizer_is_refused_before_anything_is_written(
 ):
     source, folder = tokenized
     (folder / "tokenizer_config.json").symlink_to(to)
-    assert "is a link" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
+    assert "is a symlink" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -110,7 +110,7 @@ def test_a_linked_tokenizer_folder_is_refused(tokenized, tmp_path, capsys):
     source, folder = tokenized
     folder.rename(tmp_path / "elsewhere")
     folder.symlink_to(tmp_path / "elsewhere")
-    assert "is a link" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
+    assert "is a symlink" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
 
 
 def test_a_huge_tokenizer_is_refused(tokenized, tmp_path, capsys):
@@ -131,7 +131,7 @@ def test_what_is_written_is_apart_from_what_is_read(tmp_path, capsys):
         ["lora", file, "--config", "debug", "--out", file],
         ["to-torch", base, "--config", "debug", "--out", base],
     ):  # fmt: skip
-        assert "choose a place apart" in one_line(capsys, 2, *command)
+        assert "choose a separate output path" in one_line(capsys, 2, *command)
     assert [path.name for path in base.iterdir()] == ["dit.safetensors"]
 
 
@@ -161,21 +161,21 @@ def summand(changes):
 
 
 BAD = {
-    "NaN as alpha": (pair() | {f"{NAME}.alpha": torch.tensor(math.nan)}, None, "no finite"),
-    "an infinite alpha": (pair() | {f"{NAME}.alpha": torch.tensor(math.inf)}, None, "no finite"),
+    "NaN as alpha": (pair() | {f"{NAME}.alpha": torch.tensor(math.nan)}, None, "not a finite"),
+    "an infinite alpha": (pair() | {f"{NAME}.alpha": torch.tensor(math.inf)}, None, "not a finite"),
     "two alphas": (pair() | {f"{NAME}.alpha": torch.ones(2)}, None, "2 numbers as alpha"),
-    "NaN in the header": (pair(), {"ss_network_alpha": "nan"}, "no finite"),
-    "a word in the header": (pair(), {"alpha": "much"}, "no finite"),
+    "NaN in the header": (pair(), {"ss_network_alpha": "nan"}, "not a finite"),
+    "a word in the header": (pair(), {"alpha": "much"}, "not a finite"),
     "NaN as weights": ({k: v * math.nan for k, v in pair().items()}, None, "not finite"),
     "infinite weights": ({k: v + math.inf for k, v in pair().items()}, None, "not finite"),
     "an alpha too high": (pair() | {f"{NAME}.alpha": torch.tensor(3e38)}, None, "not finite"),
     "an infinite delta": ({f"{NAME}.diff_b": torch.full((DIM,), math.inf)}, None, "not finite"),
     "rank 0": (pair(rank=0), None, "has rank 0"),
     "rank 5,000": (pair(rank=5000), None, "has rank 5000"),
-    "another width": (pair(dim=DIM + 1), None, "want"),
+    "another width": (pair(dim=DIM + 1), None, "expected"),
     "a layer too many": (pair(name="blocks.30.self_attn.q"), None, "not of a layer"),
-    "a text encoder alone": (pair(name="lora_te_a"), None, "holds nothing"),
-    "nothing": ({}, None, "holds nothing"),
+    "a text encoder alone": (pair(name="lora_te_a"), None, "has no layers"),
+    "nothing": ({}, None, "has no layers"),
 }
 
 
@@ -270,7 +270,7 @@ def test_layers_of_a_text_encoder_are_left_out_which_is_said(tmp_path, capsys):
     both = pair() | pair(name="lora_te_text_model_encoder_layers_0_mlp_fc1")
     changes = read_lora(save(tmp_path / "x.safetensors", both), CONFIG.dit)
     assert changes.keys() == {LAYER}
-    assert "2 tensors of a text encoder are left out" in capsys.readouterr().err
+    assert "skipped 2 tensors of a text encoder" in capsys.readouterr().err
 
 
 def test_whole_deltas_are_merged_applied_and_written_alike(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from egosim_jax.convert.layouts import recognize
+from egosim_jax.convert.detect import detect
 from egosim_jax.convert.source import sources
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.types import InputError
@@ -95,7 +95,7 @@ def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
 def test_a_name_in_two_files_and_an_index_of_something_else_are_refused(tmp_path):
     for number in (1, 2):
         save_file({"a": torch.rand(2)}, tmp_path / f"m-{number:05d}-of-00002.safetensors")
-    with pytest.raises(InputError, match="which another file of m has"):
+    with pytest.raises(InputError, match="which another file of m also has"):
         list(sources(tmp_path))
     for text in ("{}", "no json", '{"weight_map": {"a": "../m-00001-of-00002.safetensors"}}'):
         (tmp_path / "m.safetensors.index.json").write_text(text, encoding="utf-8")
@@ -103,7 +103,7 @@ def test_a_name_in_two_files_and_an_index_of_something_else_are_refused(tmp_path
             list(sources(tmp_path))
 
 
-def test_networks_are_told_by_their_names_under_any_prefix(tmp_path):
+def test_networks_are_detected_by_their_names_under_any_prefix(tmp_path):
     names = {
         ("dit", "wan", "diffusion_model."): "diffusion_model.blocks.0.self_attn.q.weight",
         ("vae", "wan", "model."): "model.decoder.upsamples.0.residual.2.weight",
@@ -119,7 +119,7 @@ def test_networks_are_told_by_their_names_under_any_prefix(tmp_path):
     (tmp_path / "google" / "umt5-xxl" / "tokenizer.json").touch()
     (tmp_path / ".cache").mkdir()
     save_file({"x": torch.rand(1)}, tmp_path / ".cache" / "x.safetensors")
-    folder = recognize(tmp_path)
+    folder = detect(tmp_path)
     assert {(f.network, f.naming, f.prefix) for f in folder.found} == names.keys()
     assert [source.name for source in folder.unknown] == ["z.safetensors"]
     assert folder.tokenizer == tmp_path / "google" / "umt5-xxl"
@@ -128,15 +128,15 @@ def test_networks_are_told_by_their_names_under_any_prefix(tmp_path):
 
 def test_what_is_not_there_or_not_one_is_said(tmp_path):
     with pytest.raises(InputError, match="holds no checkpoint"):
-        recognize(tmp_path)
+        detect(tmp_path)
     with pytest.raises(InputError, match="No such file"):
-        recognize(tmp_path / "none")
+        detect(tmp_path / "none")
     for name in "ab":
         save_file({"visual.cls_embedding": torch.rand(1)}, tmp_path / f"{name}.safetensors")
     with pytest.raises(InputError, match=r"2 checkpoints of the network image \(a\.s.*b\.s"):
-        recognize(tmp_path).network("image")
+        detect(tmp_path).network("image")
     with pytest.raises(InputError, match="0 checkpoints of the network dit"):
-        recognize(tmp_path).network("dit")
+        detect(tmp_path).network("dit")
 
 
 def test_bfloat16_is_read_as_such(tmp_path):

@@ -1,0 +1,144 @@
+"""Detect which networks a foreign checkpoint holds, and in which naming.
+
+A network is detected by the signature key of a naming; what precedes that key is the prefix of all
+its keys. Folders are searched as they are downloaded: EgoSim's and Wan's releases with their files
+side by side, diffusers' with a folder per network, and the tokenizer in a separate folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from egosim_jax.convert.source import Source, sources
+from egosim_jax.convert.tables import Table, tables_of
+from egosim_jax.io.mapped import Tensor
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.networks import ModelConfig
+
+TOKENIZER = ("tokenizer.json", "spiece.model")
+"""Files that mark the folder of a tokenizer."""
+DEEPEST = 2
+"""Levels of subfolders that are searched."""
+MOST_NETWORKS = 16
+"""Networks in a checkpoint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectedNetwork:
+    """Network in a foreign checkpoint."""
+
+    network: str
+    """Name of the network in a model."""
+    table: Table
+    """Conversion table that detected it."""
+    naming: str
+    """Naming of its tensors."""
+    prefix: str
+    """Prefix of all its keys, such as `diffusion_model.` in ComfyUI's files."""
+    source: Source
+    """Checkpoint that has it."""
+
+    @property
+    def tensors(self) -> Mapping[str, Tensor]:
+        """Tensors of the network by name, without the prefix."""
+        cut = len(self.prefix)
+        return {
+            name[cut:]: tensor
+            for name, tensor in self.source.tensors.items()
+            if name.startswith(self.prefix)
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folder:
+    """Networks and tokenizer of a checkpoint file or folder."""
+
+    path: Path
+    """File or folder that was searched."""
+    found: tuple[DetectedNetwork, ...]
+    """Networks in it."""
+    unknown: tuple[Source, ...]
+    """Checkpoints without a known network."""
+    tokenizer: Path | None
+    """Folder of the tokenizer, if any."""
+
+    def network(self, name: str) -> DetectedNetwork:
+        """Return the only checkpoint of a network. Raises `InputError` for none or several."""
+        here = [found for found in self.found if found.network == name]
+        if len(here) != 1:
+            names = ", ".join(found.source.name for found in here) or "none"
+            raise InputError(
+                f"{quote_path(self.path)} holds {len(here)} checkpoints of the network {name} "
+                f"({names}); expected one. Give the path of the file itself. (--source)"
+            )
+        return here[0]
+
+
+def detect(path: Path, config: ModelConfig | None = None) -> Folder:
+    """Search a file or folder for networks. Raises `InputError` if it holds no checkpoint.
+
+    The tables are those of all registered models, after those of `config`, which take precedence.
+    """
+    tables = known_tables(config)
+    found, unknown, tokenizer = [], [], None
+    for folder in _folders(path):
+        if folder.is_dir() and any((folder / name).is_file() for name in TOKENIZER):
+            tokenizer = tokenizer or folder
+        for source in sources(folder):
+            here = networks_of(source, tables)
+            found += here
+            unknown += [] if here else [source]
+    if not found and not unknown:
+        raise InputError(
+            f"{quote_path(path)} holds no checkpoint: no .safetensors, .pth, .pt or .bin. "
+            "(--source)"
+        )
+    return Folder(path=path, found=tuple(found), unknown=tuple(unknown), tokenizer=tokenizer)
+
+
+def known_tables(config: ModelConfig | None = None) -> list[tuple[str, Table]]:
+    """Return the network names and tables of a config, then of all registered models."""
+    from egosim_jax import configs
+
+    registered = map(configs.get, configs.names())
+    return tables_of([*(() if config is None else (config,)), *registered])
+
+
+def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[DetectedNetwork]:
+    """Return the networks of a checkpoint; a ComfyUI file may hold several under prefixes."""
+    found: dict[tuple[str, str], DetectedNetwork] = {}
+    for network, table in tables:
+        for naming, names in table.namings.items():
+            for key in source.tensors:
+                prefix = key.removesuffix(names.signature)
+                if prefix != key and (not prefix or prefix.endswith(".")):
+                    detected = DetectedNetwork(
+                        network=network, table=table, naming=naming, prefix=prefix, source=source
+                    )
+                    found.setdefault((network, prefix), detected)
+    if len(found) > MOST_NETWORKS:
+        raise InputError(
+            f"{source.name} holds {len(found)} networks; the limit is {MOST_NETWORKS} per file. "
+            "Split it."
+        )
+    return list(found.values())
+
+
+def _folders(path: Path) -> list[Path]:
+    """Return the path and its visible subfolders, nearest first."""
+    found, layer = [path], [path]
+    for _ in range(DEEPEST if path.is_dir() else 0):
+        layer = sorted(
+            inner
+            for outer in layer
+            for inner in outer.iterdir()
+            if inner.is_dir() and not inner.name.startswith(".")
+        )
+        found += layer
+    return found

@@ -1,0 +1,102 @@
+"""Widen the input layer of a base model to the channels of another model.
+
+Kernel rows of input parts that the base model does not have are 0, so that these do not count until
+they are trained. Where the two models encode the mask differently, the base's mask is an affine
+function of the model's, m_base = shift + scale m, which the kernel and bias of the layer absorb.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from egosim_jax.convert.stream import Weight
+from egosim_jax.convert.tables import table_of
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.conditioning.layout import ChannelLayout
+    from egosim_jax.networks import ModelConfig
+
+WidenMode = Literal["copy", "polarity"]
+"""Encoding of the base model's mask: the same as the model's, or that of the base's layout."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Widening:
+    """Change of a denoiser's input from a base model's channel layout to its own."""
+
+    base: ChannelLayout
+    """Input channels of the base model."""
+    layout: ChannelLayout
+    """Input channels of the model."""
+    input_layer: str
+    """Path of the layer that reads the channels, the first axis of its kernel."""
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Index, in the model's input, of each of the base's channels."""
+        every = np.arange(self.layout.channels)
+        return np.concatenate([every[self.layout.slice(name)] for name, _ in self.base.parts])
+
+    @property
+    def mask(self) -> tuple[float, float]:
+        """Shift and scale that map the model's mask to the base's."""
+        ratio = self.base.mask_scale / self.layout.mask_scale
+        if self.base.mask_one == self.layout.mask_one:
+            return 0.0, ratio
+        return self.base.mask_scale, -ratio
+
+    def narrow(self, latents: np.ndarray) -> np.ndarray:
+        """Return the base's input, channels last, for the model's."""
+        shift, scale = self.mask
+        found = latents[..., self.rows]
+        at = self.base.slice("mask")
+        found[..., at] = shift + scale * found[..., at]
+        return found
+
+    def apply(self, weights: dict[str, Weight]) -> None:
+        """Widen the input layer among the weights of a base model, in place."""
+        kernel, bias = (weights[f"{self.input_layer}.{name}"] for name in ("kernel", "bias"))
+        (read_kernel,), (read_bias,) = kernel.pieces, bias.pieces
+        shape = (self.layout.channels, *kernel.shape[1:])
+        weights[kernel.name] = replace(
+            kernel, shape=shape, pieces=(partial(self._kernel, read_kernel),)
+        )
+        if self.mask[0]:
+            pieces = (partial(self._bias, read_kernel, read_bias),)
+            weights[bias.name] = replace(bias, pieces=pieces)
+
+    def _kernel(self, read: Callable[[], np.ndarray]) -> np.ndarray:
+        base = read().copy()
+        base[self.base.slice("mask")] *= self.mask[1]
+        wide = np.zeros((self.layout.channels, *base.shape[1:]), base.dtype)
+        wide[self.rows] = base
+        return wide
+
+    def _bias(
+        self, read_kernel: Callable[[], np.ndarray], read: Callable[[], np.ndarray]
+    ) -> np.ndarray:
+        mask = read_kernel()[self.base.slice("mask")].astype(np.float64)
+        return read().astype(np.float64) + self.mask[0] * mask.sum(axis=tuple(range(mask.ndim - 1)))
+
+
+def widening_of(config: ModelConfig, mode: WidenMode) -> Widening:
+    """Return the widening from a model's base. Raises `InputError` if it has no narrower one."""
+    table = table_of(config.dit)
+    base = table.base
+    if base is None:
+        raise InputError(f"{config.name} has no base model to widen. (--widen)")
+    missing = [part for part, _ in base.parts if part not in config.layout]
+    if missing or base.channels >= config.layout.channels:
+        raise InputError(
+            f"{config.name} cannot be widened from a base model of {base.parts}: its layout "
+            f"{config.layout.parts} must have all of these parts and more. (--widen, --only dit)"
+        )
+    if mode == "copy":
+        base = replace(base, mask_one=config.layout.mask_one, mask_scale=config.layout.mask_scale)
+    return Widening(base=base, layout=config.layout, input_layer=table.input_layer)
