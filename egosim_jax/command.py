@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import logging
 import os
 import sys
 import traceback
@@ -68,6 +69,7 @@ def main(
     """
 
     given = list(sys.argv[1:] if args is None else args)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax also raises what it logs
 
     def run() -> int:
         import tyro

@@ -6,7 +6,6 @@ from egosim_jax import interrupts
 
 interrupts.expect()
 
-import logging
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -31,7 +30,6 @@ def main(args: Sequence[str] | None = None) -> int:
 
     given = sys.argv[1:] if args is None else args
     without_training = any(arg.partition("=")[0] == "--preflight" for arg in given)
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax's errors are raised as well
     return command.main(
         Recipes,
         program="egosim-train",

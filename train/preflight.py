@@ -29,6 +29,10 @@ from egosim_jax.types import MeshConfig
 ANNOUNCEMENT = "looking for other settings that fit, which takes minutes; --no-search skips it"
 
 
+NO_REMAT = "none"
+"""Rematerialization of a network whose config has none."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Setting:
     """The part of a batch that is computed at a time, and the rematerialization."""
@@ -110,7 +114,7 @@ def _fitting(
     counts = [clips for clips in range(1, share + 1) if share % clips == 0]
     fitting: dict[Setting, Report] = {}
     task: Any = stage.task
-    levels = task.model.dit.remat_levels
+    levels = task.model.dit.remat_levels or (NO_REMAT,)
 
     def tries() -> Iterator[None]:
         nonlocal levels
@@ -150,7 +154,8 @@ def _heading(title: str, stage: Stage, target: Target) -> str:
 def _setting(stage: Stage, target: Target) -> Setting:
     task, training = stage
     mesh = make_mesh(training.mesh, target.devices)
-    remat = task.model.dit.remat if isinstance(task, Denoising) else "none"
+    levels = isinstance(task, Denoising) and task.model.dit.remat_levels
+    remat = task.model.dit.remat if levels else NO_REMAT
     clips = training.batch_size // parts("batch", mesh) // training.grad_accum_steps
     return Setting(clips=clips, remat=remat, context=parts("tokens", mesh))
 
@@ -158,7 +163,7 @@ def _setting(stage: Stage, target: Target) -> Setting:
 def _with(stage: Stage, setting: Setting, share: int) -> Stage:
     task: Any = stage.task
     dit = task.model.dit
-    if setting.remat != dit.remat:
+    if dit.remat_levels:
         dit = replace(dit, remat=setting.remat)
     return Stage(
         replace(task, model=replace(task.model, dit=dit)),

@@ -22,7 +22,6 @@ from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.models import lora
 from egosim_jax.models.layers import LowRankParam
 from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.train.encode import example_shapes
 from egosim_jax.train.flops import count_forward
 from egosim_jax.train.update import Batch, Metrics
 
@@ -70,6 +69,8 @@ class Denoising:
 
     def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
         """Return the shapes of a batch of latents records."""
+        from egosim_jax.train.encode import example_shapes
+
         return example_shapes(self.model, batch)
 
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, "b 2"]:
