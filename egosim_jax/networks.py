@@ -60,7 +60,7 @@ class ModelConfig:
     """Sampler."""
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
-    steps: int | tuple[float, ...] = 50
+    steps: int | tuple[int | float, ...] = 50
     """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
 
     def __post_init__(self) -> None:

@@ -1,5 +1,6 @@
 """Diffusion: processes from data to noise, solvers, guidance and the training objective."""
 
+from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import (
@@ -9,10 +10,12 @@ from egosim_jax.diffusion.process import (
     RectifiedFlow,
     VariancePreserving,
 )
-from egosim_jax.diffusion.solver import Euler, Solver, integrate
+from egosim_jax.diffusion.solver import DDIM, Euler, Solver, integrate
 from egosim_jax.diffusion.unipc import UniPC
 
 __all__ = [
+    "DDIM",
+    "DPMSolver",
     "DenoiseFn",
     "Euler",
     "Guidance",

@@ -100,7 +100,7 @@ class Process(ABC):
         """Return the times at uniform positions `u` in [0, 1], to draw training times."""
 
     @abstractmethod
-    def times(self, steps: int | Sequence[float]) -> Float[np.ndarray, " times"]:
+    def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the times that a sampler visits, in float64, falling to 0.
 
         `steps` is the number of steps, or the timesteps to visit, as the network is given them.
@@ -220,7 +220,7 @@ class RectifiedFlow(Process):
         w = self.sigma_min + (self.sigma_max - self.sigma_min) * u
         return self.shift * w / (1 + (self.shift - 1) * w)
 
-    def times(self, steps: int | Sequence[float]) -> Float[np.ndarray, " times"]:
+    def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the shifted times of a sampler; given timesteps are visited as they are."""
         if isinstance(steps, int):
             visited = self.warp(np.linspace(1.0, 0.0, _count(steps) + 1)[:-1])
@@ -292,7 +292,7 @@ class VariancePreserving(Process):
             return (np.minimum(np.floor(n * u), n - 1) + 1) / n
         return (jnp.minimum(jnp.floor(n * u), n - 1) + 1) / n
 
-    def times(self, steps: int | Sequence[float]) -> Float[np.ndarray, " times"]:
+    def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the times of a sampler; given timesteps must be whole."""
         n = self.train_timesteps
         if not isinstance(steps, int):
@@ -345,7 +345,7 @@ def _count(steps: int) -> int:
     return steps
 
 
-def _falling(timesteps: Sequence[float], *, low: float, high: float) -> Float[np.ndarray, " n"]:
+def _falling(timesteps: Sequence[int | float], *, low: int, high: int) -> Float[np.ndarray, " n"]:
     """Return given timesteps as an array, checked."""
     visited = np.array(timesteps, np.float64)
     if not len(visited) or (np.diff(visited) >= 0).any():

@@ -8,7 +8,13 @@ Euler (rectified flow) follows the straight line of the present velocity v:
 
     x_t = x_s + (sigma_t - sigma_s) v
 
-The multistep solvers are in `unipc.py`.
+DDIM (Song et al. 2021; any process) keeps the predicted data and noise:
+
+    x_t = alpha_t x0 + sqrt(sigma_t^2 - s^2) e + s n,   n ~ N(0, 1)
+    s = eta sigma_t sqrt(1 - (alpha_s sigma_t / (sigma_s alpha_t))^2)
+
+eta = 0 is deterministic, eta = 1 the ancestral sampler. The multistep solvers are in `unipc.py`
+and `dpm.py`.
 """
 
 from __future__ import annotations
@@ -62,13 +68,18 @@ class Solver(Protocol):
         ...
 
 
+def sample_noise(keys: Key[Array, " b"], x: Float[Array, "*x"]) -> Float[Array, "*x"]:
+    """Draw the noise of a step, each sample's from its own key."""
+    return jax.vmap(lambda key: jax.random.normal(key, x.shape[1:]))(keys)
+
+
 def integrate(
     denoise: DenoiseFn,
     noise: Float[Array, "b f h w c"],
     *,
     process: Process,
     solver: Solver,
-    steps: int | Sequence[float],
+    steps: int | Sequence[int | float],
     keys: Key[Array, " b"] | None = None,
 ) -> Float[Array, "b f h w c"]:
     """Turn noise into latents, one network evaluation a step: one scan, no host round trips.
@@ -144,3 +155,75 @@ class Euler:
         output = output.astype(jnp.float32)
         velocity = process.to_velocity(state.x, output, row.alpha, row.sigma)
         return EulerState(state.x + row.change * velocity)
+
+
+class DDIMRow(NamedTuple):
+    """Coefficients of one DDIM step; with a leading step axis, of all steps."""
+
+    alpha: Float[Any, ""]
+    """Scale of the data at the step's start."""
+    sigma: Float[Any, ""]
+    """Scale of the noise there."""
+    data: Float[Any, ""]
+    """Factor of the predicted data."""
+    epsilon: Float[Any, ""]
+    """Factor of the predicted noise."""
+    noise: Float[Any, ""]
+    """Factor of the new noise, s."""
+
+
+class DDIMState(NamedTuple):
+    """Latents of the DDIM solver."""
+
+    x: Float[Array, "*x"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDIM:
+    """First-order solver on any process; the default sampler of CogVideoX."""
+
+    eta: float = 0.0
+    """Share of new noise: 0 is deterministic, 1 the ancestral sampler."""
+
+    def __post_init__(self) -> None:
+        """Check the share of noise."""
+        if not 0 <= self.eta <= 1:
+            raise InputError(f"DDIM's eta must be between 0 and 1, not {self.eta}.")
+
+    @property
+    def stochastic(self) -> bool:
+        """Return whether steps add noise."""
+        return self.eta > 0
+
+    def coefficients(self, process: Process, times: Float[np.ndarray, " times"]) -> DDIMRow:
+        """Return the factors of data and noise of each step."""
+        alpha, sigma = process.alpha(times), process.sigma(times)
+        ratio = alpha[:-1] * sigma[1:] / (sigma[:-1] * alpha[1:])  # e^-h
+        new = self.eta**2 * (1 - ratio**2)  # share of the variance
+        columns = (
+            alpha[:-1],
+            sigma[:-1],
+            alpha[1:],
+            sigma[1:] * np.sqrt(1 - new),
+            sigma[1:] * np.sqrt(new),
+        )
+        return DDIMRow(*(column.astype(np.float32) for column in columns))
+
+    def start(self, x: Float[Array, "*x"]) -> DDIMState:
+        """Return the noise as the first latents."""
+        return DDIMState(x.astype(jnp.float32))
+
+    def step(
+        self,
+        process: Process,
+        state: DDIMState,
+        output: Float[Array, "*x"],
+        row: DDIMRow,
+        keys: Key[Array, " b"] | None = None,
+    ) -> DDIMState:
+        """Rescale the predicted data and noise, and add new noise."""
+        output = output.astype(jnp.float32)
+        data = process.to_x0(state.x, output, row.alpha, row.sigma)
+        epsilon = process.to_epsilon(state.x, output, row.alpha, row.sigma)
+        x = row.data * data + row.epsilon * epsilon
+        return DDIMState(x if keys is None else x + row.noise * sample_noise(keys, x))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.diffusion import Objective, RectifiedFlow
+from egosim_jax.diffusion import Objective, RectifiedFlow, VariancePreserving
 from egosim_jax.types import InputError
 
 PROCESS = RectifiedFlow()
@@ -166,3 +166,20 @@ def test_the_same_key_draws_the_same_loss(x0):
 def test_a_logit_normal_without_width_is_refused():
     with pytest.raises(InputError, match="logit_std"):
         Objective(logit_std=0.0)
+
+
+@pytest.mark.parametrize("prediction", ["v", "x0"])
+@pytest.mark.parametrize("times", TIMES)
+def test_a_perfect_prediction_of_a_variance_preserving_process_has_no_error(x0, times, prediction):
+    process = VariancePreserving(prediction=prediction)
+
+    def perfect(x, t):
+        """The prediction from the known data and the noise that makes `x` of them."""
+        time = (t[:, None, None, None, None] + 1) / 1000
+        noise = (x - process.alpha(time) * x0) / process.sigma(time)
+        return process.target(x0, noise, time)
+
+    loss, sampled = Objective(times=times).loss(process, perfect, x0, jax.random.key(4))
+    assert len(set(sampled.time.tolist())) == 3
+    # float32 noise, from a division by a sigma of 0.03 or more.
+    np.testing.assert_allclose([loss, *sampled.error], 0, atol=1e-9)

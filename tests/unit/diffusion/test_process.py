@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.diffusion import RectifiedFlow
+from egosim_jax.diffusion import RectifiedFlow, VariancePreserving
 from egosim_jax.types import InputError
 
 
@@ -63,3 +63,106 @@ def test_an_impossible_process_is_refused(fields, rule):
 def test_no_steps_are_refused():
     with pytest.raises(InputError, match="at least 1"):
         RectifiedFlow().times(0)
+
+
+EVERY = [
+    RectifiedFlow(),
+    RectifiedFlow(prediction="x0"),
+    RectifiedFlow(prediction="epsilon", sigma_max=0.999),
+    VariancePreserving(),
+    VariancePreserving(prediction="x0", snr_shift=3.0),
+    VariancePreserving(prediction="epsilon", zero_terminal_snr=False, beta_schedule="linear"),
+]
+
+
+@pytest.mark.parametrize("process", EVERY)
+def test_data_noise_and_velocity_come_back_from_a_perfect_prediction(process):
+    x0, noise = np.random.default_rng(0).standard_normal((2, 5, 7))
+    time = np.array([0.001, 0.2, 0.5, 0.8, 0.997])[:, None]
+    scales = process.alpha(time), process.sigma(time)
+    x, output = process.add_noise(x0, noise, time), process.target(x0, noise, time)
+    # float64, divided by an alpha or sigma of 0.001 or more.
+    np.testing.assert_allclose(process.to_x0(x, output, *scales), x0, atol=1e-10)
+    np.testing.assert_allclose(process.to_epsilon(x, output, *scales), noise, atol=1e-10)
+    np.testing.assert_allclose(process.to_velocity(x, output, *scales), noise - x0, atol=1e-10)
+
+
+@pytest.mark.parametrize("process", EVERY)
+def test_a_compiled_process_equals_numpy(process):
+    time = process.times(25)[:-1].astype(np.float32)
+    for function in (process.alpha, process.sigma, process.timesteps):
+        np.testing.assert_allclose(jax.jit(function)(time), function(time), rtol=1e-6)
+
+
+@pytest.mark.parametrize("snr_shift", [1.0, 3.0])
+def test_the_last_timestep_of_cogvideox_is_pure_noise_and_the_variance_one(snr_shift):
+    process = VariancePreserving(snr_shift=snr_shift)
+    times = np.linspace(0, 1, 1001)
+    alpha, sigma = process.alpha(times), process.sigma(times)
+    assert (alpha[0], alpha[-1], sigma[0], sigma[-1]) == (1, 0, 0, 1)
+    assert (np.diff(alpha) < 0).all()
+    np.testing.assert_allclose(alpha**2 + sigma**2, 1, rtol=1e-14)
+
+
+def test_trailing_timesteps_start_at_the_last_and_leading_ones_end_at_the_first():
+    trailing, leading = VariancePreserving(), VariancePreserving(spacing="leading")
+    assert trailing.timesteps(trailing.times(4)[:-1]).tolist() == [999, 749, 499, 249]
+    assert leading.timesteps(leading.times(4)[:-1]).tolist() == [750, 500, 250, 0]
+
+
+def test_training_draws_every_timestep_alike():
+    process = VariancePreserving(train_timesteps=10)
+    u = np.linspace(0, 1, 1001)[:-1]
+    assert np.bincount(process.timesteps(process.warp(u)).astype(int)).tolist() == [100] * 10
+    assert process.timesteps(process.warp(np.array([1.0]))).tolist() == [9]
+
+
+def test_given_timesteps_are_what_the_network_is_given():
+    steps = [1000, 750, 500, 250]
+    process = RectifiedFlow(shift=5.0, timestep_rounding="down")
+    assert process.timesteps(process.times(steps)).tolist() == [*steps, 0]
+    steps = (999, 749, 499, 249)
+    assert VariancePreserving().timesteps(VariancePreserving().times(steps)).tolist()[:-1] == [
+        *steps
+    ]
+
+
+@pytest.mark.parametrize(
+    ("process", "steps", "rule"),
+    [
+        (RectifiedFlow(), [], "must fall"),
+        (RectifiedFlow(), [500, 500], "must fall"),
+        (RectifiedFlow(), [1001, 500], "at most 1000"),
+        (RectifiedFlow(), [500, 0], "above 0"),
+        (VariancePreserving(), [1000, 500], "at most 999"),
+        (VariancePreserving(), [998.5, 500], "whole numbers"),
+        (VariancePreserving(), 1001, "more than the 1000"),
+        (VariancePreserving(), 0, "at least 1"),
+    ],
+)
+def test_impossible_steps_are_refused(process, steps, rule):
+    with pytest.raises(InputError, match=rule):
+        process.times(steps)
+
+
+@pytest.mark.parametrize(
+    ("fields", "rule"),
+    [
+        ({"beta_start": 0.5, "beta_end": 0.1}, "beta_start <= beta_end"),
+        ({"snr_shift": 0.0}, "snr_shift must be above 0"),
+        ({"train_timesteps": 0}, "train_timesteps must be above 0"),
+        ({"prediction": "epsilon"}, "zero_terminal_snr must be False"),
+        ({"prediction": "velocity"}, "must be one of v, epsilon, x0"),
+    ],
+)
+def test_an_impossible_variance_preserving_process_is_refused(fields, rule):
+    with pytest.raises(InputError, match=rule):
+        VariancePreserving(**fields)
+
+
+@pytest.mark.parametrize(
+    ("prediction", "rule"), [("v", "must be one of velocity"), ("epsilon", "sigma_max")]
+)
+def test_a_prediction_that_a_flow_cannot_invert_is_refused(prediction, rule):
+    with pytest.raises(InputError, match=rule):
+        RectifiedFlow(prediction=prediction)

@@ -1,15 +1,24 @@
-"""Solvers on equations with known solutions; `tests/parity/test_solvers.py` has the rest."""
+"""Solvers on equations with known solutions; `tests/parity` compares them with diffusers."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.diffusion import Euler, RectifiedFlow, UniPC, integrate
+from egosim_jax.diffusion import (
+    DDIM,
+    DPMSolver,
+    Euler,
+    RectifiedFlow,
+    UniPC,
+    VariancePreserving,
+    integrate,
+)
 from egosim_jax.types import InputError
 
 PROCESS = RectifiedFlow(shift=2.0)
-SOLVERS = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3)]
+SOLVERS = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3), DDIM(), DPMSolver()]
+STOCHASTIC = [DDIM(eta=1.0), DPMSolver(stochastic=True)]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +71,9 @@ def test_a_straight_path_ends_at_the_data(noise, solver, steps):
     np.testing.assert_allclose(x, data, atol=1e-5)
 
 
-@pytest.mark.parametrize(("solver", "order"), [(Euler(), 1), (UniPC(order=2), 2)])
+@pytest.mark.parametrize(
+    ("solver", "order"), [(Euler(), 1), (UniPC(order=2), 2), (DDIM(), 1), (DPMSolver(), 2)]
+)
 def test_half_the_step_divides_the_error_by_two_to_the_order(noise, solver, order):
     ratio = end_error(solver, noise, 16) / end_error(solver, noise, 32)
     # The steps are not yet infinitely small: within a quarter of an order.
@@ -124,3 +135,92 @@ def test_coefficients_are_finite_from_pure_noise_to_data(order):
 def test_an_order_below_one_is_refused():
     with pytest.raises(InputError, match="order"):
         UniPC(order=0)
+
+
+@pytest.mark.parametrize("solver", STOCHASTIC)
+@pytest.mark.parametrize("process", [PROCESS, VariancePreserving(snr_shift=3.0)])
+def test_stochastic_solvers_end_with_the_deviation_of_the_data(process, solver):
+    std = 0.5
+
+    def denoise(x, t):
+        """The expected data, noise and from them the prediction when the data are N(0, std^2)."""
+        time = per_sample(t + (process is not PROCESS)) / 1000
+        alpha, sigma = process.alpha(time), process.sigma(time)
+        gain = 1 / (alpha**2 * std**2 + sigma**2)
+        return process.target(gain * alpha * std**2 * x, gain * sigma * x, time)
+
+    noise = jax.random.normal(jax.random.key(0), (4, 4, 16, 16, 16))
+    keys = jax.random.split(jax.random.key(1), 4)
+    x = integrate(denoise, noise, process=process, solver=solver, steps=1000, keys=keys)
+    # 5 standard errors of the deviation of 65536 samples are 0.007; the rest is discretization.
+    assert float(jnp.std(x)) == pytest.approx(std, abs=0.015)
+    # It forgets its starting noise, which a deterministic solver only rescales.
+    assert abs(np.corrcoef(np.ravel(x), np.ravel(noise))[0, 1]) < 0.1
+
+
+@pytest.mark.parametrize("solver", STOCHASTIC)
+def test_a_sample_of_a_stochastic_solver_does_not_depend_on_its_batch(noise, solver):
+    keys = jax.random.split(jax.random.key(1), 2)
+    sample = lambda x, keys: integrate(  # noqa: E731
+        gaussian_velocity, x, process=PROCESS, solver=solver, steps=5, keys=keys
+    )
+    together, alone = sample(noise, keys), sample(noise[1:], keys[1:])
+    np.testing.assert_allclose(together[1:], alone, rtol=1e-6, atol=1e-6)
+    assert not np.allclose(sample(noise, keys[::-1]), together)
+
+
+def test_a_stochastic_solver_without_keys_is_refused(noise):
+    with pytest.raises(InputError, match="keys"):
+        integrate(gaussian_velocity, noise, process=PROCESS, solver=DDIM(eta=1.0), steps=2)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_given_timesteps_are_visited(noise, solver):
+    seen = []
+
+    def velocity(x, t):
+        jax.debug.callback(lambda t: seen.append(float(t[0])), t, ordered=True)
+        return x
+
+    steps = (1000, 750, 500, 250)
+    integrate(velocity, noise, process=PROCESS, solver=solver, steps=steps).block_until_ready()
+    jax.effects_barrier()
+    assert seen == list(steps)
+
+
+def test_given_timesteps_of_the_schedule_equal_the_schedule(noise):
+    timesteps = tuple(PROCESS.timesteps(PROCESS.times(4)[:-1]).tolist())
+    given, scheduled = (
+        integrate(gaussian_velocity, noise, process=PROCESS, solver=UniPC(), steps=steps)
+        for steps in (timesteps, 4)
+    )
+    np.testing.assert_allclose(given, scheduled, rtol=1e-6, atol=1e-6)
+
+
+def test_euler_refuses_a_path_that_is_not_straight(noise):
+    with pytest.raises(InputError, match="DDIM"):
+        integrate(gaussian_velocity, noise, process=VariancePreserving(), solver=Euler(), steps=2)
+
+
+def test_unipc_refuses_pure_noise_without_signal(noise):
+    with pytest.raises(InputError, match="zero_terminal_snr"):
+        integrate(gaussian_velocity, noise, process=VariancePreserving(), solver=UniPC(), steps=2)
+
+
+@pytest.mark.parametrize("prediction", ["x0", "v", "epsilon"])
+@pytest.mark.parametrize("solver", [DDIM(), DPMSolver(), UniPC()])
+def test_a_solver_ends_alike_whatever_the_network_predicts(noise, solver, prediction):
+    process = VariancePreserving(prediction=prediction, zero_terminal_snr=False)
+
+    def denoise(x, t):
+        time = per_sample(t + 1) / 1000
+        data = jnp.tanh(x)
+        epsilon = (x - process.alpha(time) * data) / process.sigma(time)
+        return process.target(data, epsilon, time)
+
+    x = integrate(denoise, noise, process=process, solver=solver, steps=10)
+    reference = VariancePreserving(prediction="x0", zero_terminal_snr=False)
+    data = lambda x, t: jnp.tanh(x)  # noqa: E731
+    expected = integrate(data, noise, process=reference, solver=solver, steps=10)
+    # epsilon is divided by alpha = 0.07 at the start.
+    np.testing.assert_allclose(x, expected, atol=2e-5)
