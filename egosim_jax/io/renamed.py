@@ -37,6 +37,8 @@ TYPES = {
     "FlowSchedule": "RectifiedFlow",
 }
 """Classes of config.json: the old name, then today's."""
+RECIPES = ("RealTiny", "Tabletop")
+"""Old names of recipes, which experiments also have."""
 FIELDS = {
     "Training": {"accumulate": "grad_accum_steps", "patience": "hang_timeout_s"},
     "OptimizerConfig": {
@@ -63,6 +65,16 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
         "weights_dtype": "float32",
     },
     "FlowSchedule": {"prediction": "velocity"},
+    "ModelConfig": {
+        "layout": {
+            "type": "ChannelLayout",
+            "parts": [["noisy", 16], ["mask", 4], ["prior", 16], ["hands", 16]],
+            "mask_packing": "space",
+            "mask_one": "generate",
+            "mask_scale": 1.0,
+            "mask_prior": True,
+        },
+    },
     "Tabletop": {"crop": [48, 64], "dropout": _DROPOUT, "stride": 1, "weights_dtype": "float16"},
 }
 """Fields that a class of config.json did not have under its old name, with their values then."""
@@ -77,6 +89,8 @@ def upgrade(recorded: Any) -> Any:
     if not isinstance(recorded, dict):
         return recorded
     kind = recorded.get("type")
+    if kind in RECIPES and "denoiser" not in recorded:  # an experiment of the same name
+        kind = None
     if not isinstance(kind, str):
         return {name: upgrade(value) for name, value in recorded.items()}
     renamed, dropped = FIELDS.get(kind, {}), DROPPED.get(kind, ())

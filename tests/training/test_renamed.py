@@ -116,3 +116,8 @@ def test_a_difference_from_an_old_run_is_named_as_today(tmp_path):
 def test_configs_of_today_are_not_changed():
     today = upgrade(OLD_RUN["denoiser"])
     assert upgrade(today) == today
+
+
+def test_an_experiment_with_the_name_of_an_old_recipe_keeps_it():
+    experiment = {"experiment": {"type": "Tabletop", "clips": 6}}
+    assert upgrade(experiment) == experiment
