@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
@@ -117,9 +117,16 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
 
 
 def denoise(
-    dit: Denoiser, condition: Condition, noise: Float[Array, "b f h w z"], config: ModelConfig
+    dit: Denoiser,
+    condition: Condition,
+    noise: Float[Array, "b f h w z"],
+    config: ModelConfig,
+    keys: Key[Array, " b"] | None = None,
 ) -> Float[Array, "b f h w z"]:
-    """Walk from noise to latents; the unconditional branch knows no text."""
+    """Run the sampler; the unconditional branch uses an empty prompt.
+
+    `keys`, one for each item, draw the noise that a stochastic solver adds.
+    """
     channels = config.layout.condition_channels(condition, noise)
 
     def branch(text: Array) -> DenoiseFn:
@@ -136,6 +143,7 @@ def denoise(
         process=config.process,
         solver=config.solver,
         steps=config.steps,
+        keys=keys,
     )
 
 
@@ -167,7 +175,9 @@ class Generator:
             about=("noise", shape),
         )
         self._denoise = Program(
-            lambda dit, condition, noise: denoise(dit, condition, noise, config),
+            lambda dit, condition, noise, *seeds: denoise(
+                dit, condition, noise, config, *map(_step_keys, seeds)
+            ),
             networks.dit,
             mesh=mesh,
             about=("denoise", config),
@@ -186,7 +196,7 @@ class Generator:
         yield "encode", self._encode, (inputs,)
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
         yield "noise", self._noise, (seeds,)
-        given = self._encode.shapes(inputs), self._noise.shapes(seeds)
+        given = self._encode.shapes(inputs), self._noise.shapes(seeds), *self._stepping(seeds)
         yield "denoise", self._denoise, given
         yield "decode", self._decode, (self._denoise.shapes(*given),)
 
@@ -221,7 +231,7 @@ class Generator:
         condition = self._encode(Inputs.of(triplets, self.config))
         if without is not None:
             condition = condition.drop(without)
-        latents = self._denoise(condition, self.noise(seeds))
+        latents = self._denoise(condition, self.noise(seeds), *self._stepping(_uint32(seeds)))
         bad = [
             triplet.video_id
             for triplet, latent in zip(triplets, np.asarray(latents), strict=True)
@@ -275,11 +285,24 @@ class Generator:
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
         """The starting noise of each seed, of which the last 32 bits count."""
-        return self._noise(np.array([seed & 0xFFFFFFFF for seed in seeds], np.uint32))
+        return self._noise(_uint32(seeds))
+
+    def _stepping(self, seeds: T) -> tuple[T, ...]:
+        """Return what a stochastic solver gets besides the noise: the seeds."""
+        return (seeds,) if self.config.solver.stochastic else ()
 
     def _clips(self, latents: Float[Array, "b f h w z"]) -> list[Clip]:
         frames = np.asarray(self._decode(latents))
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
+
+
+def _uint32(seeds: Sequence[int]) -> np.ndarray:
+    return np.array([seed & 0xFFFFFFFF for seed in seeds], np.uint32)
+
+
+def _step_keys(seeds: Array) -> Key[Array, " b"]:
+    """Return the key of each seed's noise at the solver's steps, other than its starting noise."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), 1))(seeds)
 
 
 def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:

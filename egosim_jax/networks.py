@@ -12,9 +12,10 @@ from jax.sharding import Mesh
 
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
-from egosim_jax.diffusion.solver import Euler
+from egosim_jax.diffusion.solver import DDIM, Euler
 from egosim_jax.diffusion.unipc import UniPC
 from egosim_jax.io import weights
 from egosim_jax.models import Denoiser, ImageEncoder, NetworkConfig, TextEncoder, VideoCodec
@@ -56,7 +57,7 @@ class ModelConfig:
     """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
     process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
     """Path from data to noise, and the quantity that the denoiser predicts."""
-    solver: Euler | UniPC = field(default_factory=Euler)
+    solver: Euler | DDIM | UniPC | DPMSolver = field(default_factory=Euler)
     """Sampler."""
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
@@ -82,6 +83,8 @@ class ModelConfig:
         for left, a, right, b in pairs:
             if a != b:
                 raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+        # Raises if the solver does not fit the process, or the steps.
+        self.solver.coefficients(self.process, self.process.times(self.steps))
         self.grid.check(self.video)
         frames, patch = self.latent_shape[0], dit.patch[0]
         if frames % patch:

@@ -31,6 +31,9 @@ SHEET_CLIPS, SHEET_COLUMNS, SHEET_WIDTH = 6, 6, 240
 """Of the contact sheet: clips, moments of each, and pixels of a picture's width."""
 
 
+Solver = Literal["euler", "unipc", "wan", "ddim", "dpmpp_2m", "dpmpp_2m_sde"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Generate:
     """Generate a clip for each row of a metadata file, or of a scene of the tabletop world.
@@ -66,9 +69,9 @@ class Generate:
     """First frame of the window that is generated; several make several clips, {id}_{frame}."""
     steps: int | None = None
     """Denoising steps, if not the model's own."""
-    solver: Literal["euler", "unipc", "wan"] | None = None
-    """Steps from noise to data, if not the model's own; wan: UniPC with the noise levels and whole
-    timesteps of Wan's own sampler."""
+    solver: Solver | None = None
+    """Sampler, if not the model's own; wan: UniPC with the noise levels and whole timesteps of
+    Wan's own sampler; dpmpp_2m: DPM-Solver++ (2M), whose SDE form adds noise at each step."""
     seed: int = 0
     """Each clip's noise comes from this seed and its id; without metadata, the scene does too."""
     batch_size: int | None = None
@@ -181,7 +184,7 @@ class Generate:
         import dataclasses
 
         from egosim_jax import configs
-        from egosim_jax.diffusion import Euler, RectifiedFlow, UniPC
+        from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
 
         config = configs.get(self.config)
         if self._weights is not None:
@@ -190,9 +193,18 @@ class Generate:
             raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
         config = dataclasses.replace(config, steps=self.steps or config.steps)
         if self.solver is not None:
-            solver = Euler() if self.solver == "euler" else UniPC()
-            config = dataclasses.replace(config, solver=solver)
+            solvers = {
+                "euler": Euler(),
+                "unipc": UniPC(),
+                "wan": UniPC(),
+                "ddim": DDIM(),
+                "dpmpp_2m": DPMSolver(),
+                "dpmpp_2m_sde": DPMSolver(stochastic=True),
+            }
+            config = dataclasses.replace(config, solver=solvers[self.solver])
         if self.solver == "wan":
+            if not isinstance(config.process, RectifiedFlow):
+                raise InputError(f"{config.name} is not a rectified flow. (--solver wan)")
             process = RectifiedFlow.wan_unipc(config.process.shift)
             config = dataclasses.replace(config, process=process)
         return config

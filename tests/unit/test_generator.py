@@ -10,7 +10,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.diffusion.guidance import Guidance
+from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
 from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import Program
@@ -78,6 +78,24 @@ def test_a_seed_gives_its_clip_again_and_another_seed_another(generator, triplet
     assert not np.array_equal(first.frames, third.frames)
     assert first.frames.shape == (5, 32, 48, 3)
     assert first.fps == CONFIG.video.fps
+
+
+def test_a_clip_of_a_stochastic_solver_comes_from_its_seed_alone(networks, triplets):
+    config = dataclasses.replace(CONFIG, solver=DPMSolver(stochastic=True), steps=3)
+    generator = Generator(config, networks)
+    together = np.asarray(generator.latents(triplets[:2], [3, 4]))
+    alone = np.asarray(generator.latents(triplets[1:2], [4]))[0]
+    # The sums of a batch run in another order.
+    assert np.linalg.norm(together[1] - alone) / np.linalg.norm(alone) <= 1e-5
+    other = dataclasses.replace(config, solver=DPMSolver())
+    assert not np.allclose(Generator(other, networks).latents(triplets[1:2], [4])[0], alone)
+    assert [name for name, *_ in generator.programs(2)] == ["encode", "noise", "denoise", "decode"]
+
+
+def test_a_solver_that_does_not_fit_the_process_is_refused():
+    with pytest.raises(InputError, match="DDIM"):
+        dataclasses.replace(CONFIG, process=VariancePreserving())
+    assert dataclasses.replace(CONFIG, process=VariancePreserving(), solver=DDIM())
 
 
 def test_each_condition_changes_the_latents(networks, triplets):
