@@ -1,8 +1,7 @@
 """An egocentric world simulator in JAX: the public names, each imported when it is first used.
 
-config = egosim_jax.get_config("egosim_14b")
-networks = egosim_jax.Networks.load(config, Path("weights/egosim_14b"))
-clips = egosim_jax.Generator(config, networks).generate(triplets, seeds=[0])
+generator = egosim_jax.Generator.load("tabletop")
+clips = generator.generate(triplets, seeds=[0])
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar, no_type_check
 
 import jax
@@ -189,6 +190,35 @@ class Generator:
             mesh=mesh,
             about=("decode", config),
         )
+
+    @classmethod
+    def load(
+        cls,
+        config: str | ModelConfig,
+        weights: Path | str | None = None,
+        *,
+        mesh: Mesh | None = None,
+        lora: Path | None = None,
+        lora_scale: float = 1.0,
+        renderer: Renderer = jitted,
+    ) -> Generator:
+        """Load a model, by name or config, from a weights folder.
+
+        Without a folder, these are the weights that come with the package or were fetched. `lora`
+        is a file in any naming that `egosim-convert` reads. Raises `InputError` if config, weights
+        or LoRA are missing or do not fit each other.
+        """
+        from egosim_jax import configs
+
+        config = configs.get(config) if isinstance(config, str) else config
+        folder = configs.weights_of(config.name, None if weights is None else Path(weights))
+        networks = Networks.load(config, folder, mesh=mesh)
+        if lora is not None:
+            from egosim_jax.convert.lora import read_lora
+            from egosim_jax.models.lora import apply
+
+            apply(networks.dit, read_lora(lora, config.dit), scale=lora_scale)
+        return cls(config.at(folder), networks, mesh, renderer=renderer)
 
     def programs(self, batch: int) -> Iterator[tuple[str, Program, tuple]]:
         """What `generate` runs for a batch of this size, by name, and the shapes it is given."""

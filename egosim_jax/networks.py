@@ -18,10 +18,19 @@ from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
 from egosim_jax.diffusion.solver import DDIM, Euler
 from egosim_jax.diffusion.unipc import UniPC
 from egosim_jax.io import weights
-from egosim_jax.models import Denoiser, ImageEncoder, NetworkConfig, TextEncoder, VideoCodec
+from egosim_jax.models import (
+    Denoiser,
+    DenoiserConfig,
+    ImageEncoder,
+    ImageEncoderConfig,
+    NetworkConfig,
+    TextEncoder,
+    TextEncoderConfig,
+    VideoCodec,
+    VideoCodecConfig,
+)
 from egosim_jax.models.layers import initialize
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
-from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import InputError, VideoGrid, VideoSpec
@@ -39,13 +48,13 @@ class ModelConfig:
     """Name of the model on the command line."""
     video: VideoSpec
     """Length and size of its clips."""
-    dit: WanDiTConfig
+    dit: DenoiserConfig
     """Config of the denoiser."""
-    vae: WanVAEConfig = field(default_factory=WanVAEConfig)
+    vae: VideoCodecConfig = field(default_factory=WanVAEConfig)
     """Config of the video autoencoder."""
-    text: UMT5Config = field(default_factory=UMT5Config)
+    text: TextEncoderConfig = field(default_factory=UMT5Config)
     """Config of the text encoder."""
-    image: CLIPVisionConfig | None = field(default_factory=CLIPVisionConfig)
+    image: ImageEncoderConfig | None = field(default_factory=CLIPVisionConfig)
     """Config of the image encoder; None for models without the image branch."""
     layout: ChannelLayout = field(default_factory=ChannelLayout)
     """Input channels of the denoiser."""

@@ -116,12 +116,20 @@ def write_trained(trained: Networks, out: Path, *, model: ModelConfig, start: Pa
     import jax
 
     from egosim_jax.io import weights
+    from egosim_jax.io.mapped import read_safetensors
     from egosim_jax.models import lora
 
     if deltas := lora.deltas_of(trained.dit):
         path, base = out / "lora.safetensors", weights.hashes(start)["dit"]
+        changes: dict[str, lora.Change] = {**deltas}
+        before = read_safetensors(start / "dit.safetensors")
+        for name, value in lora.full_weights(trained.dit, model.dit.also_train).items():
+            if (gathered := weights.gather(value)) is not None:
+                changes[name] = gathered - before[name].array().astype(gathered.dtype)
         if jax.process_index() == 0:
-            weights.write(path, lora.tensors(deltas), metadata=lora.about(model.name, base=base))
+            weights.write(
+                path, lora.tensors(changes), metadata=lora.metadata(model.name, base=base)
+            )
         return path
     folder = out / "weights"
     for name, network in trained.parts().items():

@@ -154,8 +154,8 @@ def _heading(title: str, stage: Stage, target: Target) -> str:
 def _setting(stage: Stage, target: Target) -> Setting:
     task, training = stage
     mesh = make_mesh(training.mesh, target.devices)
-    levels = isinstance(task, Denoising) and task.model.dit.remat_levels
-    remat = task.model.dit.remat if levels else NO_REMAT
+    dit: Any = task.model.dit if isinstance(task, Denoising) else None
+    remat = dit.remat if dit and dit.remat_levels else NO_REMAT
     clips = training.batch_size // parts("batch", mesh) // training.grad_accum_steps
     return Setting(clips=clips, remat=remat, context=parts("tokens", mesh))
 

@@ -300,13 +300,9 @@ class Generate:
         if self._weights is None:
             print(f"{config.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(config, Networks.random(config, seed=self.seed), mesh)
-        networks = Networks.load(config, self._weights, mesh=mesh)
-        if self.lora is not None:
-            from egosim_jax.convert.lora import read_lora
-            from egosim_jax.models import lora
-
-            lora.apply(networks.dit, read_lora(self.lora, config.dit), scale=self.lora_scale)
-        return Generator(config, networks, mesh)
+        return Generator.load(
+            config, self._weights, mesh=mesh, lora=self.lora, lora_scale=self.lora_scale
+        )
 
     def _load(
         self, batch: Sequence[_Item], config: ModelConfig

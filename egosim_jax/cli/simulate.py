@@ -68,7 +68,6 @@ class Simulate:
         from egosim_jax.io.digest import sha256
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
-        from egosim_jax.networks import Networks
         from egosim_jax.rollout import Rollout
         from egosim_jax.simulator import Simulator
         from egosim_jax.worlds.tabletop import make_sequence, to_action
@@ -88,11 +87,7 @@ class Simulate:
         kind = "robot" if self.robot else "human"
         truth = list(make_sequence(self.seed, spec=config.video, clips=self.clips, kind=kind))
         simulator = Simulator(
-            generator=Generator(
-                config.at(weights),
-                Networks.load(config, weights),
-                renderer=rendering.get(self.renderer),
-            ),
+            generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
             perception=None if self.update == "none" else backend(self.perception, truth),
             fps=config.video.fps,
         )

@@ -53,14 +53,13 @@ class Continuous:
         from egosim_jax.generator import Generator
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
-        from egosim_jax.networks import Networks
 
         check_counts({"--sequences": self.sequences, "--clips": self.clips})
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         made_of = {"experiment": self, "weights": hashes(weights)}
         open_folder(self.out, made_of, mutable=["experiment.weights"])
-        generator = Generator(config.at(weights), Networks.load(config, weights))
+        generator = Generator.load(config, weights)
         seeds = range(self.first_scene, self.first_scene + self.sequences)
         jobs = [(method, seed) for seed in seeds for method in METHODS]
         scores: dict[str, list[Scores]] = {method: [] for method in METHODS}

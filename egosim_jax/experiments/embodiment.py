@@ -280,16 +280,12 @@ class Embodiment:
         return {**videos, **copies(scenes), "truth through the autoencoder": through}
 
     def _generator(self, made: Mapping[str, Path], name: str) -> Generator:
-        from egosim_jax.convert.lora import read_lora
         from egosim_jax.generator import Generator
-        from egosim_jax.models import lora
-        from egosim_jax.networks import Networks
 
         model = self._model
-        networks = Networks.load(model, made["people" if name == "lora" else name])
         if name == "lora":
-            lora.apply(networks.dit, read_lora(made[name], model.dit))
-        return Generator(model, networks)
+            return Generator.load(model, made["people"], lora=made[name])
+        return Generator.load(model, made[name])
 
     def _keep(self, name: str, make: Callable[[], Iterable[np.ndarray]]) -> list[np.ndarray]:
         """The videos of a method, made unless they were."""

@@ -72,7 +72,6 @@ class Tabletop:
         from egosim_jax.generator import Generator
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
-        from egosim_jax.networks import Networks
 
         check_counts(
             {"--scenes": self.scenes, "--seeds": self.seeds, "--batch-size": self.batch_size}
@@ -81,7 +80,7 @@ class Tabletop:
         weights = configs.weights_of(self.config, self.weights)
         made_of = {"experiment": self, "weights": hashes(weights)}
         open_folder(self.out, made_of, mutable=["experiment.weights"])
-        generator = Generator(config.at(weights), Networks.load(config, weights))
+        generator = Generator.load(config, weights)
         kinds: tuple[Kind, ...] = ("human", "robot")
         tables = {kind: self._compare(kind, generator) for kind in kinds}
         definitions = {**DEFINITIONS, "spread": SPREAD}

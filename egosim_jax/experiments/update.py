@@ -65,14 +65,13 @@ class Update:
         from egosim_jax.generator import Generator
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
-        from egosim_jax.networks import Networks
 
         check_counts({"--scenes": self.scenes})
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         made_of = {"experiment": self, "weights": hashes(weights)}
         open_folder(self.out, made_of, mutable=["experiment.weights"])
-        generator = Generator(config.at(weights), Networks.load(config, weights))
+        generator = Generator.load(config, weights)
         table: dict[str, list[dict[str, float]]] = {}
         for seed in track(self._seeds(config.video), "scenes", total=self.scenes):
             for row, found in _rows(seed, config.video, generator):

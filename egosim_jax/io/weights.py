@@ -133,7 +133,7 @@ def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
     tensors = {}
     for name, leaf in _leaves(module).items():
         value = leaf.get_value()
-        gathered = _gathered(value if dtype is None else value.astype(dtype))
+        gathered = gather(value if dtype is None else value.astype(dtype))
         if gathered is not None:
             tensors[name] = gathered
     if tensors:
@@ -165,7 +165,7 @@ def link_others(folder: Path, origin: Path) -> None:
             link.symlink_to(path.resolve())
 
 
-def _gathered(array: Any) -> np.ndarray | None:
+def gather(array: Any) -> np.ndarray | None:
     """Gather an array from all processes; None in all but the first."""
     import jax
     from jax.experimental import multihost_utils

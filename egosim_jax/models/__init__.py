@@ -7,7 +7,7 @@ Protocols of this module.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
@@ -75,8 +75,9 @@ class ImageEncoder(Protocol):
 
 @runtime_checkable
 class NetworkConfig(Protocol):
-    """Config of a network, which builds it."""
+    """Config of a network, a frozen dataclass that builds it."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
     table: ClassVar[str]
     """Module whose `TABLE` maps its weights to the names of other formats (`convert.tables`)."""
 
@@ -88,6 +89,118 @@ class NetworkConfig(Protocol):
     def build(self, *, rngs: nnx.Rngs) -> Any:
         """Build the network with random weights."""
         ...
+
+
+@runtime_checkable
+class DenoiserConfig(NetworkConfig, Protocol):
+    """Config of a denoiser."""
+
+    numerics_only: ClassVar[tuple[str, ...]]
+    """Fields that change only how values are computed, which a resumed training may change."""
+    remat_levels: ClassVar[tuple[str, ...]]
+    """Values of the field `remat`, by the memory that they take, ascending; empty without it."""
+    lora_targets: ClassVar[tuple[str, ...]]
+    """Patterns of the linear layers that a LoRA adapts, by dotted path."""
+    also_train: ClassVar[tuple[str, ...]]
+    """Patterns of the weights that are trained in full along with a LoRA, by dotted path."""
+
+    @property
+    def in_channels(self) -> int:
+        """Channels of the noisy latents and the condition together."""
+        ...
+
+    @property
+    def out_channels(self) -> int:
+        """Channels of the noisy latents and of the prediction."""
+        ...
+
+    @property
+    def patch(self) -> tuple[int, int, int]:
+        """Latent frames, rows and columns of a token."""
+        ...
+
+    @property
+    def heads(self) -> int:
+        """Attention heads."""
+        ...
+
+    @property
+    def text_dim(self) -> int:
+        """Width of the text encoder's tokens."""
+        ...
+
+    @property
+    def image_dim(self) -> int | None:
+        """Width of the image encoder's tokens; None for a model without the image branch."""
+        ...
+
+    def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
+        """Count a forward pass of one sample, of so many latent cells, text and image tokens."""
+        ...
+
+
+@runtime_checkable
+class VideoCodecConfig(NetworkConfig, Protocol):
+    """Config of a video codec."""
+
+    @property
+    def spatial_stride(self) -> int:
+        """Pixels per latent cell, along each axis."""
+        ...
+
+    @property
+    def temporal_stride(self) -> int:
+        """Pixel frames per latent frame, after the first."""
+        ...
+
+    @property
+    def latent_channels(self) -> int:
+        """Channels of the latents."""
+        ...
+
+
+@runtime_checkable
+class TextEncoderConfig(NetworkConfig, Protocol):
+    """Config of a text encoder."""
+
+    @property
+    def dim(self) -> int:
+        """Width of the embeddings."""
+        ...
+
+
+@runtime_checkable
+class ImageEncoderConfig(NetworkConfig, Protocol):
+    """Config of an image encoder."""
+
+    @property
+    def dim(self) -> int:
+        """Width of the tokens."""
+        ...
+
+    @property
+    def image_size(self) -> int:
+        """Rows and columns of the picture in pixels."""
+        ...
+
+    @property
+    def tokens(self) -> int:
+        """Tokens of a picture."""
+        ...
+
+
+class Flops(NamedTuple):
+    """Model FLOPs of a forward pass; a multiplication and an addition count as two."""
+
+    weights: float
+    """FLOPs of products with weights."""
+    attention: float
+    """FLOPs of products of queries, keys and values."""
+
+    @property
+    def total(self) -> float:
+        """Sum of both."""
+        return self.weights + self.attention
 
 
 def abstract(config: NetworkConfig) -> Any:

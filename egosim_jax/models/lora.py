@@ -1,8 +1,11 @@
-"""Low-rank additions to linear layers.
+"""Low-rank adaptation (LoRA) of linear layers.
 
 A layer y = x W + b becomes y = x W + b + s (x A) B with A `[in, r]`, B `[r, out]` and s = alpha / r
-times what a user asks for. Merged, the same is W + s A B. Source: Hu et al. 2021, LoRA, section
-4.1.
+times the scale that a user asks for. Merged, the same is W + s A B. Source: Hu et al. 2021, LoRA,
+section 4.1.
+
+Which layers are adapted, and which weights are trained in full along with them, is said by the
+denoiser's config (`lora_targets`, `also_train`) in patterns of dotted paths.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 import jax
@@ -21,41 +25,43 @@ from jaxtyping import Float
 from egosim_jax.io.mapped import OURS
 from egosim_jax.io.untrusted import listing
 from egosim_jax.io.weights import flat_shapes
-from egosim_jax.models.layers import Linear, LowRank
+from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
 BASE = "base_sha256"
-"""In that header: the hash of the weights that the LoRA was trained on."""
+"""Metadata key of the hash of the weights that the LoRA was trained on."""
+DIFF = ".diff"
+"""End of the name of a change to a weight in full, in a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Delta:
-    """What is added to one linear layer, or to a layer of every block of a stack."""
+    """Low-rank change of a linear layer, or of that layer in every block of a stack."""
 
     down: Float[np.ndarray, "*l i r"]
-    """A."""
+    """Matrix A."""
     up: Float[np.ndarray, "*l r o"]
-    """B, with alpha / r in it."""
+    """Matrix B, multiplied by alpha / r."""
 
 
 Change = Delta | np.ndarray
-"""What a file adds: to a linear layer, of this path; or all of it to the weight of this path."""
+"""Low-rank change of the linear layer at a path, or difference of the weight at a path in full."""
 MOST_RANK = 2048
 """Highest rank that is read; with the network's own widths it bounds the memory."""
 
 
 def linears(network: Any) -> Iterator[tuple[str, Linear]]:
-    """The linear layers of a network by their dotted paths."""
+    """Iterate over the linear layers of a network with their dotted paths."""
     for path, module in nnx.iter_modules(network):
         if isinstance(module, Linear):
             yield ".".join(map(str, path)), module
 
 
 def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) -> None:
-    """Add summands to the layers and weights of these paths, in place; low-rank ones stay apart.
+    """Apply changes to a network in place; low-rank ones are kept apart from the weights.
 
-    Raises what `check` raises.
+    Raises `InputError` as `check` does.
     """
     check_scale(scale)
     check(flat_shapes(network), changes)
@@ -74,7 +80,7 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
 
 
 def deltas_of(network: Any) -> dict[str, Delta]:
-    """What was added to the layers that have a summand."""
+    """Return the low-rank changes of a network by the path of their layer."""
     return {
         path: Delta(
             down=np.asarray(layer.low_rank.down.get_value()),
@@ -85,57 +91,87 @@ def deltas_of(network: Any) -> dict[str, Delta]:
     }
 
 
-def tensors(deltas: Mapping[str, Delta]) -> dict[str, np.ndarray]:
-    """Our own names of summands in a file: a layer's path, then `down` or `up`."""
-    return {
-        f"{path}.{part}": getattr(delta, part)
-        for path, delta in deltas.items()
-        for part in ("down", "up")
-    }
+def full_weights(network: Any, patterns: Sequence[str]) -> dict[str, Any]:
+    """Return the weights whose paths match `also_train` patterns."""
+    leaves = nnx.to_flat_state(nnx.state(network, nnx.Param))
+    named = {".".join(map(str, path)): leaf.get_value() for path, leaf in leaves}
+    return {path: value for path, value in named.items() if matches(path, patterns)}
 
 
-def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Delta]:
-    """The inverse of `tensors`. Raises `InputError` naming what is of no pair."""
-    return {path: Delta(down=down, up=up) for path, (down, up) in pairs(tensors).items()}
+def tensors(changes: Mapping[str, Change]) -> dict[str, np.ndarray]:
+    """Return changes as the tensors of a file: a layer's path with `down` or `up`, or `diff`."""
+    named = {}
+    for path, change in changes.items():
+        if isinstance(change, Delta):
+            named |= {f"{path}.down": change.down, f"{path}.up": change.up}
+        else:
+            named[f"{path}{DIFF}"] = change
+    return named
+
+
+def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Change]:
+    """Return the changes of a file's tensors. Raises `InputError` naming incomplete pairs."""
+    low = {path: Delta(down=down, up=up) for path, (down, up) in pairs(tensors).items()}
+    full = {n.removesuffix(DIFF): tensor for n, tensor in tensors.items() if n.endswith(DIFF)}
+    return {**low, **full}
 
 
 def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
-    """What is named `down` and `up`, by path. Raises `InputError` naming what is of no pair."""
-    paths = sorted({name.rpartition(".")[0] for name in tensors})
+    """Return the tensors named `down` and `up` by path.
+
+    Raises `InputError` naming incomplete pairs; names that end with `diff` are skipped.
+    """
+    names = {name for name in tensors if not name.endswith(DIFF)}
+    paths = sorted({name.rpartition(".")[0] for name in names})
     both = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
-    if odd := sorted(both ^ tensors.keys()):
-        raise InputError(f"The LoRA has no pairs of down and up of these: {listing(odd)}.")
+    if odd := sorted(both ^ names):
+        raise InputError(f"The LoRA has incomplete pairs of down and up: {listing(odd)}.")
     return {path: (tensors[f"{path}.down"], tensors[f"{path}.up"]) for path in paths}
 
 
-def about(config: str, *, base: str) -> dict[str, str]:
-    """The header of a file in our own names; `base` is the hash of what it was trained on."""
+def metadata(config: str, *, base: str) -> dict[str, str]:
+    """Return the metadata of a file; `base` is the hash of the weights that it was trained on."""
     return {"format": OURS, "config": config, BASE: base}
 
 
-def start(network: Any, rank: int, *, rngs: nnx.Rngs) -> None:
-    """Add summands of a rank to every linear layer of the blocks, in place, to train.
+def start(network: Any, rank: int, *, targets: Sequence[str], rngs: nnx.Rngs) -> None:
+    """Add trainable low-rank changes to the linear layers that match `targets`, in place.
 
     A is drawn as the paper does, from a normal distribution of deviation 1 / sqrt(in), and B is 0,
     so that nothing changes before the first update.
     """
     if rank < 1:
-        raise InputError(f"A LoRA has a rank of at least 1, not {rank}.")
+        raise InputError(f"The rank of a LoRA must be at least 1, not {rank}.")
     for path, layer in linears(network):
-        if path.startswith("blocks."):
+        if matches(path, targets):
             *stacked, wide, out = layer.kernel.shape
             down = jax.random.normal(rngs.params(), (*stacked, wide, rank)) / wide**0.5
             layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
 
 
+def trained(also_train: Sequence[str]) -> Any:
+    """Return the nnx filter of a LoRA's weights and of the denoiser's weights trained in full."""
+
+    def in_full(path: tuple[Any, ...], _: Any) -> bool:
+        network, *inner = map(str, path)
+        return network == "dit" and matches(".".join(inner), also_train)
+
+    return nnx.Any(LowRankParam, in_full) if also_train else LowRankParam
+
+
+def matches(path: str, patterns: Sequence[str]) -> bool:
+    """Return whether a dotted path matches one of the patterns, in which * also matches dots."""
+    return any(fnmatchcase(path, pattern) for pattern in patterns)
+
+
 def check_scale(scale: float) -> None:
-    """Raise `InputError` for what is no strength of a LoRA."""
+    """Raise `InputError` unless a LoRA's scale is finite."""
     if not math.isfinite(scale):
-        raise InputError(f"A LoRA's scale is a finite number, not {scale}. (--scale)")
+        raise InputError(f"A LoRA's scale must be a finite number, not {scale}. (--scale)")
 
 
 def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) -> None:
-    """Raise `InputError` naming every summand that does not fit the weights, or is not finite."""
+    """Raise `InputError` naming every change that does not fit the weights, or is not finite."""
     problems = []
     for path, change in changes.items():
         if isinstance(change, Delta):
@@ -143,7 +179,8 @@ def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) 
             arrays = (change.down, change.up)
         else:
             arrays, want = (change,), shapes.get(path)
-            why = f"have {change.shape}, want {want}" if change.shape != want else None
+            mismatch = f"has shape {change.shape}; expected {want}"
+            why = mismatch if change.shape != want else None
         if why is None and not all(np.isfinite(array).all() for array in arrays):
             why = "has values that are not finite"
         if why is not None:
@@ -154,19 +191,21 @@ def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) 
 def misfit(
     shapes: Mapping[str, tuple[int, ...]], path: str, down: tuple[int, ...], up: tuple[int, ...]
 ) -> str | None:
-    """Say why a pair of such shapes does not fit the linear layer of a path, if it does not."""
+    """Return why a pair of such shapes does not fit the linear layer at a path, or None."""
     kernel = shapes.get(f"{path}.kernel", ())
-    if len(kernel) != (3 if path.startswith("blocks.") else 2):
-        return "is no linear layer"
+    if len(kernel) not in (2, 3):  # of one layer, or of a stack of them
+        return "is not a linear layer"
     *stacked, wide, out = kernel
     rank = down[-1] if down else 0
     if not 1 <= rank <= MOST_RANK:
-        return f"has rank {rank}, want 1 to {MOST_RANK}"
+        return f"has rank {rank}; expected 1 to {MOST_RANK}"
     want = ((*stacked, wide, rank), (*stacked, rank, out))
-    return None if (down, up) == want else f"have {down} and {up}, want {want[0]} and {want[1]}"
+    if (down, up) == want:
+        return None
+    return f"has shapes {down} and {up}; expected {want[0]} and {want[1]}"
 
 
 def refuse(problems: Sequence[str]) -> None:
     """Raise `InputError` if there are problems."""
     if problems:
-        raise InputError(f"The LoRA is not of this network: {listing(problems)}.")
+        raise InputError(f"The LoRA does not fit this network: {listing(problems)}.")

@@ -6,9 +6,9 @@
     python -m tests.benchmarks.bench_gpu clip
 
 All of it at full width and with 24,960 tokens, on random weights. TFLOP/s and MFU count what the
-model needs (`train/flops.py`), and not what is computed again. `--profile` says where the time of
-the last case went, kernel by kernel. Beside the memory that was taken stands what the program was
-compiled to take.
+model needs (`forward_flops` of its config), not what is computed again. `--profile` says where the
+time of the last case went, kernel by kernel. Beside the memory that was taken stands what the
+program was compiled to take.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train import recipes
-from egosim_jax.train.flops import count_forward
 from egosim_jax.train.update import Programs, Stage
 from egosim_jax.types import MeshConfig
 
@@ -289,7 +288,7 @@ def _stage(model: ModelConfig, clips: int) -> Stage:
 def _forward_flops(config: ModelConfig) -> float:
     """Those of one clip."""
     text, latents = config.tokenizer.max_tokens, config.latent_shape
-    return count_forward(config.dit, latents=latents, text=text, image=IMAGE).total
+    return config.dit.forward_flops(latents=latents, text=text, image=IMAGE).total
 
 
 def _half(params: Any) -> Any:

@@ -12,7 +12,6 @@ from egosim_jax import configs
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.preflight.targets import peak
-from egosim_jax.train.flops import count_forward
 from egosim_jax.train.monitor import Clock
 from egosim_jax.train.tasks.denoising import Denoising
 
@@ -20,7 +19,7 @@ from egosim_jax.train.tasks.denoising import Denoising
 def test_a_forward_of_the_14b_takes_1126_tflop():
     """Counted by hand from the published architecture, for 61 frames of 832 x 480."""
     model = configs.get("egosim_14b")
-    flops = count_forward(model.dit, latents=model.latent_shape, text=512, image=257)
+    flops = model.dit.forward_flops(latents=model.latent_shape, text=512, image=257)
     assert flops.total == pytest.approx(1126.17e12, rel=1e-5)
     assert flops.attention == pytest.approx((510.363 + 10.469 + 5.255) * 1e12, rel=1e-4)
 
@@ -38,7 +37,7 @@ def test_the_count_is_the_compilers_of_a_small_network(image):
     given = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     program = jax.jit(lambda params, *args: nnx.merge(graph, params)(*args))
     counted = program.lower(params, *given).cost_analysis()["flops"]
-    ours = count_forward(config, latents=latents, text=text, image=image).total
+    ours = config.forward_flops(latents=latents, text=text, image=image).total
     assert ours == pytest.approx(counted, rel=0.06)
 
 
@@ -46,7 +45,7 @@ def test_an_update_takes_three_forwards_and_a_loras_spares_the_gradients_of_weig
     model = configs.get("debug")
     whole, low = Denoising(model=model).flops(3), Denoising(model=model, rank=2).flops(3)
     tokens = {"text": model.tokenizer.max_tokens, "image": 5}
-    forward = count_forward(model.dit, latents=model.latent_shape, **tokens)
+    forward = model.dit.forward_flops(latents=model.latent_shape, **tokens)
     assert whole == pytest.approx(9 * forward.total)
     assert whole - low == pytest.approx(3 * forward.weights)
 

@@ -24,16 +24,16 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.video import to_model
-from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig
+from egosim_jax.models import VideoCodecConfig
 from egosim_jax.train.update import Batch, Metrics
-from egosim_jax.types import SPATIAL_STRIDE, InputError, VideoSpec
+from egosim_jax.types import InputError, VideoSpec
 
 
 @dataclass(frozen=True, kw_only=True)
 class Autoencoding:
     """The task of training the video VAE on random crops of clips."""
 
-    vae: WanVAEConfig
+    vae: VideoCodecConfig
     """Config of the VAE."""
     video: VideoSpec
     """Frames of a crop, and the size of the videos that it is cut from."""
@@ -51,13 +51,13 @@ class Autoencoding:
         for name, crop, size in zip(
             ("rows", "columns"), self.crop, (self.video.height, self.video.width), strict=True
         ):
-            if crop % SPATIAL_STRIDE or not 0 < crop <= size:
+            if crop % self.vae.spatial_stride or not 0 < crop <= size:
                 raise InputError(
                     f"A crop of {crop} {name} cannot be cut out of {size}: it must be a multiple "
-                    f"of {SPATIAL_STRIDE} and at most the video's. (--crop)"
+                    f"of {self.vae.spatial_stride} and at most the video's. (--crop)"
                 )
 
-    def networks(self, rngs: nnx.Rngs) -> WanVAE:
+    def networks(self, rngs: nnx.Rngs) -> Any:
         """Return the VAE with random weights."""
         return self.vae.build(rngs=rngs)
 
@@ -88,7 +88,7 @@ class Autoencoding:
         return jnp.concatenate([key[None], others])
 
     def loss(
-        self, networks: WanVAE, batch: Batch, keys: Key[Array, " b"]
+        self, networks: Any, batch: Batch, keys: Key[Array, " b"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the loss of the module docstring, for sampled latents."""
         video = to_model(batch["video"])
@@ -106,7 +106,7 @@ class Autoencoding:
         """Return NaN: not counted."""
         return float("nan")
 
-    def validate(self, networks: WanVAE, batch: Batch) -> Metrics:
+    def validate(self, networks: Any, batch: Batch) -> Metrics:
         """Return the PSNR of the reconstruction from the mean latents."""
         video = to_model(batch["video"])
         decoded = networks.decode_whole(networks.moments(video)[0])
@@ -126,7 +126,7 @@ def _psnr(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) 
     return (10 * jnp.log10(4.0 / jnp.maximum(error, 1e-10))).mean()
 
 
-def latent_statistics(vae: WanVAE, videos: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def latent_statistics(vae: Any, videos: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation of each latent channel over uint8 videos `f h w 3`."""
     graph, params = nnx.split(vae)
 

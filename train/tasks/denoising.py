@@ -20,9 +20,7 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.models import lora
-from egosim_jax.models.layers import LowRankParam
 from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.train.flops import count_forward
 from egosim_jax.train.update import Batch, Metrics
 
 VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)
@@ -50,7 +48,7 @@ class Denoising:
     @property
     def trained(self) -> Any:
         """The nnx filter of all weights, or of those of the LoRA."""
-        return nnx.Param if self.rank is None else LowRankParam
+        return nnx.Param if self.rank is None else lora.trained(self.model.dit.also_train)
 
     @property
     def frozen_dtype(self) -> str:
@@ -61,7 +59,7 @@ class Denoising:
         """Return the networks with random weights."""
         networks = Networks.build(self.model, only=self.model.trained_networks, rngs=rngs)
         if self.rank is not None:
-            lora.start(networks.dit, self.rank, rngs=rngs)
+            lora.start(networks.dit, self.rank, targets=self.model.dit.lora_targets, rngs=rngs)
         return networks
 
     def examples(self) -> None:
@@ -104,12 +102,11 @@ class Denoising:
 
     def flops(self, samples: int) -> float:
         """Return the model FLOPs of an update, of the denoiser only, which has nearly all."""
-        image = self.model.image
-        forward = count_forward(
-            self.model.dit,
-            latents=self.model.latent_shape,
-            text=self.model.tokenizer.max_tokens,
-            image=0 if image is None else 1 + (image.image_size // image.patch) ** 2,
+        model = self.model
+        forward = model.dit.forward_flops(
+            latents=model.latent_shape,
+            text=model.tokenizer.max_tokens,
+            image=0 if model.image is None else model.image.tokens,
         )
         # Backward: gradients of activations and of weights; those of a LoRA's weights cost little.
         weights = 3 if self.rank is None else 2

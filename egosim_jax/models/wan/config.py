@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from flax import nnx
 
+from egosim_jax.models import Flops
 from egosim_jax.models.attention import Kernel
 from egosim_jax.types import InputError, check_counts
 
@@ -26,10 +28,14 @@ class WanDiTConfig:
     """Module of the conversion table."""
     numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "attention", "remat")
     """Fields that change only how values are computed, which a resumed training may change."""
-    remat_levels: ClassVar[tuple[Remat, ...]] = (
+    remat_levels: ClassVar[tuple[str, ...]] = (
         "offload", "full", "attention", "projections", "products", "none",
     )  # fmt: skip
     """Values of `remat`, by the memory that they take, ascending."""
+    lora_targets: ClassVar[tuple[str, ...]] = ("blocks.*",)
+    """Patterns of the linear layers that a LoRA adapts."""
+    also_train: ClassVar[tuple[str, ...]] = ()
+    """Patterns of the weights that are trained in full along with a LoRA."""
 
     in_channels: int = 52
     """Channels of the noisy latents and the condition together."""
@@ -86,6 +92,31 @@ class WanDiTConfig:
         from egosim_jax.models.wan.dit import WanDiT
 
         return WanDiT(self, rngs=rngs)
+
+    def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
+        """Count a forward pass of one sample, of so many latent cells, text and image tokens.
+
+        With N tokens of width d, an MLP of width f, T text and I image tokens and L blocks, it has
+
+            self-attention    L (8 N d^2 + 4 N^2 d)
+            cross-attention   L (4 N d^2 + 4 (T + I) d^2 + 4 N (T + I) d)
+            MLP               L 4 N d f
+
+        and the embeddings and the head. Norms and activations do not count.
+        """
+        d, f, depth = self.dim, self.ffn_dim, self.layers
+        n = prod(latents) // PATCH**2
+        image = image if self.image_dim is not None else 0
+        block = 12 * n * d**2 + 4 * (text + image) * d**2 + 4 * n * d * f
+        embeddings = 2 * n * PATCH**2 * (self.in_channels + self.out_channels) * d
+        embeddings += 2 * text * (self.text_dim * d + d**2)
+        embeddings += 2 * (self.freq_dim * d + 7 * d**2)
+        if self.image_dim is not None:
+            embeddings += 2 * image * (self.image_dim**2 + self.image_dim * d)
+        return Flops(
+            weights=float(depth * block + embeddings),
+            attention=float(depth * 4 * n * (n + text + image) * d),
+        )
 
     @property
     def patch(self) -> tuple[int, int, int]:

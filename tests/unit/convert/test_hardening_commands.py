@@ -197,7 +197,7 @@ def own(layers=CONFIG.dit.layers, dim=DIM, path=LAYER, value=1.0):
 )
 def test_a_lora_in_our_names_that_does_not_fit_is_refused(tmp_path, capsys, tensors):
     path = tmp_path / "x.safetensors"
-    weights.write(path, tensors, metadata=lora.about("debug", base="0"))
+    weights.write(path, tensors, metadata=lora.metadata("debug", base="0"))
     out = tmp_path / "out" / "x.safetensors"
     assert main(["lora", str(path), "--config", "debug", "--out", str(out)]) == 2
     assert "error: " in capsys.readouterr().err

@@ -177,11 +177,11 @@ def test_blocks_may_be_missing_and_ranks_differ(pairs, tmp_path):
 
 def test_a_fresh_summand_changes_nothing_until_it_is_trained():
     made = network()
-    lora.start(made, 2, rngs=nnx.Rngs(3))
+    lora.start(made, 2, targets=CONFIG.lora_targets, rngs=nnx.Rngs(3))
     np.testing.assert_array_equal(velocity(made), velocity(network()))
     assert len(lora.deltas_of(made)) == 12
     with pytest.raises(InputError, match="rank"):
-        lora.start(made, 0, rngs=nnx.Rngs(3))
+        lora.start(made, 0, targets=CONFIG.lora_targets, rngs=nnx.Rngs(3))
 
 
 def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
@@ -211,7 +211,7 @@ def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
         read_lora(tmp_path / "bad.safetensors", CONFIG)
     narrow = np.zeros((CONFIG.layers, 7, 3), np.float32)
     wide = {"blocks.self_attn.q": lora.Delta(down=narrow, up=narrow.transpose(0, 2, 1))}
-    with pytest.raises(InputError, match="not of this network"):
+    with pytest.raises(InputError, match="does not fit this network"):
         lora.apply(network(), wide)
     weights.save(tmp_path / "base" / "dit.safetensors", network())
     args = ["lora", str(tmp_path / "bad.safetensors"), "--config", "debug", "--merge"]

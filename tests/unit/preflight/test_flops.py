@@ -12,7 +12,6 @@ from egosim_jax.models.attention import attention, keep_attention
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.preflight.flops import count
-from egosim_jax.train.flops import count_forward
 
 
 def shape(*sizes, dtype=jnp.float32):
@@ -33,7 +32,7 @@ def test_a_forward_of_the_14b_is_that_of_the_formula(kernel, tolerance, monkeypa
     graph, params = nnx.split(nnx.eval_shape(lambda: WanDiT(config, rngs=nnx.Rngs(0))))
     given = shape(1, 16, 60, 104, 52), shape(1), shape(1, 512, 4096), shape(1, 257, 1280)
     have = counted(lambda params, *args: nnx.merge(graph, params)(*args), params, *given)
-    want = count_forward(config, latents=(16, 60, 104), text=512, image=257).total
+    want = config.forward_flops(latents=(16, 60, 104), text=512, image=257).total
     assert have == pytest.approx(want, rel=tolerance)
     assert want == pytest.approx(1126.17e12, rel=1e-5)
 
