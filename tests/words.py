@@ -50,7 +50,7 @@ PHRASES = {
     r"things?": "object, or the noun itself",
     rf"(?:lies?|lay|lying)(?! {_SPATIAL})": "is, is stored",
     r"stands?(?! for| on)": "is, remains",
-    r"tells?(?! apart)|told": "specify, given, report",
+    r"tells|told": "specify, given, report",
     r"(?:left|leaves?|leaving) out": "skip, omit, drop",
     r"of (?:its|their|one's|his|her) own": "its own, separate",
     r"(?:come|comes|came) by": "obtain",
@@ -63,6 +63,7 @@ PHRASES = {
 """Regular expressions of words in prose and in identifiers, and what to write instead."""
 
 PROSE = {
+    r"tell(?! apart)": "specify, report",
     r"answers?|answered": "return, output",
     r"(?:go|goes|going|went) on": "continue",
     r"(?<!ground )(?<!ground-)truths?|true clips?": "ground truth, target",
@@ -102,7 +103,6 @@ RENAMED = {
     "TooLarge": "OutOfMemory",
     "least_s": "roofline_s",
     "ALONE": "OFFLINE_ENV",
-    "turned": "rotation_z",
 }
 """Identifiers that were renamed, and their names today."""
 

@@ -1,4 +1,4 @@
-"""The one way to write: complete or absent, never through a link, never two writers at once.
+"""Atomic writes: complete or absent, never through a link, never two writers at once.
 
 What is written has an unpredictable hidden name until it is on disk; then it is renamed. A crash
 leaves at most such a hidden file or folder, which the next write of the same name removes.
@@ -22,7 +22,7 @@ from typing import Any
 from egosim_jax.types import InputError
 
 TEMPORARY = ".tmp"
-"""In the middle of every temporary name."""
+"""Infix of every temporary name."""
 LOCK = ".lock"
 """Name of the file that a process locks while it writes to a folder."""
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -33,8 +33,9 @@ _NEW = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
 def atomic_write(path: Path) -> Iterator[Path]:
     """Create a temporary file to write to; rename it to `path` when the block ends.
 
-    The temporary file is new, empty, beside `path` and has its suffix; folders are made as needed.
-    It reaches the disk before it is renamed. After an error it is removed; an older `path` stays.
+    The temporary file is new, empty, in the folder of `path` and has its suffix; folders are made
+    as needed. It is on disk before it is renamed. After an error it is removed; an older `path`
+    stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
@@ -53,7 +54,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Create a temporary folder to write to; put it in the place of `path` when the block ends.
+    """Create a temporary folder to write to; rename it to `path` when the block ends.
 
     An older `path` is exchanged for it in one step and then removed; after an error it stays.
     """
@@ -79,7 +80,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def append_line(path: Path, record: Mapping[str, Any]) -> None:
     """Append one JSON object as a line, on disk when this returns.
 
-    What a crash left of a line that was cut off is removed first.
+    An incomplete last line, as a crash leaves one, is removed first.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -96,7 +97,7 @@ def append_line(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def _end_of_lines(descriptor: int) -> int:
-    """Cut a file off after its last line feed; its size."""
+    """Truncate a file after its last line feed and return its size."""
     size = end = os.fstat(descriptor).st_size
     while end:
         start = max(0, end - (1 << 16))
@@ -176,7 +177,7 @@ def _temporary_name(path: Path) -> Path:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove what writers of `path` left that no longer run: nobody holds its lock."""
+    """Remove temporary files of `path` whose writers ended: nobody holds their locks."""
     stem = path.stem.encode()[:120].decode("utf-8", "ignore")
     start, end = f".{stem}.", f"{TEMPORARY}{path.suffix}"
     with os.scandir(path.parent) as entries:

@@ -1,4 +1,4 @@
-"""The hash by which files are told apart."""
+"""SHA-256 of files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Content hashes of values: what a run is made of, so that another run is told apart from it."""
+"""Content hashes of values, such as all settings of a run."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _function(function: Callable[..., Any], within: tuple[int, ...]) -> Iterator
 
 
 def _code(code: CodeType) -> Iterator[bytes]:
-    """A function's instructions and constants, without its file and line numbers."""
+    """Yield a function's instructions and constants, without its file and line numbers."""
     yield code.co_code
     yield repr(code.co_names).encode()
     for constant in code.co_consts:

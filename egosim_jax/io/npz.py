@@ -17,7 +17,7 @@ from egosim_jax.types import InputError
 MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26
 DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError,
           RuntimeError)  # fmt: skip
-"""What zipfile and NumPy raise for archives that are not whole."""
+"""Exceptions of zipfile and NumPy for damaged archives."""
 MAX_ENTRIES = 64
 _HEADER = 4096
 

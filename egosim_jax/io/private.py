@@ -1,4 +1,4 @@
-"""The one policy for caches of native code: what is loaded runs, so only its user may have made it.
+"""Caches of native code: what is loaded runs, so only its user may have written it.
 
 A cache is a folder `~/.cache/egosim_jax/NAME` (`XDG_CACHE_HOME/egosim_jax/NAME` if that is set to
 an absolute path) that belongs to the user, that nobody else can read or write and that is no link.
@@ -27,7 +27,7 @@ _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 def cache_folder() -> Path:
-    """Return the folder of everything that can be made again.
+    """Return the folder of all caches: compiled programs, fetched weights.
 
     As the XDG specification asks, an empty or relative `XDG_CACHE_HOME` counts as not set.
     """
@@ -37,16 +37,16 @@ def cache_folder() -> Path:
 
 @dataclass(frozen=True)
 class PrivateCache:
-    """Files of bytes, each with its checksum, in a folder that is the user's alone."""
+    """Cache of files, each with its checksum, in a folder that only its user can write to."""
 
     folder: Path
-    """Where they lie."""
+    """Folder of the files."""
     most: int
-    """Files that are kept: those that were used last."""
+    """Maximum number of files; those that were used last are kept."""
 
     @classmethod
     def open(cls, name: str, *, most: int) -> PrivateCache | None:
-        """Make or find the cache of a name; None, with a warning, if it is not the user's alone."""
+        """Open the cache of a name; None, with a warning, if others could write to it."""
         folder = cache_folder() / name
         try:
             folder.parent.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ class PrivateCache:
         return None
 
     def get(self, name: str) -> bytes | None:
-        """Read a file; None if it is not there or, with a warning, not to be trusted."""
+        """Read a file; None if it is absent or, with a warning, not trusted."""
         path = self.folder / name
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -82,7 +82,7 @@ class PrivateCache:
             return data[_HEAD:]
 
     def put(self, name: str, data: bytes) -> None:
-        """Write a file, and remove those that were used longest ago; only warns if it cannot."""
+        """Write a file and remove those that were used longest ago; failures only warn."""
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]*", name):
             raise ValueError(f"not a file name: {name[:80]!r}")
         path = self.folder / name
@@ -109,7 +109,7 @@ def _refused(path: Path, problem: str) -> None:
 
 
 def _file_problem(found: os.stat_result) -> str | None:
-    """Say what is wrong with a file of native code, if anything."""
+    """Return the reason not to trust a file of native code; None if it is trusted."""
     if not stat.S_ISREG(found.st_mode):
         return "it is not a regular file"
     if found.st_uid != os.getuid():
@@ -122,7 +122,7 @@ def _file_problem(found: os.stat_result) -> str | None:
 
 
 def _problem(folder: Path) -> str | None:
-    """Say who else could change what lies in a folder, if anybody."""
+    """Return the reason not to trust a folder; None if only its user can write to it."""
     for own in (folder, folder.parent):
         found = own.lstat()
         if not stat.S_ISDIR(found.st_mode):

@@ -1,4 +1,4 @@
-"""The one reader of bytes that others wrote: bounded before anything is built from them.
+"""Readers of untrusted files: bounded before anything is built from them.
 
 Only regular files are opened, so that a pipe or a device cannot block. Sizes are checked before
 reading, depth and repeated names while parsing, and no message repeats an untrusted value in full.
@@ -19,7 +19,7 @@ from egosim_jax.types import InputError
 MAX_JSON_BYTES = 16 << 20
 """Largest JSON document that is parsed, in bytes; Python objects take up to 30 times as much."""
 MAX_QUOTED = 80
-"""Characters of an untrusted value in a message."""
+"""Maximum length of an untrusted value in a message, in characters."""
 
 
 def open_regular(path: Path) -> io.BufferedReader:
@@ -76,10 +76,10 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
 def read_lines(
     path: Path, *, limit: int = 1 << 30, last: Literal["drop", "read"] = "drop"
 ) -> Iterator[tuple[int, Any]]:
-    """Parse a file of JSON lines: line numbers from 1, and values; blank lines are passed over.
+    """Yield line numbers, from 1, and values of a file of JSON lines; blank lines are skipped.
 
     Only a line feed ends a line. A `last` line without one was cut off by a crash and is dropped,
-    unless people may have written it.
+    unless it may have been written by hand.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -119,13 +119,13 @@ def quote_text(text: str) -> str:
 
 
 def listing(items: Sequence[str], *, most: int = 5) -> str:
-    """Put findings on one line: the first ones, and how many more there are."""
+    """Join findings on one line: the first ones, and the number of the others."""
     more = f"; and {len(items) - most:,} more" if len(items) > most else ""
     return "; ".join(items[:most]) + more
 
 
 def quote_path(path: Path | str) -> str:
-    """Show a path in a message: as it is, unless it has characters that cannot be printed."""
+    """Return a path for a message, escaped if it has characters that cannot be printed."""
     text = str(path)
     return text if text.isprintable() else ascii(text)
 

@@ -1,4 +1,4 @@
-"""Videos and images in and out: uint8 RGB arrays on our side, H.264 and PNG on disk.
+"""Reading and writing of videos and images: uint8 RGB arrays, H.264 and PNG on disk.
 
 Colors cross between RGB and YUV 4:2:0 with accurate rounding and interpolated chroma. The
 scaler's fast default, with which EgoSim's loader reads (`decoding="official"`), gives frames about
@@ -41,23 +41,23 @@ from egosim_jax.io.untrusted import open_regular, quote_path, quote_text, read_b
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000
-"""Longest video that is read, in frames, unless the caller says otherwise."""
+"""Maximum length of a video in frames, unless the caller gives another."""
 MAX_PIXELS = 2**31
-"""Most pixels decoded from one video, frames x height x width: some ten seconds."""
+"""Maximum number of pixels decoded from one video, frames x height x width: about 10 s."""
 MAX_KEPT = 3 * 2**28
-"""Most bytes of the frames that one reading gives."""
+"""Maximum size of the frames of one call, in bytes."""
 MAX_IMAGE_PIXELS = 2**25
-"""Most pixels of one image or frame: 8192 x 4096."""
+"""Maximum number of pixels of one image or frame: 8192 x 4096."""
 MAX_IMAGE_BYTES = 2**28
-"""Largest image file that is read."""
+"""Maximum size of an image file in bytes."""
 IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
-"""Image formats that are read."""
+"""Image formats that can be read."""
 
 File = io.BufferedReader | io.BytesIO
 Decoding = Literal["accurate", "official"]
-"""How YUV becomes RGB: accurately, or bit for bit as in EgoSim's loader (imageio's FFmpeg)."""
+"""Conversion of YUV to RGB: accurate, or bit for bit as in EgoSim's loader (imageio's FFmpeg)."""
 Damage = Literal["refuse", "stop"]
-"""What to do where a video is damaged: raise `InputError`, or give the frames before."""
+"""Action at damage in a video: raise `InputError`, or stop and return the frames before it."""
 
 _ACCURATE = (
     Interpolation.BICUBIC
@@ -80,22 +80,22 @@ _OPTIONS = {
 
 
 class DamagedError(InputError):
-    """A video is not whole, or not what was written."""
+    """Raised for a video that is truncated or damaged."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Video:
-    """A decoded video."""
+    """Decoded video and its frame rate."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """RGB."""
+    """Frames in RGB."""
     fps: Fraction
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoInfo:
-    """What a video holds, read without decoding it."""
+    """Length, size and rate of a video, read without decoding it."""
 
     frames: int
     height: int
@@ -113,7 +113,7 @@ def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
 
 
 def probe_encoded(data: bytes, *, name: str = "the encoded video") -> VideoInfo:
-    """`probe_video` from the bytes of a file; `name` stands for the path in errors."""
+    """Probe the bytes of a video file (`probe_video`); `name` replaces the path in errors."""
     return _probe(io.BytesIO(data), name, "refuse")
 
 
@@ -155,7 +155,7 @@ def decode_video(
     each: Callable[[np.ndarray], np.ndarray] | None = None,
     name: str = "the encoded video",
 ) -> Video:
-    """`read_video` from the bytes of a file; `name` stands for the path in errors."""
+    """Decode the bytes of a video file (`read_video`); `name` replaces the path in errors."""
     return _decode(
         io.BytesIO(data),
         name,
@@ -170,7 +170,7 @@ def decode_video(
 def write_video(
     path: Path, frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = 10
 ) -> None:
-    """Write an H.264 mp4, whole or not at all."""
+    """Write an H.264 mp4 file atomically."""
     data = encode_video(frames, fps, crf=crf)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data)
@@ -217,7 +217,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.ndarray, "h w 3"]:
-    """`read_image` from the bytes of a file; `name` stands for the path in errors.
+    """Decode the bytes of an image file (`read_image`); `name` replaces the path in errors.
 
     Of 16 bits the upper 8 are taken.
     """
@@ -299,7 +299,7 @@ def _decode(
 
 
 def _grown(kept: np.ndarray, frame: np.ndarray, name: str) -> np.ndarray:
-    """Room for twice as many frames, without a copy."""
+    """Double the capacity for frames without a copy."""
     room = min(max(16, 2 * len(kept)), MAX_KEPT // frame.nbytes)
     if room <= len(kept):
         raise InputError(
@@ -316,7 +316,7 @@ def _rgb(picture: VideoFrame, decoding: Decoding) -> np.ndarray:
 
 
 def _upright(picture: VideoFrame, pixels: np.ndarray) -> np.ndarray:
-    """Turn and mirror pixels as the display matrix (a b u, c d v, x y w) says.
+    """Rotate and mirror frames by the display matrix (a b u, c d v, x y w).
 
     A point (x, y) is shown at (a x + c y, b x + d y), y downward.
     """
@@ -324,14 +324,14 @@ def _upright(picture: VideoFrame, pixels: np.ndarray) -> np.ndarray:
         return pixels
     a, b, _, c, d, *_ = np.frombuffer(bytes(picture.side_data["DISPLAYMATRIX"]), np.int32)
     if (a or d) and (b or c):
-        raise InputError("the video is turned by an angle that is no multiple of 90°.")
+        raise InputError("the video is rotated by an angle that is not a multiple of 90°.")
     if b or c:
         pixels, a, d = pixels.swapaxes(0, 1), c, b
     return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
 def _pictures(container: InputContainer, name: str, max_frames: int) -> Iterator[VideoFrame]:
-    """Decode frame after frame. Raises `DamagedError` where the video is not whole."""
+    """Yield decoded frames. Raises `DamagedError` where the video is damaged."""
     stream, size = container.streams.video[0], None
     shown = given = 0
     for packet in _packets(container, name, max_frames):
@@ -353,7 +353,7 @@ def _decoded(stream: VideoStream, packet: Packet | None, name: str) -> list[Vide
 
 
 def _packets(container: InputContainer, name: str, max_frames: int) -> Iterator[Packet | None]:
-    """Read packet after packet, then None, for which the decoder gives what it still holds.
+    """Yield packets, then None, for which the decoder returns its remaining frames.
 
     Raises `DamagedError` at the end if the file was cut off.
     """
@@ -378,7 +378,7 @@ def _packets(container: InputContainer, name: str, max_frames: int) -> Iterator[
 
 @contextmanager
 def _open_file(path: Path) -> Iterator[File]:
-    """A file opened here, so that no video library ever resolves a name."""
+    """Open a file here, so that no video library resolves a name."""
     with open_regular(path) as file:
         if not os.fstat(file.fileno()).st_size:
             raise InputError(f"{quote_path(path)} is empty (0 bytes).")
@@ -387,7 +387,7 @@ def _open_file(path: Path) -> Iterator[File]:
 
 @contextmanager
 def _open_video(file: File, name: str, max_frames: int) -> Iterator[InputContainer]:
-    """A container with a video stream of an allowed size."""
+    """Open a container with a video stream of an allowed size."""
     check_boxes(file, name)
     with _refusing(f"{name} is not a readable video"):
         container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
@@ -407,7 +407,7 @@ def _open_video(file: File, name: str, max_frames: int) -> Iterator[InputContain
 
 @contextmanager
 def _refusing(what: str, kind: type[InputError] = InputError) -> Iterator[None]:
-    """Whatever a decoder raises about foreign bytes becomes `InputError`."""
+    """Turn exceptions of a decoder about untrusted bytes into `InputError`."""
     try:
         yield
     except InputError:

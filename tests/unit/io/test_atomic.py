@@ -1,4 +1,4 @@
-"""What is written is complete or absent."""
+"""Written files are complete or absent."""
 
 import fcntl
 import json
@@ -93,7 +93,7 @@ def test_lines_are_appended_after_the_last_complete_one(tmp_path):
     ]
 
 
-def test_a_second_process_is_refused_and_told_who_is_first(tmp_path):
+def test_a_second_process_is_refused_and_the_first_one_named(tmp_path):
     program = (
         "import sys, pathlib; from egosim_jax.io.atomic import lock_folder\n"
         "from egosim_jax.types import InputError\n"

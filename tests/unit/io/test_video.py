@@ -260,7 +260,7 @@ def test_frames_are_turned_and_mirrored_as_the_display_matrix_says(turn):
 
 
 def test_an_oblique_display_matrix_is_refused():
-    with pytest.raises(InputError, match="no multiple of 90"):
+    with pytest.raises(InputError, match="not a multiple of 90"):
         decode_video(remuxed(encode_video(smooth(), 16), rotation=30))
 
 
@@ -375,7 +375,7 @@ def test_an_image_of_32_bits_is_refused(tmp_path):
 
 
 def test_the_groups_of_samples_of_a_phones_video_are_counted():
-    """Its kind of group, four letters, stands where other tables have their number of entries."""
+    """Its kind of group, four letters, is where other tables have their number of entries."""
     group = b"\0\0\0\0roll" + (1).to_bytes(4, "big") + (48_000).to_bytes(4, "big") + b"\0" * 4
     check_boxes(io.BytesIO((8 + len(group)).to_bytes(4, "big") + b"sbgp" + group), "a.mp4")
     many = group[:8] + (2**30).to_bytes(4, "big") + group[12:]
