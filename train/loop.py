@@ -122,7 +122,7 @@ class Run:
         self.source, self.frozen, self.update = source, programs.frozen, programs.update
         self.clock, self.skips = Clock(flops=float("nan")), SkipMonitor(source)
         self.learning_rate = learning_rate(training.optimizer, training.steps)
-        self.pending: dict[int, Mapping[str, jax.Array]] = {}
+        self.pending: list[Mapping[str, jax.Array]] = []
         self.writers: list[Writer] = []
         self.batches = stack.enter_context(closing(self._batches(source)))
         self.checkpoints = Checkpoints(
@@ -183,7 +183,7 @@ class Run:
             examples = next(self.batches)
         with self.clock.phase("step"):
             state, metrics = self.update(state, self.frozen, self._to_devices(examples))
-            self.pending[step] = metrics
+            self.pending.append(metrics)
             self.skips.watch(step, metrics, examples["record"])
         self.watchdog.beat()
         return state
@@ -192,8 +192,8 @@ class Run:
         """Write the mean metrics since the last line, and the speed."""
         with self.clock.phase("step"):
             self.skips.check()
-            metrics = mean_metrics(list(self.pending.values()))
-        self.pending = {}
+            metrics = mean_metrics(self.pending)
+        self.pending = []
         if self.batches.skipped:
             metrics["skipped_records"] = float(len(self.batches.skipped))
         metrics["lr"] = float(np.asarray(self.learning_rate(step - 1)))

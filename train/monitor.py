@@ -209,7 +209,7 @@ def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
 
     Skipped updates are only counted, as `skipped_updates`.
     """
-    fetched = jax.device_get(list(rows))
+    fetched = jax.device_get(rows)
     kept = [row for row in fetched if not row["consecutive_skips"]]
     names = [name for name in fetched[0] if name != "consecutive_skips"]
     metrics = {name: average(kept, name) for name in names if kept}
