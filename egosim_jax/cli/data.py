@@ -328,3 +328,21 @@ class Stats:
             )
             table.add_row(split, str(count), frames, f"{words[split] / count:.1f}")
         return table
+
+
+@dataclass(frozen=True, kw_only=True)
+class Data:
+    """Prepare data: clips of a procedural world, shards of videos, frames or latents."""
+
+    command: (
+        Annotated[Make, tyro.conf.subcommand("make")]
+        | Annotated[Pack, tyro.conf.subcommand("pack")]
+        | Annotated[Encode, tyro.conf.subcommand("encode")]
+        | Annotated[Look, tyro.conf.subcommand("look")]
+        | Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Stats, tyro.conf.subcommand("stats")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()

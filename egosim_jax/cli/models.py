@@ -103,3 +103,17 @@ def _fetch(release: Release, listing: Listing, folder: Path, *, keep_download: b
         write_json(folder / hub.RECORD, hub.as_record(release, listing, hashes))
         if not keep_download:
             shutil.rmtree(downloads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models:
+    """List released weights by name; fetch and convert them."""
+
+    command: (
+        Annotated[List, tyro.conf.subcommand("list")]
+        | Annotated[Fetch, tyro.conf.subcommand("fetch")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()

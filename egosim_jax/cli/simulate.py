@@ -181,10 +181,9 @@ def score(step: Step, clip: TabletopClip) -> dict[str, float]:
     bare = np.zeros_like(acted)
     bare[-1] = ids[-1] < FIRST_HAND
     return {
-        "psnr": whole.psnr,
-        "ssim": whole.ssim,
+        **whole,
         "region_psnr": region_psnr(video, truth, acted[1:]),
-        "prior_psnr": compare(step.view.frames[1:], truth).psnr,
+        "prior_psnr": compare(step.view.frames[1:], truth)["psnr"],
         "depth_error": depth_error(after.depth_m, clip.depth_m, bare),
         "depth_known": coverage(after.depth_m, bare),
         "camera_error": _camera_error(step.clip.frames, clip, ~acted),

@@ -38,6 +38,11 @@ def get(name: str) -> ModelConfig:
     return importlib.import_module(f"{__name__}.{name}").CONFIG
 
 
+def allows_random_weights(name: str) -> bool:
+    """Return True if a model may generate with random weights, to see that everything runs."""
+    return getattr(importlib.import_module(f"{__name__}.{name}"), "RANDOM_WEIGHTS", False)
+
+
 def shipped_weights(name: str) -> Path | None:
     """The folder of the weights that come with the package, if the config has any."""
     folder = SHIPPED / name

@@ -16,3 +16,5 @@ CONFIG = dataclasses.replace(
     image=CLIPVisionConfig(image_size=28, dim=32, layers=2, heads=2, ffn_dim=64),
     steps=4,
 )
+RANDOM_WEIGHTS = True
+"""Generate with random weights if none are given."""

@@ -1,157 +1,112 @@
-"""`egosim experiment tabletop`: what each condition is worth, on scenes that were held out."""
+"""`egosim experiment tabletop`: ablation of the conditions on held-out scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from egosim_jax.command import DONE
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.experiments.config import Tabletop
+from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
     SHEET_MOMENTS,
     SHEET_SCENES,
-    Hidden,
-    Scene,
-    copies,
+    DroppedCondition,
+    HeldOutClip,
+    baselines,
+    evaluate,
     generate,
-    judge,
     reconstruct,
 )
-from egosim_jax.experiments.tables import mean_and_spread
+from egosim_jax.generator import Generator
+from egosim_jax.io.run import write_json
+from egosim_jax.metrics.report import print_table, summarize
 from egosim_jax.progress import track
-from egosim_jax.types import check_counts
+from egosim_jax.types import Kind, check_counts
 
-if TYPE_CHECKING:
-    from egosim_jax.generator import Generator
-    from egosim_jax.types import Kind
-
-Summary = dict[str, float]
-Table = dict[str, dict[str, Summary]]
-METHODS: tuple[tuple[str, Hidden | None], ...] = (
+Table = dict[str, dict[str, dict[str, float]]]
+METHODS: tuple[tuple[str, DroppedCondition | None], ...] = (
     ("full", None),
     ("without prior", "prior"),
     ("without mask", "mask"),
     ("without hands", "hands"),
 )
-SPREAD = (
-    "standard deviation over scenes, each a mean over seeds; and over seeds, each a mean over "
-    "scenes (n - 1)"
-)
+"""Names of the generated rows, and the condition that each drops."""
+SPREAD = {
+    "spread": "standard deviation over scenes (n - 1), each a mean over seeds",
+    "spread_over_seeds": "standard deviation over seeds (n - 1), each a mean over scenes",
+}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tabletop:
-    """Generate held-out tabletop scenes with all conditions and without each, and compare.
-
-    Prints a table for people's hands and one for robots', beside the prior copied, the first frame
-    repeated and the truth through the autoencoder. Writes report.json and a contact sheet of each.
-    """
-
-    out: Path
-    """Folder to write to."""
-    config: str = "tabletop"
-    """Name of the model."""
-    weights: Path | None = None
-    """Folder of weights, if not those that come with the package."""
-    scenes: int = 24
-    """Scenes of each kind."""
-    first_scene: int = 100
-    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
-    seeds: int = 2
-    """Times that each clip is generated, from different noise."""
-    batch_size: int = 8
-    """Clips generated together."""
-
-    def run(self) -> int:
-        """Make the scenes, generate, compare, draw."""
-        from egosim_jax import configs
-        from egosim_jax.generator import Generator
-        from egosim_jax.io.run import open_folder, write_json
-        from egosim_jax.io.weights import hashes
-
-        check_counts(
-            {"--scenes": self.scenes, "--seeds": self.seeds, "--batch-size": self.batch_size}
-        )
-        config = configs.get(self.config)
-        weights = configs.weights_of(self.config, self.weights)
-        made_of = {"experiment": self, "weights": hashes(weights)}
-        open_folder(self.out, made_of, mutable=["experiment.weights"])
-        generator = Generator.load(config, weights)
-        kinds: tuple[Kind, ...] = ("human", "robot")
-        tables = {kind: self._compare(kind, generator) for kind in kinds}
-        definitions = {**DEFINITIONS, "spread": SPREAD}
-        write_json(self.out / "report.json", {"definitions": definitions, "tables": tables})
-        for kind, table in tables.items():
-            _print(kind, table)
-        return DONE
-
-    def _compare(self, kind: Kind, generator: Generator) -> Table:
-        """Scores of every method on the scenes of one kind of hands, and their sheet."""
-        spec = generator.config.video
-        seeds = range(self.first_scene, self.first_scene + self.scenes)
-        scenes = [
-            Scene.make(seed, spec, kind)
-            for seed in track(seeds, f"making {kind} scenes", total=self.scenes)
-        ]
-        table: Table = {}
-        shown: list[SheetClip] = []
-        size = self.batch_size
-        for name, hidden in METHODS:
-            runs = []
-            for seed in track(range(self.seeds), f"{kind}, {name}", total=self.seeds):
-                videos = list(
-                    generate(generator, scenes, batch_size=size, seed=seed, without=hidden)
-                )
-                runs.append(judge(scenes, videos))
-                if hidden is None and seed == 0:
-                    shown = [
-                        scene.block({"generated": video})
-                        for scene, video in zip(scenes, videos, strict=True)
-                    ]
-            table[name] = summarize(runs)
-        others = {
-            **copies(scenes),
-            "truth through the autoencoder": list(reconstruct(generator, scenes, batch_size=size)),
-            "truth": [scene.clip.frames for scene in scenes],
+def run(settings: Tabletop) -> None:
+    """Make the scenes, generate, compare, draw."""
+    check_counts(
+        {
+            "--scenes": settings.scenes,
+            "--seeds": settings.seeds,
+            "--batch-size": settings.batch_size,
         }
-        for name, videos in others.items():
-            table[name] = summarize([judge(scenes, videos)])
-        draw_sheet(
-            shown[:SHEET_SCENES], self.out / f"contact_sheet_{kind}.png", moments=SHEET_MOMENTS
-        )
-        return table
+    )
+    generator = open_experiment(settings)
+    kinds: tuple[Kind, ...] = ("human", "robot")
+    tables = {kind: _compare(settings, kind, generator) for kind in kinds}
+    report = {"definitions": {**DEFINITIONS, **SPREAD}, "tables": tables}
+    write_json(settings.out / "report.json", report)
+    for kind, table in tables.items():
+        title = f"{kind}: mean ± spread over scenes (± over seeds)"
+        print_table("", table, MEASURES, title=title)
 
 
-def summarize(runs: Sequence[Sequence[Mapping[str, float]]]) -> dict[str, Summary]:
-    """Mean and spreads of each measure; `runs` has a list of scenes for each seed.
+def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Table:
+    """Score every method on the scenes of one kind of hands, and draw their contact sheet."""
+    spec, size = generator.config.video, settings.batch_size
+    seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
+    scenes = [
+        HeldOutClip.make(seed, spec, kind)
+        for seed in track(seeds, f"making {kind} scenes", total=settings.scenes)
+    ]
+    table: Table = {}
+    shown: list[SheetClip] = []
+    for name, dropped in METHODS:
+        runs = []
+        for seed in track(range(settings.seeds), f"{kind}, {name}", total=settings.seeds):
+            videos = list(generate(generator, scenes, batch_size=size, seed=seed, without=dropped))
+            runs.append(evaluate(scenes, videos))
+            if dropped is None and seed == 0:
+                shown = [
+                    scene.on_sheet({"generated": video})
+                    for scene, video in zip(scenes, videos, strict=True)
+                ]
+        table[name] = summarize_runs(runs)
+    others = {
+        **baselines(scenes),
+        "ground truth through the autoencoder": list(
+            reconstruct(generator, scenes, batch_size=size)
+        ),
+        "ground truth": [scene.clip.frames for scene in scenes],
+    }
+    for name, videos in others.items():
+        table[name] = summarize_runs([evaluate(scenes, videos)])
+    sheet = settings.out / f"contact_sheet_{kind}.png"
+    draw_sheet(shown[:SHEET_SCENES], sheet, moments=SHEET_MOMENTS)
+    return table
 
-    Where a measure is NaN, because there was nothing to measure, it does not count.
+
+def summarize_runs(
+    runs: Sequence[Sequence[Mapping[str, float]]],
+) -> dict[str, dict[str, float]]:
+    """Return mean and spreads of each measure; `runs` has the scores of all scenes for each seed.
+
+    NaN, the score of a scene in which there is nothing to measure, is ignored.
     """
-    summaries = {}
-    for name in MEASURES:
-        by_seed = [[scene[name] for scene in run] for run in runs]
-        scenes = [mean_and_spread(values)[0] for values in zip(*by_seed, strict=True)]
-        mean, over_scenes = mean_and_spread(scenes)
-        _, over_seeds = mean_and_spread([mean_and_spread(values)[0] for values in by_seed])
-        summaries[name] = {"mean": mean, "over_scenes": over_scenes, "over_seeds": over_seeds}
-    return summaries
+    scenes = [_means(scores) for scores in zip(*runs, strict=True)]
+    seeds = summarize([_means(scores) for scores in runs], MEASURES)
+    return {
+        name: {**summary, "spread_over_seeds": seeds[name]["spread"]}
+        for name, summary in summarize(scenes, MEASURES).items()
+    }
 
 
-def _print(kind: str, table: Table) -> None:
-    from rich.console import Console
-    from rich.table import Table as RichTable
-
-    title = f"{kind}: mean ± spread over scenes (± over seeds)"
-    shown = RichTable("", *(name for name, _ in MEASURES.values()), title=title)
-    for method, summaries in table.items():
-        cells = []
-        for measure, (_, form) in MEASURES.items():
-            value = summaries[measure]
-            mean, scenes, seeds = (form.format(value[k]) for k in value)
-            cells.append(f"{mean} ± {scenes} (± {seeds})")
-        shown.add_row(method, *cells)
-    Console(width=160).print(shown)
+def _means(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {name: summary["mean"] for name, summary in summarize(scores, MEASURES).items()}

@@ -1,10 +1,8 @@
-"""A table of methods: means and spreads over clips, split by split."""
+"""Scores of videos, their means and spreads, and tables of them."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import UInt8
@@ -18,57 +16,58 @@ DEFINITIONS = {
     "spread": "standard deviation over clips (n - 1)",
 }
 
-
-@dataclass(frozen=True, kw_only=True)
-class Score:
-    """One method on one clip."""
-
-    psnr: float
-    """dB."""
-    ssim: float
+Measures = Mapping[str, tuple[str, str]]
+"""Column title and number format of each measure, by name."""
+Summary = Mapping[str, Mapping[str, float]]
+"""`mean` and `spread` of each measure, by name; a measure without repetitions has no `spread`."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Summary:
-    """One method over the clips of one split."""
-
-    clips: int
-    psnr: float
-    psnr_spread: float
-    ssim: float
-    ssim_spread: float
+def score(
+    video: UInt8[np.ndarray, "f h w 3"], target: UInt8[np.ndarray, "f h w 3"]
+) -> dict[str, float]:
+    """Return PSNR in dB and SSIM of a video, each a mean over frames."""
+    return {"psnr": float(psnr(video, target).mean()), "ssim": float(ssim(video, target).mean())}
 
 
-def score(video: UInt8[np.ndarray, "f h w 3"], truth: UInt8[np.ndarray, "f h w 3"]) -> Score:
-    """PSNR and SSIM, each a mean over frames."""
-    return Score(psnr=float(psnr(video, truth).mean()), ssim=float(ssim(video, truth).mean()))
+def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
+    """Return mean and standard deviation (n - 1) of values, ignoring NaN.
+
+    The mean of no values is NaN, the deviation of fewer than two values 0.
+    """
+    known = [value for value in values if not np.isnan(value)]
+    mean = float(np.mean(known)) if known else float("nan")
+    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
 
 
-def summarize(scores: Sequence[Score]) -> Summary:
-    """Means over clips, and standard deviations (0 for a single clip)."""
-    psnrs, ssims = [s.psnr for s in scores], [s.ssim for s in scores]
-    return Summary(
-        clips=len(scores),
-        psnr=math.fsum(psnrs) / len(psnrs),
-        psnr_spread=_deviation(psnrs),
-        ssim=math.fsum(ssims) / len(ssims),
-        ssim_spread=_deviation(ssims),
-    )
+def summarize(
+    scores: Sequence[Mapping[str, float]], measures: Iterable[str]
+) -> dict[str, dict[str, float]]:
+    """Return mean and spread of each measure over scores."""
+    summary = {}
+    for name in measures:
+        mean, spread = mean_and_spread(score[name] for score in scores)
+        summary[name] = {"mean": mean, "spread": spread}
+    return summary
 
 
-def summarize_splits(
-    clips: Sequence[tuple[str, Mapping[str, Score]]],
-) -> dict[str, dict[str, Summary]]:
-    """Sorted splits, and of each method its summary, from every clip's split and scores."""
-    gathered: dict[str, dict[str, list[Score]]] = {}
-    for split, scores in clips:
-        for method, value in scores.items():
-            gathered.setdefault(split, {}).setdefault(method, []).append(value)
-    return {
-        split: {method: summarize(values) for method, values in methods.items()}
-        for split, methods in sorted(gathered.items())
-    }
+def print_table(
+    corner: str, rows: Mapping[str, Summary], measures: Measures, *, title: str | None = None
+) -> None:
+    """Print a row for each summary, as mean ± spread; `corner` heads the column of row names.
+
+    The cell of a missing measure is empty; a `spread_over_seeds` is appended in parentheses.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(corner, *(heading for heading, _ in measures.values()), title=title)
+    for row, summary in rows.items():
+        cells = (_cell(summary.get(name, {}), form) for name, (_, form) in measures.items())
+        table.add_row(row, *cells)
+    Console(width=160).print(table)
 
 
-def _deviation(values: Sequence[float]) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+def _cell(value: Mapping[str, float], form: str) -> str:
+    text = " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)
+    seeds = value.get("spread_over_seeds")
+    return text if seeds is None else f"{text} (± {form.format(seeds)})"

@@ -37,7 +37,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def generated(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both clips, of which one has lost its mask: it fails, the other is made."""
+    """Both clips, of which one has no mask: it fails, the other is made."""
     broken = tmp_path_factory.mktemp("broken")
     shutil.copytree(clips.parent, broken, dirs_exist_ok=True)
     (broken / "sample_1" / "pc_mask_video.mp4").unlink()
@@ -142,7 +142,7 @@ def test_a_clip_whose_line_a_kill_prevented_is_listed(generated, clips, tmp_path
     assert results(out)["sample_0"]["status"] == "done"
 
 
-def test_damaged_clips_that_are_left_over_end_as_they_did_at_first(generated, tmp_path, capsys):
+def test_damaged_clips_give_the_same_exit_code_again(generated, tmp_path, capsys):
     """The first run of `generated` gave 3."""
     out = tmp_path / "run"
     shutil.copytree(generated, out)
@@ -150,7 +150,7 @@ def test_damaged_clips_that_are_left_over_end_as_they_did_at_first(generated, tm
     assert "0 done, 1 failed" in capsys.readouterr().err
 
 
-def test_evaluate_reports_the_generated_clips_beside_the_baselines(generated, clips, capsys):
+def test_evaluate_reports_the_generated_clips_along_with_the_baselines(generated, clips, capsys):
     args = ["evaluate", "--generated", str(generated), "--metadata", str(clips)]
     assert main(args) == 3  # one of the two clips was never generated
     report = json.loads((generated / "report.json").read_text("utf-8"))
@@ -225,16 +225,16 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
     assert tables.keys() == {"human", "robot"}
     human = tables["human"]
     assert human.keys() >= {"full", "without prior", "without mask", "without hands"}
-    assert human["truth"]["psnr"]["mean"] == 100
-    assert human["truth"]["hand_iou"]["mean"] > 0.7
-    assert human["full"]["psnr"]["over_seeds"] > 0
+    assert human["ground truth"]["psnr"]["mean"] == 100
+    assert human["ground truth"]["hand_iou"]["mean"] > 0.7
+    assert human["full"]["psnr"]["spread_over_seeds"] > 0
     assert human["prior copied"]["region_psnr"]["mean"] < 30
     assert (out / "contact_sheet_human.png").exists()
     assert (out / "contact_sheet_robot.png").exists()
     assert "without hands" in capsys.readouterr().out
 
 
-def test_the_doctor_says_what_is_there_and_what_is_not(weights, tmp_path, capsys, monkeypatch):
+def test_the_doctor_lists_what_is_missing(weights, tmp_path, capsys, monkeypatch):
     (tmp_path / "mine").symlink_to(weights)
     monkeypatch.setattr(doctor, "find_spec", lambda name: None)
     assert main(["doctor", str(tmp_path / "mine")]) == 0

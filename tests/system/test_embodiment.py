@@ -12,7 +12,7 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.networks import Networks
 
-MODELS = {"people", "full", "lora", "scratch"}
+MODELS = {"human", "full", "lora", "scratch"}
 ALIKE = {"steps": 2, "batch-size": 2, "warmup": 1, "learning-rate": 0.01}
 
 
@@ -35,8 +35,8 @@ def report(run: Path) -> dict:
     return json.loads((run / "report.json").read_text("utf-8"))
 
 
-def test_there_is_a_line_for_each_model_and_for_what_needs_none(report):
-    others = {"prior copied", "first frame repeated", "truth through the autoencoder"}
+def test_there_is_a_row_for_each_model_and_baseline(report):
+    others = {"prior copied", "first frame repeated", "ground truth through the autoencoder"}
     assert report["table"].keys() == MODELS | others
     assert all(line["psnr"]["mean"] > 0 for line in report["table"].values())
 
@@ -50,11 +50,11 @@ def test_validation_losses_are_finite_before_and_after(report):
         assert line["after"]["mean"] == steps["2"]
 
 
-def test_robots_trainings_start_from_the_peoples_model(report):
+def test_robot_trainings_start_from_the_human_model(report):
     line = report["table"]
     for name in ("full", "lora"):
-        assert line[name]["before"]["mean"] == pytest.approx(line["people"]["after"]["mean"])
-    assert line["scratch"]["before"]["mean"] == pytest.approx(line["people"]["before"]["mean"])
+        assert line[name]["before"]["mean"] == pytest.approx(line["human"]["after"]["mean"])
+    assert line["scratch"]["before"]["mean"] == pytest.approx(line["human"]["before"]["mean"])
 
 
 def test_every_scene_belongs_to_one_split(run):
@@ -74,7 +74,7 @@ def test_the_weights_of_each_model_are_complete(run):
     assert not (run / "lora" / "weights").exists()
 
 
-def test_the_sheet_has_a_row_for_each_model_between_conditions_and_truth(run):
+def test_the_sheet_has_a_row_for_each_model_between_conditions_and_ground_truth(run):
     with Image.open(run / "contact_sheet.png") as sheet:
         assert sheet.size == (6 * 96, 2 * (16 + 7 * 64))
     assert (run / "curves.png").exists()
@@ -89,11 +89,11 @@ def test_started_again_it_trains_nothing_and_reports_the_same(
     assert main(experiment(weights, run)) == 0
     assert json.loads((run / "report.json").read_text("utf-8")) == report
     said = capsys.readouterr().out
-    assert "people, then a LoRA: training on robots" in said
-    assert "robots alone" in said
+    assert "human, then a LoRA: training on the robot" in said
+    assert "robot alone" in said
 
 
-def test_a_stage_that_was_lost_is_made_again_alike(weights, run):
+def test_a_lost_stage_is_trained_again_to_equal_weights(weights, run):
     path = run / "lora" / "lora.safetensors"
     before = load_file(path)
     path.unlink()
@@ -108,7 +108,7 @@ def test_another_config_is_refused(weights, run, capsys):
     assert "experiment.lora.learning_rate" in capsys.readouterr().err
 
 
-def test_a_stage_that_cannot_be_is_refused_before_clips_are_made(weights, tmp_path, capsys):
+def test_an_invalid_stage_is_refused_before_clips_are_made(weights, tmp_path, capsys):
     assert main(experiment(weights, tmp_path / "run", "--scratch.learning-rate", "-1")) == 2
     assert "learning_rate must be positive" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

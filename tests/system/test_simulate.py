@@ -142,7 +142,7 @@ def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(
     assert (out / "report.json").read_bytes() == kept
 
 
-def test_the_state_after_a_thing_was_carried_is_compared_with_the_truth(
+def test_the_state_after_an_object_was_carried_is_compared_with_the_ground_truth(
     weights, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(update, "LARGE", VideoSpec(frames=9, height=96, width=160))
@@ -153,13 +153,13 @@ def test_the_state_after_a_thing_was_carried_is_compared_with_the_truth(
     assert table.keys() == {
         "oracle, 160 x 96",
         "oracle, 96 x 64",
-        "classical, true frames",
+        "classical, ground-truth frames",
         "classical, generated frames",
     }
-    told = {name: value["mean"] for name, value in table["oracle, 160 x 96"].items()}
-    assert told["accurate"] >= 95
-    assert told["complete"] >= 80
-    assert told["ghost"] < 2
+    scores = {name: value["mean"] for name, value in table["oracle, 160 x 96"].items()}
+    assert scores["accuracy"] >= 95
+    assert scores["completeness"] >= 80
+    assert scores["ghost"] < 2
     lost = table["classical, generated frames"]  # of random weights: nothing is found in noise
     assert lost["ghost"]["mean"] > 90
     assert "ghost points" in capsys.readouterr().out

@@ -5,13 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from egosim_jax import interrupts
+from egosim_jax.data.clips import write_clips
 from egosim_jax.data.manifest import MANIFEST
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.records import from_bytes, to_bytes
@@ -48,6 +49,12 @@ class DatasetConfig:
                 f"The dataset is empty: it has {len(self.seeds)} scenes of {self.clips} clips; "
                 "both must be at least 1. (--scenes, --clips)"
             )
+
+
+def write_scenes(folder: Path, seeds: Iterable[int], *, spec: VideoSpec, kind: Kind) -> Path:
+    """Write the first clip of each seed as files in EgoSim's layout; return their metadata.csv."""
+    clips = (next(make_sequence(seed, spec=spec, kind=kind)) for seed in seeds)
+    return write_clips(folder, map(to_triplet, clips), fps=spec.fps)
 
 
 def make_shards(config: DatasetConfig, *, out: Path, workers: int) -> Iterator[int]:

@@ -1,4 +1,4 @@
-"""`egosim evaluate`: what is compared with what."""
+"""`egosim evaluate`: the compared videos, frames and sizes."""
 
 import json
 
@@ -14,14 +14,14 @@ from egosim_jax.types import InputError
 
 @pytest.fixture
 def run(clips, tmp_path):
-    """A folder of generated clips: the truth a little darker."""
+    """A folder of generated clips: the ground truth, a little darker."""
     folder = tmp_path / "run"
     for name in ("clip0", "clip1"):
-        write_video(folder / f"{name}.mp4", truth(clips, name) // 2 + 50, 16)
+        write_video(folder / f"{name}.mp4", target_of(clips, name) // 2 + 50, 16)
     return folder
 
 
-def truth(clips, name):
+def target_of(clips, name):
     return read_video(clips.parent / name / "video.mp4").frames
 
 
@@ -30,9 +30,9 @@ def metrics(folder):
     return {line["video_id"]: line for line in map(json.loads, lines)}
 
 
-def test_a_clip_is_compared_with_its_truth_from_frame_1_on(clips, run):
+def test_a_clip_is_compared_with_its_ground_truth_from_frame_1_on(clips, run):
     assert Evaluate(generated=run, metadata=clips).run() == DONE
-    generated, reference = read_video(run / "clip1.mp4").frames, truth(clips, "clip1")
+    generated, reference = read_video(run / "clip1.mp4").frames, target_of(clips, "clip1")
     scores = metrics(run)["clip1"]
     assert scores["generated"]["psnr"] == pytest.approx(psnr(generated, reference)[1:].mean())
     assert scores["generated"]["ssim"] == pytest.approx(ssim(generated, reference)[1:].mean())
@@ -41,7 +41,7 @@ def test_a_clip_is_compared_with_its_truth_from_frame_1_on(clips, run):
 
 def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):
     Evaluate(generated=run, metadata=clips).run()
-    scores, reference = metrics(run)["clip0"], truth(clips, "clip0")
+    scores, reference = metrics(run)["clip0"], target_of(clips, "clip0")
     prior = read_video(clips.parent / "clip0" / "ego_prior_video.mp4").frames
     still = np.broadcast_to(reference[:1], reference.shape)
     assert scores["prior"]["psnr"] == pytest.approx(psnr(prior, reference)[1:].mean())
@@ -50,28 +50,28 @@ def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):
     assert "vae" not in scores
 
 
-def test_a_reconstruction_beside_a_clip_is_the_ceiling(clips, run):
-    write_video(run / "clip0_vae.mp4", truth(clips, "clip0"), 16)
+def test_a_reconstruction_is_compared_as_the_upper_bound(clips, run):
+    write_video(run / "clip0_vae.mp4", target_of(clips, "clip0"), 16)
     Evaluate(generated=run, metadata=clips).run()
-    copy, reference = read_video(run / "clip0_vae.mp4").frames, truth(clips, "clip0")
+    copy, reference = read_video(run / "clip0_vae.mp4").frames, target_of(clips, "clip0")
     assert metrics(run)["clip0"]["vae"]["psnr"] == pytest.approx(psnr(copy, reference)[1:].mean())
     assert "vae" not in metrics(run)["clip1"]
 
 
-def test_the_truth_is_stretched_to_the_generated_size(clips, run):
-    small = truth(clips, "clip0")[:, ::2, ::2]
+def test_the_ground_truth_is_resized_to_the_generated_size(clips, run):
+    small = target_of(clips, "clip0")[:, ::2, ::2]
     write_video(run / "clip0.mp4", small, 16)
     Evaluate(generated=run, metadata=clips).run()
     assert metrics(run)["clip0"]["generated"]["psnr"] > 25
 
 
 def test_results_name_the_windows(clips, run):
-    write_video(run / "clip0_3.mp4", truth(clips, "clip0")[3:8], 16)
+    write_video(run / "clip0_3.mp4", target_of(clips, "clip0")[3:8], 16)
     line = {"video_id": "clip0_3", "source_id": "clip0", "start": 3, "status": "done"}
     (run / "results.jsonl").write_text(json.dumps(line) + "\n")
     assert Evaluate(generated=run, metadata=clips).run() == DONE
     assert list(metrics(run)) == ["clip0_3"]
-    generated, reference = read_video(run / "clip0_3.mp4").frames, truth(clips, "clip0")[3:8]
+    generated, reference = read_video(run / "clip0_3.mp4").frames, target_of(clips, "clip0")[3:8]
     expected = psnr(generated, reference)[1:].mean()
     assert metrics(run)["clip0_3"]["generated"]["psnr"] == pytest.approx(expected)
 
@@ -83,23 +83,21 @@ def test_the_last_line_of_a_clip_counts(clips, run):
     assert Evaluate(generated=run, metadata=clips).run() == DONE
 
 
-def test_a_clip_that_failed_is_left_out_and_named(clips, run, capsys):
+def test_a_clip_that_failed_is_skipped_and_named(clips, run, capsys):
     lines = [
         {"video_id": name, "source_id": name, "start": 0, "status": status}
         for name, status in (("clip0", "failed"), ("clip1", "done"))
     ]
     (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
-    assert "left out: clip0: it was not generated" in capsys.readouterr().err
+    assert "skipped: clip0: its generation failed" in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
 
 
-def test_a_missing_clip_is_left_out_and_named(clips, run, capsys):
+def test_a_missing_clip_is_skipped_and_named(clips, run, capsys):
     (run / "clip0.mp4").unlink()
     assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
-    assert (
-        f"left out: clip0: {run / 'clip0.mp4'} cannot be read: No such" in capsys.readouterr().err
-    )
+    assert f"skipped: clip0: {run / 'clip0.mp4'} cannot be read: No such" in capsys.readouterr().err
 
 
 def test_rows_are_selected_by_column(clips, run):
@@ -117,7 +115,7 @@ def test_the_report_has_definitions_and_a_summary_for_each_split(clips, run, tmp
     assert "test, 1 clips" in printed
 
 
-def test_a_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
+def test_a_ground_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
     for name in ("clip0", "clip1"):
         write_video(run / f"{name}.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
     with pytest.raises(InputError, match="could be compared"):
@@ -125,7 +123,7 @@ def test_a_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
     assert "ends before frame 13" in capsys.readouterr().err
 
 
-def test_metadata_without_truth_is_refused(clips, run):
+def test_metadata_without_ground_truth_is_refused(clips, run):
     lines = clips.read_text().splitlines()
     clips.write_text("\n".join(line.split(",", 1)[1] for line in lines))
     with pytest.raises(InputError, match="could be compared"):
@@ -137,16 +135,16 @@ def test_a_missing_folder_is_refused(clips, tmp_path):
         Evaluate(generated=tmp_path / "none", metadata=clips).run()
 
 
-def test_a_clip_of_fewer_frames_is_left_out_and_named(clips, run, capsys):
-    write_video(run / "clip0.mp4", truth(clips, "clip0")[:5], 16)
+def test_a_clip_of_fewer_frames_is_skipped_and_named(clips, run, capsys):
+    write_video(run / "clip0.mp4", target_of(clips, "clip0")[:5], 16)
     assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
-    assert "left out: clip0: it has 5 frames, most clips 9." in capsys.readouterr().err
+    assert "skipped: clip0: it has 5 frames, most clips 9." in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
 
 
 def test_the_report_names_the_protocol(clips, run, capsys):
     for name in ("clip0", "clip1"):
-        write_video(run / f"{name}.mp4", truth(clips, name)[:, ::2, :32], 16)
+        write_video(run / f"{name}.mp4", target_of(clips, name)[:, ::2, :32], 16)
     Evaluate(generated=run, metadata=clips).run()
     protocol = json.loads((run / "report.json").read_text())["protocol"]
     assert (protocol["size"], protocol["pixels"], protocol["frames"]) == (
@@ -158,12 +156,12 @@ def test_the_report_names_the_protocol(clips, run, capsys):
     assert "frames 1 to 8 at the size of the output: 32x16" in capsys.readouterr().out
 
 
-def test_methods_of_different_size_compare_at_the_size_of_the_truth(clips, run, tmp_path):
+def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, run, tmp_path):
     small = tmp_path / "small"
     for name in ("clip0", "clip1"):
         write_video(small / f"{name}.mp4", read_video(run / f"{name}.mp4").frames[:, ::2, ::3], 16)
     for folder in (run, small):
-        Evaluate(generated=folder, metadata=clips, size="truth").run()
+        Evaluate(generated=folder, metadata=clips, size="target").run()
     assert json.loads((small / "report.json").read_text())["protocol"]["pixels"] == ["48x32"]
     for method in ("prior", "still"):  # of which neither depends on what was generated
         assert metrics(small)["clip0"][method] == metrics(run)["clip0"][method]
@@ -175,7 +173,7 @@ def test_methods_of_different_size_compare_at_the_size_of_the_truth(clips, run, 
     "line",
     ["[]", '{"video_id": "../../x"}', '{"video_id": 3}', '{"video_id": "a", "start": "x"}', "{"],
 )
-def test_results_that_are_none_are_refused(clips, run, line):
+def test_invalid_results_are_refused(clips, run, line):
     (run / "results.jsonl").write_text(line + "\n")
     with pytest.raises(InputError, match=r"results\.jsonl, line 1"):
         Evaluate(generated=run, metadata=clips).run()

@@ -1,32 +1,32 @@
 """Summaries of scores."""
 
+import numpy as np
 import pytest
 
-from egosim_jax.metrics.report import Score, summarize, summarize_splits
+from egosim_jax.metrics.report import mean_and_spread, print_table, summarize
 
 
 def test_a_summary_is_mean_and_sample_deviation():
-    summary = summarize([Score(psnr=20.0, ssim=0.5), Score(psnr=24.0, ssim=0.9)])
-    assert summary.clips == 2
-    assert (summary.psnr, summary.ssim) == (22.0, pytest.approx(0.7))
+    scores = [{"psnr": 20.0, "ssim": 0.5}, {"psnr": 24.0, "ssim": 0.9}]
+    summary = summarize(scores, ("psnr", "ssim"))
+    assert (summary["psnr"]["mean"], summary["ssim"]["mean"]) == (22.0, pytest.approx(0.7))
     # Two values d apart deviate by d / sqrt(2).
-    assert summary.psnr_spread == pytest.approx(4 / 2**0.5)
-    assert summary.ssim_spread == pytest.approx(0.4 / 2**0.5)
+    assert summary["psnr"]["spread"] == pytest.approx(4 / 2**0.5)
+    assert summary["ssim"]["spread"] == pytest.approx(0.4 / 2**0.5)
 
 
 def test_a_single_clip_has_no_spread():
-    assert summarize([Score(psnr=20.0, ssim=0.5)]).psnr_spread == 0.0
+    assert summarize([{"psnr": 20.0}], ("psnr",))["psnr"]["spread"] == 0.0
 
 
-def test_clips_are_gathered_by_split_and_method():
-    low, high = Score(psnr=10.0, ssim=0.1), Score(psnr=30.0, ssim=0.9)
-    splits = summarize_splits(
-        [
-            ("train", {"prior": low, "vae": high}),
-            ("test", {"prior": high}),
-            ("train", {"prior": low}),
-        ]
-    )
-    assert splits["train"]["prior"].clips == 2
-    assert splits["train"]["vae"].psnr == 30.0
-    assert splits["test"]["prior"].psnr == 30.0
+def test_nan_is_ignored():
+    assert mean_and_spread([1.0, np.nan, 3.0]) == (2.0, pytest.approx(2**0.5))
+    assert np.isnan(mean_and_spread([np.nan])[0])
+
+
+def test_a_table_has_mean_and_spreads_and_empty_cells(capsys):
+    measures = {"psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.3f}")}
+    full = {"psnr": {"mean": 20.0, "spread": 1.0, "spread_over_seeds": 0.5}}
+    print_table("method", {"full": full}, measures, title="human")
+    row = next(line for line in capsys.readouterr().out.splitlines() if "full" in line)
+    assert [cell.strip() for cell in row.split("│")[1:-1]] == ["full", "20.00 ± 1.00 (± 0.50)", ""]

@@ -1,0 +1,373 @@
+"""Batch generation: a clip for each window of the clips of a metadata file, in one folder.
+
+For each window the folder gets {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | ground truth)
+and, on request, {id}_vae.mp4, the ground truth through the autoencoder; and results.jsonl, of whose
+lines the last one of an id counts, and contact_sheet.png of the first clips. The noise of a clip
+depends on the seed and its id alone, so that a clip depends on neither order nor batch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.sharding import Mesh
+
+from egosim_jax.convert.lora import check_base
+from egosim_jax.data.clips import Policy, check_clip, load_triplet
+from egosim_jax.data.metadata import ClipFiles, check_presence, is_safe_id
+from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.generator import Generator, batches
+from egosim_jax.io.atomic import append_line
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.run import open_folder
+from egosim_jax.io.untrusted import listing, quote_path, read_lines
+from egosim_jax.io.video import Decoding, read_video, write_video
+from egosim_jax.io.weights import hashes
+from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, parts
+from egosim_jax.types import Clip, InputError, Triplet
+
+RESULTS = "results.jsonl"
+"""File of the results in a folder of generated clips."""
+SHEET_CLIPS = 6
+"""Maximum number of clips on the contact sheet."""
+SHEET_COLUMNS = 6
+"""Frames of each clip on the contact sheet."""
+SHEET_WIDTH = 240
+"""Width of a frame on the contact sheet in pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A window of a clip, and the id of the generated clip."""
+
+    files: ClipFiles
+    """Files of the clip."""
+    start: int
+    """First frame of the window in the clip."""
+    output_id: str
+    """Stem of the output files."""
+
+    @property
+    def split(self) -> str:
+        """Split of the metadata, or "all"."""
+        return self.files.extra.get("split", "all")
+
+
+Failure = tuple[Window, str]
+"""A window and why it failed."""
+
+
+class Outcome(NamedTuple):
+    """Numbers of windows of a batch job by their outcome."""
+
+    existing: int
+    """Windows that were generated before."""
+    done: int
+    """Windows that were generated now."""
+    rejected: int
+    """Windows whose inputs are invalid."""
+    failed: int
+    """Windows whose generation failed."""
+
+
+def windows_of(clips: Iterable[ClipFiles], starts: Sequence[int]) -> list[Window]:
+    """Return the windows of clips that start at some frames.
+
+    With several starts the ids are {video_id}_{start}.
+    """
+    several = len(starts) > 1
+    return [
+        Window(files, start, f"{files.video_id}_{start}" if several else files.video_id)
+        for files, start in itertools.product(clips, starts)
+    ]
+
+
+def read_results(folder: Path) -> dict[str, dict[str, Any]] | None:
+    """Read the last result of each id in a folder of generated clips; None if it has no results."""
+    path = folder / RESULTS
+    if not path.is_file():
+        return None
+    results = {}
+    for number, line in read_lines(path):
+        output_id = line.get("video_id") if isinstance(line, dict) else None
+        start = line.get("start", 0) if isinstance(line, dict) else None
+        if not (isinstance(output_id, str) and is_safe_id(output_id)) or type(start) is not int:
+            raise InputError(
+                f"{quote_path(path)}, line {number} is not a result: it needs a valid video_id and "
+                "an integer start."
+            )
+        results[output_id] = line
+    return results
+
+
+def seed_of(seed: int, output_id: str) -> int:
+    """Return the seed of a clip's noise, given the seed of the job."""
+    return int.from_bytes(hashlib.sha256(f"{seed} {output_id}".encode()).digest()[:4], "big")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchJob:
+    """Settings of a batch generation into a folder; equal settings continue in the same folder."""
+
+    model: ModelConfig
+    """Config of the model."""
+    out: Path
+    """Folder to write to."""
+    weights: Path | None
+    """Folder of weights; None for random weights of `seed`."""
+    lora: Path | None = None
+    """LoRA of the denoiser."""
+    lora_scale: float = 1.0
+    """Strength of the LoRA."""
+    seed: int = 0
+    """Seed from which each clip's noise is derived."""
+    batch_size: int | None = None
+    """Clips generated together, over all devices; None for one on each part of the mesh."""
+    mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
+    """Layout of the devices."""
+    policy: Policy = "strict"
+    """Treatment of invalid input (`data/clips.py`)."""
+    decoding: Decoding = "accurate"
+    """Color decoding of videos."""
+    skip_existing: bool = False
+    """Skip windows whose video exists."""
+    reconstruct: bool = False
+    """Also write the ground truth through the autoencoder."""
+
+    def open(self) -> None:
+        """Record the settings in the folder. Raises `InputError` if it is of another job."""
+        self._place()
+        digests = None if self.weights is None else hashes(self.weights)
+        if self.lora is not None and digests is not None:
+            check_base(self.lora, [digests["dit"]])
+        settings = {
+            "model": self.model,
+            "weights": digests,
+            "lora": None if self.lora is None else [sha256(self.lora), self.lora_scale],
+            "seed": self.seed,
+            "policy": self.policy,
+        }
+        if self.decoding != "accurate":
+            settings["decoding"] = self.decoding
+        open_folder(self.out, settings)
+        for name, digest in (digests or {}).items():
+            print(f"{self.model.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
+
+    def generate(self, windows: Sequence[Window]) -> Outcome:
+        """Check all inputs, compile, generate and draw; print the path of each new clip."""
+        self._check_names(windows)
+        existing = [w for w in windows if self.skip_existing and self._video(w).exists()]
+        if existing:
+            print(f"{len(existing)} existing clips are skipped", file=sys.stderr)
+            self._list(existing)
+        skipped = {window.output_id for window in existing}
+        todo = [window for window in windows if window.output_id not in skipped]
+        valid, rejected = self._check(todo)
+        for window, problem in rejected:
+            self._report(window, status="failed", error=problem)
+        failed: list[Failure] = []
+        if valid:
+            self._warn_of_long_prompts(valid)
+            failed = self._generate(valid)
+            self._draw(windows)
+        outcome = Outcome(len(existing), len(valid) - len(failed), len(rejected), len(failed))
+        bad = outcome.rejected + outcome.failed
+        print(f"{outcome.done} done, {bad} failed: {self.out}", file=sys.stderr)
+        return outcome
+
+    def _place(self) -> tuple[Mesh, int]:
+        """Return the mesh and the number of clips generated together on it."""
+        mesh = make_mesh(self.mesh)
+        size = parts("batch", mesh) if self.batch_size is None else self.batch_size
+        check_batch(size, mesh)
+        return mesh, size
+
+    def _check_names(self, windows: Sequence[Window]) -> None:
+        """Raise `InputError` if two clips would write the same file."""
+        owners: dict[str, str] = {}
+        for window in windows:
+            for suffix in ("", "_cmp", "_vae"):
+                name = f"{window.output_id}{suffix}.mp4"
+                other = owners.setdefault(name, window.output_id)
+                if other != window.output_id:
+                    raise InputError(
+                        f"The clips {other} and {window.output_id} would both write {name}. Rename "
+                        "one of them. (column video_id)"
+                    )
+
+    def _list(self, windows: Sequence[Window]) -> None:
+        """Report existing clips whose results an interruption prevented."""
+        results = read_results(self.out) or {}
+        done = {name for name, line in results.items() if line.get("status") == "done"}
+        for window in windows:
+            if window.output_id not in done:
+                self._report(window, status="done", seed=seed_of(self.seed, window.output_id))
+
+    def _check(self, windows: Sequence[Window]) -> tuple[list[Window], list[Failure]]:
+        """Return the windows whose inputs are valid, and the others with their problems."""
+        if windows:
+            check_presence([window.files for window in windows])
+        valid, rejected = [], []
+        for window in windows:
+            problems = check_clip(
+                window.files, self.model.video, start=window.start, policy=self.policy
+            )
+            if problems:
+                rejected.append((window, listing(problems)))
+            else:
+                valid.append(window)
+        return valid, rejected
+
+    def _warn_of_long_prompts(self, windows: Sequence[Window]) -> None:
+        prompts = {window.files.video_id: window.files.prompt for window in windows}
+        tokens = self.model.tokenizer.tokenize(list(prompts.values()))
+        if tokens.cut:
+            limit = self.model.tokenizer.max_tokens
+            print(
+                f"warning: {tokens.cut} of {len(prompts)} prompts are longer than {limit} tokens "
+                f"(the longest has {max(tokens.lengths)}) and are cut",
+                file=sys.stderr,
+            )
+
+    def _generate(self, windows: Sequence[Window]) -> list[Failure]:
+        """Generate batch after batch; return the failures."""
+        mesh, size = self._place()
+        unit = parts("batch", mesh)
+        size = min(size, -(-len(windows) // unit) * unit)  # a multiple of the mesh that suffices
+        then = time.monotonic()
+        generator = self._load_generator(mesh)
+        loaded = time.monotonic()
+        generator.compile(size)
+        print(
+            f"weights in {loaded - then:.1f} s, programs in {time.monotonic() - loaded:.1f} s",
+            file=sys.stderr,
+        )
+        failed: list[Failure] = []
+        began, done = time.monotonic(), 0
+        for batch in batches(windows, size):
+            then = time.monotonic()
+            triplets, problems = self._load(batch)
+            failed += problems
+            if triplets:
+                failed += self._generate_batch(generator, triplets, size)
+            done += len(batch)
+            left = (time.monotonic() - began) / done * (len(windows) - done)
+            print(
+                f"{done}/{len(windows)} clips, {time.monotonic() - then:.1f} s, {left:.0f} s left",
+                file=sys.stderr,
+            )
+        return failed
+
+    def _load_generator(self, mesh: Mesh) -> Generator:
+        if self.weights is None:
+            print(f"{self.model.name}: random weights of seed {self.seed}", file=sys.stderr)
+            return Generator(self.model, Networks.random(self.model, seed=self.seed), mesh)
+        return Generator.load(
+            self.model, self.weights, mesh=mesh, lora=self.lora, lora_scale=self.lora_scale
+        )
+
+    def _load(
+        self, windows: Sequence[Window]
+    ) -> tuple[list[tuple[Window, Triplet]], list[Failure]]:
+        """Decode the inputs of a batch; return them, and the failures."""
+        loaded, failed = [], []
+        for window in windows:
+            try:
+                triplet = load_triplet(
+                    window.files,
+                    self.model.video,
+                    start=window.start,
+                    policy=self.policy,
+                    decoding=self.decoding,
+                )
+                loaded.append((window, triplet))
+            except InputError as error:
+                failed.append((window, str(error)))
+                self._report(window, status="failed", error=str(error))
+        return loaded, failed
+
+    def _generate_batch(
+        self, generator: Generator, loaded: Sequence[tuple[Window, Triplet]], size: int
+    ) -> list[Failure]:
+        """Generate and write one batch, padded to `size` so that nothing is compiled again."""
+        windows, triplets = zip(*loaded, strict=True)
+        fill = size - len(windows)
+        triplets = [*triplets, *[triplets[-1]] * fill]
+        seeds = [seed_of(self.seed, w.output_id) for w in (*windows, *[windows[-1]] * fill)]
+        then = time.monotonic()
+        try:
+            clips = generator.generate(triplets, seeds)
+        except FloatingPointError as error:
+            for window in windows:
+                self._report(window, status="failed", error=str(error))
+            return [(window, str(error)) for window in windows]
+        seconds = (time.monotonic() - then) / len(windows)
+        reconstructions = generator.reconstruct(triplets) if self.reconstruct else [None] * size
+        for window, triplet, clip, reconstruction, seed in zip(
+            windows, triplets, clips, reconstructions, seeds, strict=False
+        ):
+            self._write(window, triplet, clip, reconstruction)
+            self._report(window, status="done", seed=seed, seconds=round(seconds, 3))
+            print(self._video(window))
+        return []
+
+    def _write(
+        self, window: Window, triplet: Triplet, clip: Clip, reconstruction: Clip | None
+    ) -> None:
+        shown = [triplet.prior, triplet.hands, clip.frames]
+        if triplet.target is not None:
+            shown.append(triplet.target)
+        comparison = np.concatenate(shown, axis=2)
+        write_video(self.out / f"{window.output_id}_cmp.mp4", comparison, clip.fps)
+        if reconstruction is not None:
+            path = self.out / f"{window.output_id}_vae.mp4"
+            write_video(path, reconstruction.frames, clip.fps)
+        write_video(self._video(window), clip.frames, clip.fps)
+
+    def _report(self, window: Window, *, status: str, **values: Any) -> None:
+        """Append a line to results.jsonl."""
+        if status == "failed":
+            print(f"failed: {window.output_id}: {values['error']}", file=sys.stderr)
+        own = {
+            "video_id": window.output_id,
+            "source_id": window.files.video_id,
+            "start": window.start,
+            "status": status,
+            "output": f"{window.output_id}.mp4",
+            **values,
+            "prompt": window.files.prompt,
+        }
+        # A column of the metadata must not replace a field of the result.
+        reserved = {*own, "seed", "seconds", "error"}
+        extra = window.files.extra.items()
+        line = own | {f"metadata_{k}" if k in reserved else k: text for k, text in extra}
+        append_line(self.out / RESULTS, line)
+
+    def _video(self, window: Window) -> Path:
+        return self.out / f"{window.output_id}.mp4"
+
+    def _draw(self, windows: Sequence[Window]) -> None:
+        """Draw the contact sheet of the first existing clips."""
+        clips = list(itertools.islice(self._sheet_clips(windows), SHEET_CLIPS))
+        if clips:
+            last = self.model.video.frames - 1
+            moments = np.linspace(0, last, SHEET_COLUMNS).round().astype(int)
+            sheet = self.out / "contact_sheet.png"
+            draw_sheet(clips, sheet, moments=moments.tolist(), width=SHEET_WIDTH)
+            print(sheet)
+
+    def _sheet_clips(self, windows: Sequence[Window]) -> Iterator[SheetClip]:
+        for window in windows:
+            if self._video(window).exists():
+                videos = read_video(self.out / f"{window.output_id}_cmp.mp4").frames
+                videos = np.split(videos, videos.shape[2] // self.model.video.width, axis=2)
+                yield SheetClip(f"{window.output_id}   prior, hands, generated", videos[:3])

@@ -1,0 +1,49 @@
+"""`egosim experiment`: documented experiments, each by one command that resumes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Annotated
+
+import tyro
+
+from egosim_jax.command import DONE
+from egosim_jax.experiments.config import (
+    Continuous,
+    Debug,
+    Embodiment,
+    RealTiny,
+    Tabletop,
+    Update,
+)
+
+MODULES = {
+    Tabletop: "tabletop",
+    Continuous: "continuous",
+    Update: "update",
+    Embodiment: "embodiment",
+    RealTiny: "real_tiny",
+    Debug: "debug",
+}
+"""Module of `egosim_jax.experiments`, and name on the command line, of each experiment."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Repeat a documented experiment: training, generation and its table, by one command."""
+
+    command: (
+        Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
+        | Annotated[Continuous, tyro.conf.subcommand("continuous")]
+        | Annotated[Update, tyro.conf.subcommand("update")]
+        | Annotated[Embodiment, tyro.conf.subcommand("embodiment")]
+        | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
+        | Annotated[Debug, tyro.conf.subcommand("debug")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen experiment."""
+        name = MODULES[type(self.command)]
+        import_module(f"egosim_jax.experiments.{name}").run(self.command)
+        return DONE

@@ -1,0 +1,155 @@
+"""Settings of the experiments, which are also the options of `egosim experiment`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelExperiment:
+    """Settings of every experiment with a trained model."""
+
+    out: Path
+    """Folder to write to."""
+    config: str = "tabletop"
+    """Name of the model."""
+    weights: Path | None = None
+    """Folder of weights, by default those that ship with the package."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tabletop(ModelExperiment):
+    """Generate held-out tabletop scenes with all conditions and without each, and compare.
+
+    Prints a table for human hands and one for the robot, along with the prior copied, the first
+    frame repeated and the ground truth through the autoencoder. Writes report.json and a contact
+    sheet of each.
+    """
+
+    scenes: int = 24
+    """Scenes of each kind of hands."""
+    first_scene: int = 100
+    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+    seeds: int = 2
+    """Repetitions of each clip with different noise."""
+    batch_size: int = 8
+    """Clips generated together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Continuous(ModelExperiment):
+    """Simulate held-out sequences with and without state updates, and compare clip by clip.
+
+    Prints a table for each method and writes report.json and curves.png. Each sequence is a
+    simulation in a separate folder; the same command resumes an interrupted experiment.
+    """
+
+    sequences: int = 6
+    """Number of sequences, of consecutive seeds."""
+    clips: int = 10
+    """Clips of each sequence."""
+    first_scene: int = 200
+    """Seed of the first sequence; the shipped model was trained on those from 1000 on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Update(ModelExperiment):
+    """Carry an object in held-out scenes, update the state, and compare it with the ground truth.
+
+    A row each for the oracle at 832 x 480 and at the model's size, and for classical perception of
+    ground-truth and of generated frames. Prints a table and writes report.json.
+    """
+
+    scenes: int = 8
+    """Number of scenes in which an object is carried."""
+    first_scene: int = 200
+    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hyperparameters:
+    """Hyper-parameters of one training; the learning rate has a warm-up and a cosine decay."""
+
+    steps: int
+    """Number of updates."""
+    learning_rate: float
+    """Peak learning rate."""
+    warmup: int
+    """Updates of linear warm-up."""
+    optimizer: Literal["adamw", "muon"] = "muon"
+    """Optimizer name."""
+    batch_size: int = 4
+    """Clips per update."""
+    seed: int = 0
+    """Seed of the initial weights, the order of the clips and the noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Embodiment:
+    """Train on human hands, then on a few clips of a robot: all weights, and a LoRA.
+
+    A further model is trained on the robot clips alone. Prints the scores of each on held-out robot
+    clips; writes report.json, contact_sheet.png and curves.png. The same command resumes an
+    interrupted experiment.
+    """
+
+    out: Path
+    """Folder of the run; each training has a subfolder."""
+    config: str = "tabletop"
+    """Name of the model."""
+    weights: Path | None = None
+    """Folder of weights whose autoencoder is used, by default those that ship with the package."""
+    human_scenes: int = 400
+    """Scenes of human hands to train on, one clip of each."""
+    robot_scenes: int = 24
+    """Scenes of the robot to train on, one clip of each."""
+    held_out: int = 24
+    """Scenes of the robot to validate on and to generate, one clip of each."""
+    first_scene: int = 5000
+    """Seed of the first scene; the shipped autoencoder was trained on those from 1000 to 1999."""
+    human: Hyperparameters = Hyperparameters(steps=1200, learning_rate=2e-3, warmup=50)
+    """Training on human clips, from random weights."""
+    full: Hyperparameters = Hyperparameters(steps=200, learning_rate=5e-4, warmup=10)
+    """Training of all weights of the human model on robot clips."""
+    lora: Hyperparameters = Hyperparameters(
+        steps=200, learning_rate=2e-3, warmup=10, optimizer="adamw"
+    )
+    """Training of a LoRA of the human model on robot clips."""
+    scratch: Hyperparameters = Hyperparameters(steps=200, learning_rate=2e-3, warmup=50)
+    """Training on robot clips from random weights."""
+    rank: int = 16
+    """Rank of the LoRA."""
+    dropout: float = 0.15
+    """Probability with which each condition is dropped in training."""
+    batch_size: int = 8
+    """Clips encoded, and generated, together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealTiny:
+    """Train `real_tiny` on the train split, generate both splits, compare, and draw a sheet."""
+
+    metadata: Path
+    """CSV or JSONL in EgoSim's columns, with video and split; clips of 61 frames."""
+    out: Path
+    """Folder of the run."""
+    start: tuple[int, ...] = (0, 22, 44)
+    """First frames of the windows that are generated."""
+    seed: int = 0
+    """Seed of the generated clips."""
+    batch_size: int = 5
+    """Clips generated together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Debug:
+    """Do the same with `debug` on sample clips, in a few minutes, to see that everything runs."""
+
+    out: Path
+    """Folder of the run."""
+    steps: int = 20
+    """Updates of the autoencoder, and as many of the denoiser."""
+    seed: int = 0
+    """Seed of the generated clips."""

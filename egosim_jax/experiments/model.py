@@ -1,0 +1,18 @@
+"""The generator of an experiment with a trained model."""
+
+from __future__ import annotations
+
+from egosim_jax import configs
+from egosim_jax.experiments.config import ModelExperiment
+from egosim_jax.generator import Generator
+from egosim_jax.io.run import open_folder
+from egosim_jax.io.weights import hashes
+
+
+def open_experiment(settings: ModelExperiment) -> Generator:
+    """Open the folder of an experiment, new or of equal settings, and load its generator."""
+    config = configs.get(settings.config)
+    weights = configs.weights_of(settings.config, settings.weights)
+    record = {"experiment": settings, "weights": hashes(weights)}
+    open_folder(settings.out, record, mutable=["experiment.weights"])
+    return Generator.load(config, weights)
