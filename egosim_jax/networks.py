@@ -135,7 +135,7 @@ class ModelConfig:
 
     def at(self, folder: Path) -> ModelConfig:
         """Return this config with the tokenizer's files looked up in a weights folder."""
-        if self.tokenizer.kind == "byt5" or isinstance(self.tokenizer.kind, Path):
+        if self.tokenizer.kind == "byt5" or self.tokenizer.kind.is_relative_to(folder):
             return self
         files = replace(self.tokenizer, kind=folder / self.tokenizer.kind)
         return replace(self, tokenizer=files)

@@ -152,8 +152,8 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
     return "\n\n".join(
         [
             "All weights of `egosim_14b` trained, batch 32 (64 on 64 devices), GiB of a device by\n"
-            "`--remat` and by clips on a device at a time; what does not fit stands beside what\n"
-            "there is:",
+            "`--remat` and by clips on a device at a time; if it does not fit, > what the\n"
+            "device has:",
             _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
             "Every recipe as it is, GiB of a device (clips on a device at a time):",
             _rows(["recipe", *(f"`{target}`" for target in targets)], by_target),
