@@ -15,7 +15,7 @@ import ipaddress
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -53,6 +53,16 @@ def distributed_context() -> Iterator[None]:
         yield
     finally:
         jax.distributed.shutdown()
+
+
+def launched_context() -> AbstractContextManager[None]:
+    """Return `distributed_context` for a process of a launcher, and an empty context otherwise.
+
+    Launchers set the variables of this module, or are Slurm or Open MPI with several tasks.
+    """
+    tasks = [os.environ.get(name, "1") for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")]
+    launched = any(name in os.environ for name in NAMES) or any(count != "1" for count in tasks)
+    return distributed_context() if launched else nullcontext()
 
 
 def _initialize(address: str, count: int, index: int) -> None:

@@ -37,7 +37,7 @@ Commands = (
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `egosim`."""
+    """Run the command `egosim`; return its exit code."""
     return command.main(
         Commands,
         program="egosim",

@@ -1,4 +1,4 @@
-"""`egosim doctor`: what this machine has, and what is missing."""
+"""`egosim doctor`: devices, versions, extras and weights of this machine."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ LIBRARIES = (
     "opencv-python-headless",
 )  # fmt: skip
 EXTRAS = {"rerun": "viewer", "OpenEXR": "recorded", "tensorboardX": "tensorboard", "wandb": "wandb"}
-"""Modules and the extras that bring them."""
+"""Extras by the module that they install."""
 NATIVE = ("open3d", "cv2", "av")
-"""What needs libraries of the system."""
+"""Modules that need system libraries."""
 HERE = Path("weights")
+"""Default folder that is searched for weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
     """Report devices, versions, extras and weights, and what each model needs in memory.
 
-    Exit code 1 if anything that is needed cannot be imported.
+    Exit code 1 if a required module cannot be imported.
     """
 
     weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of weights to look at; if none is given, those in ./weights."""
+    """Folders of weights to report, by default those in ./weights."""
 
     def run(self) -> int:
-        """Look and print."""
+        """Print the report."""
         import jax
         from rich.console import Console
 
@@ -76,14 +77,14 @@ def _memory(device: object) -> str:
 
 
 def _broken() -> Iterator[str]:
-    """What is installed and cannot be imported."""
+    """Yield a message for each native module that cannot be imported."""
     for name in NATIVE:
         try:
             import_module(name)
         except ImportError as error:
             yield (
-                f"{name} cannot be imported: {error}. Install the system libraries that the README "
-                "lists."
+                f"{name} cannot be imported: {error}. Install the system libraries listed in the "
+                "README."
             )
 
 
@@ -107,7 +108,7 @@ def _print_models(console: Console, folders: list[Path]) -> None:
 
 
 def _bytes(config: ModelConfig) -> int:
-    """Of the weights, each as wide as its network computes."""
+    """Return the size of the weights of a model in the dtypes in which its networks compute."""
     import jax.numpy as jnp
     from flax import nnx
 
@@ -122,7 +123,7 @@ def _bytes(config: ModelConfig) -> int:
 
 
 def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
-    """A row for each network of a folder of weights."""
+    """Yield a table row for each network of a folder of weights."""
     from egosim_jax.io.mapped import read_metadata
     from egosim_jax.io.weights import hashes
 

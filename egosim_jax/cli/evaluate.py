@@ -28,8 +28,10 @@ class Evaluate:
     where: str | None = None
     """Take rows whose column has this value, for instance split=test."""
     size: Literal["output", "target"] = "output"
-    """Size of the comparison: that of the output, which flatters small ones, or of the ground
-    truth, at which methods whose outputs differ in size must be compared."""
+    """Size of the comparison: of the output, or of the recorded video.
+
+    That of the output flatters small ones: compare methods whose outputs differ in size at that of
+    the target."""
     out: Path | None = None
     """Folder of the report, by default that of the clips."""
 

@@ -32,9 +32,10 @@ class Generate:
     config: str
     """Name of the model."""
     metadata: Path | None = None
-    """CSV or JSONL in EgoSim's columns: ego_prior_video, hand_keypoint_video, first_frame, prompt,
-    video_id, and video if the ground truth is known. Without it, a scene of the tabletop world is
-    made from the seed and written to OUT/scenes."""
+    """CSV or JSONL in EgoSim's columns; without it, a scene of the tabletop world from the seed.
+
+    The columns are ego_prior_video, hand_keypoint_video, first_frame, prompt, video_id, and video
+    if the ground truth is known. The scene is written to OUT/scenes."""
     robot: bool = False
     """Make the scene with a robot gripper instead of human hands."""
     out: Path | None = None
@@ -63,22 +64,23 @@ class Generate:
     seed: int = 0
     """Seed from which each clip's noise is derived, and without metadata the scene."""
     batch_size: int | None = None
-    """Clips generated together, over all devices: a multiple of mesh.data x mesh.fsdp, which is
-    also the default."""
+    """Clips generated together, over all devices: a multiple of mesh.data x mesh.fsdp, its default.
+    """
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
-    """Layout of the devices; by default each generates separate clips. Less time for one clip:
-    --mesh.data 1 --mesh.context -1. Weights too large for one device: --mesh.data 1
-    --mesh.fsdp -1."""
+    """Layout of the devices; by default each generates separate clips.
+
+    Less time for one clip: --mesh.data 1 --mesh.context -1. Weights too large for one device:
+    --mesh.data 1 --mesh.fsdp -1."""
     lenient: bool = False
-    """Repair input as the official loader does: repeat or cut frames, resize videos, treat all
-    pixels as observed if there is no mask."""
+    """Repair input as the official loader does.
+
+    It repeats or cuts frames, resizes videos, and treats all pixels as observed without a mask."""
     decoding: Literal["accurate", "official"] = "accurate"
     """Color decoding of videos; official: as in EgoSim's loader, a gray level darker."""
     skip_existing: bool = False
     """Skip clips whose video exists."""
     reconstruct: bool = False
-    """Also write {id}_vae.mp4, the ground truth through the autoencoder: the upper bound of any
-    denoiser."""
+    """Also write {id}_vae.mp4, the ground truth through the autoencoder: the upper bound."""
 
     def run(self) -> int:
         """Check everything, compile, generate."""
@@ -138,10 +140,7 @@ class Generate:
         from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
 
         config = configs.get(self.config)
-        if self._weights is not None:
-            config = config.at(self._weights)
-        elif not configs.allows_random_weights(self.config):
-            raise InputError(f"{config.name} needs weights. (--weights FOLDER)")
+        config = config if self._weights is None else config.at(self._weights)
         config = replace(config, steps=self.steps or config.steps)
         if self.solver is not None:
             solvers = {
@@ -161,6 +160,9 @@ class Generate:
 
     @property
     def _weights(self) -> Path | None:
+        """Folder of the weights; None for random ones."""
         from egosim_jax import configs
 
-        return self.weights or configs.shipped_weights(self.config)
+        if self.weights is None and configs.allows_random_weights(self.config):
+            return None
+        return configs.weights_of(self.config, self.weights)

@@ -7,6 +7,7 @@ import importlib
 import json
 import pkgutil
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from egosim_jax.io import hub
@@ -28,19 +29,23 @@ def names() -> list[str]:
 
 
 def get(name: str) -> ModelConfig:
-    """The config of that name; an unknown one raises `InputError` with the nearest."""
+    """Return the config of a name; an unknown one raises `InputError` with the nearest."""
+    return _module(name).CONFIG
+
+
+def allows_random_weights(name: str) -> bool:
+    """Return True if a model may generate with random weights, to see that everything runs."""
+    return getattr(_module(name), "RANDOM_WEIGHTS", False)
+
+
+def _module(name: str) -> ModuleType:
     if name not in names():
         near = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)
         raise InputError(
             f"There is no config {name!r}. Nearest: {near[0]}. All: {', '.join(names())}. "
             "(--config)"
         )
-    return importlib.import_module(f"{__name__}.{name}").CONFIG
-
-
-def allows_random_weights(name: str) -> bool:
-    """Return True if a model may generate with random weights, to see that everything runs."""
-    return getattr(importlib.import_module(f"{__name__}.{name}"), "RANDOM_WEIGHTS", False)
+    return importlib.import_module(f"{__name__}.{name}")
 
 
 def shipped_weights(name: str) -> Path | None:

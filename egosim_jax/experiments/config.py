@@ -79,7 +79,7 @@ class Hyperparameters:
     warmup: int
     """Updates of linear warm-up."""
     optimizer: Literal["adamw", "muon"] = "muon"
-    """Optimizer name."""
+    """Name of the optimizer."""
     batch_size: int = 4
     """Clips per update."""
     seed: int = 0

@@ -50,11 +50,11 @@ def test_pack_takes_the_selected_rows(clips, out):
     assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
 
 
-def test_pack_leaves_a_bad_clip_out_and_says_so(clips, out, capsys):
+def test_pack_skips_and_reports_a_bad_clip(clips, out, capsys):
     (clips.parent / "clip0" / "pc_mask_video.mp4").unlink()
     assert Pack(metadata=clips, out=out).run() == PARTIAL
     assert (
-        f"left out: metadata.csv line 2 (clip0): {clips.parent}/clip0/pc_mask_video.mp4 cannot"
+        f"skipped: metadata.csv line 2 (clip0): {clips.parent}/clip0/pc_mask_video.mp4 cannot"
         in capsys.readouterr().err
     )
     assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
@@ -74,7 +74,7 @@ def test_pack_refuses_to_replace_shards_unasked(clips, out):
         Pack(metadata=clips, out=out).run()
 
 
-def test_check_of_sound_shards_prints_nothing(clips, out, capsys):
+def test_check_of_valid_shards_prints_nothing(clips, out, capsys):
     Pack(metadata=clips, out=out).run()
     capsys.readouterr()
     assert Check(shards=out).run() == DONE
@@ -153,7 +153,7 @@ BAD_CLIPS = {
 def test_one_bad_clip_does_not_end_the_batch(clips, out, capsys, how):
     BAD_CLIPS[how](clips.parent / "clip0" / "hand_keypoint_video.mp4")
     assert Pack(metadata=clips, out=out).run() == PARTIAL
-    assert "left out: metadata.csv line 2 (clip0)" in capsys.readouterr().err
+    assert "skipped: metadata.csv line 2 (clip0)" in capsys.readouterr().err
     assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
 
 

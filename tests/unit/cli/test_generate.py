@@ -1,4 +1,4 @@
-"""What `egosim generate` refuses before it compiles anything."""
+"""`egosim generate`: input that is refused before anything is compiled."""
 
 from dataclasses import replace
 

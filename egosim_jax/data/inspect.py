@@ -1,0 +1,65 @@
+"""Inspection of shards: clips for a contact sheet, and statistics of each split."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.sheet import SheetClip
+from egosim_jax.data.transforms import decode_record, record_length
+from egosim_jax.progress import track
+from egosim_jax.types import InputError, VideoSpec
+
+
+@dataclass
+class SplitStatistics:
+    """Number, lengths and prompts of the records of a split."""
+
+    records: int = 0
+    """Number of records."""
+    lengths: Counter[int] = field(default_factory=Counter)
+    """Number of records by their number of frames."""
+    words: int = 0
+    """Number of words of all prompts."""
+
+
+def choose_clips(
+    reader: ShardReader, *, by: Sequence[str], streams: Collection[str], limit: int
+) -> list[SheetClip]:
+    """Decode some videos of the first clip of each combination of values of the columns `by`.
+
+    Without columns, decode those of the first `limit` clips. Raises `InputError` for latents and
+    for unknown columns.
+    """
+    if reader.manifest.kind == "latents":
+        raise InputError(f"{reader.folder} holds latents, not videos or frames. (--shards)")
+    spec = reader.manifest.spec or VideoSpec()
+    clips: dict[object, SheetClip] = {}
+    for number, record in enumerate(track(reader, "reading", total=len(reader))):
+        extra = record.metadata.get("extra", {})
+        unknown = [name for name in by if name not in extra]
+        if unknown:
+            known = ", ".join(sorted(extra)) or "none"
+            raise InputError(f"The clips have no column {', '.join(unknown)}; known: {known}.")
+        key = tuple(extra[name] for name in by) if by else number
+        if key not in clips:
+            videos = decode_record(record.arrays, spec)
+            shown = [videos[name] for name in streams if name in videos]
+            clips[key] = SheetClip(str(record.metadata.get("prompt", "")), shown)
+        if len(clips) == limit:
+            break
+    return [clips[key] for key in sorted(clips, key=str)]
+
+
+def split_statistics(reader: ShardReader) -> dict[str, SplitStatistics]:
+    """Return the statistics of every split, in the order of their names."""
+    splits: dict[str, SplitStatistics] = {}
+    for record in track(reader, "reading", total=len(reader)):
+        name = str(record.metadata.get("extra", {}).get("split", "all"))
+        split = splits.setdefault(name, SplitStatistics())
+        split.records += 1
+        split.lengths[record_length(record.arrays)] += 1
+        split.words += len(str(record.metadata.get("prompt", "")).split())
+    return dict(sorted(splits.items()))
