@@ -12,6 +12,7 @@ from PIL import Image
 
 from egosim_jax.cli import view
 from egosim_jax.cli.__main__ import main
+from egosim_jax.experiments import update
 from egosim_jax.io.video import probe_video
 from egosim_jax.state.snapshot import load, read_ply
 from egosim_jax.types import SceneState, VideoSpec
