@@ -101,8 +101,10 @@ class Weights:
     dtype: Dtype | None = None
     """Dtype to store floating weights in; by default each keeps its own."""
     widen: WidenMode | None = None
-    """Convert a base model with fewer input channels; the kernels of the others are 0. `polarity`
-    re-expresses the base's mask, 1 = keep, in the model's; `copy` takes both masks as equal."""
+    """Conversion from a base model of fewer input channels; the kernels of the others are 0.
+
+    `polarity` re-expresses the base's mask (Wan: 1 = keep) in the model's; `copy` takes both masks
+    as equal."""
 
     def run(self) -> int:
         """Detect the networks, check them, write."""

@@ -48,6 +48,7 @@ PREFIXES = (
     "base_model.model.", "diffusion_model.", "model.", "transformer.", "pipe.dit.", "dit.",
     "lora_unet_", "lora_transformer_", "_",
 )  # fmt: skip
+"""Prefixes of layer names that LoRA files of other projects have, in any naming."""
 TEXT_PREFIXES = ("lora_te", "text_encoder.", "text_encoders.")
 """Prefixes of the layers of a text encoder, which are skipped."""
 LOW_RANK = {
@@ -203,7 +204,9 @@ def _translated(
     settings: Settings,
 ) -> dict[str, Change]:
     """Convert a file in a foreign naming; shapes are checked before values are read."""
-    known = _locations(config, want)
+    namings = table_of(config).namings.values()
+    prefixes = (*PREFIXES, *(naming.lora_prefix for naming in namings if naming.lora_prefix))
+    known = _locations(config, want, prefixes)
     low_rank: dict[Location, dict[str, Tensor]] = {}
     full: dict[Location, Tensor] = {}
     problems, text = [], 0
@@ -213,8 +216,8 @@ def _translated(
             continue
         suffix = SUFFIX.search(key)
         kind = suffix[1] if suffix else ""
-        stem = f"{_plain(key[: suffix.start()])}_{FULL.get(kind, 'weight')}" if suffix else ""
-        location = known.get(stem)
+        layer = _plain(key[: suffix.start()], prefixes) if suffix else ""
+        location = known.get(f"{layer}_{FULL.get(kind, 'weight')}")
         if location is None or (kind in LOW_RANK and location.rule.transform != "linear"):
             problems.append(f"{key}: not of a layer of this network")
         elif (kind in FULL and location in full) or LOW_RANK.get(kind) in low_rank.get(
@@ -339,12 +342,14 @@ def exported_metadata(changes: Mapping[str, Change]) -> dict[str, str]:
     return {"format": "pt"} | ({"rank": rank, "alpha": rank} if ranks else {})
 
 
-def _locations(config: NetworkConfig, want: Mapping[str, tuple[int, ...]]) -> dict[str, Location]:
+def _locations(
+    config: NetworkConfig, want: Mapping[str, tuple[int, ...]], prefixes: Sequence[str]
+) -> dict[str, Location]:
     """Return the weights by their plain names in all namings; earlier ones take precedence."""
     known: dict[str, Location] = {}
     for naming in table_of(config).namings.values():
         named = _by_name(naming.rules(config), want)
-        known = {_plain(name): location for name, location in named.items()} | known
+        known = {_plain(name, prefixes): location for name, location in named.items()} | known
     return known
 
 
@@ -356,8 +361,8 @@ def _by_name(rules: Sequence[Rule], want: Mapping[str, tuple[int, ...]]) -> dict
     }
 
 
-def _plain(name: str) -> str:
+def _plain(name: str, prefixes: Sequence[str]) -> str:
     """Return a layer's name without prefixes and with underscores for dots."""
-    while prefix := next((p for p in PREFIXES if name.startswith(p)), None):
+    while prefix := next((p for p in prefixes if name.startswith(p)), None):
         name = name.removeprefix(prefix)
     return name.replace(".", "_")

@@ -1,4 +1,4 @@
-"""Conversion at full size: memory of the 14B, and speed of a 1.3B beside reading alone.
+"""Conversion at full size: memory of the 14B, and speed of a 1.3B versus reading alone.
 
     python -m tests.benchmarks.bench_convert memory --folder FOLDER
     python -m tests.benchmarks.bench_convert speed --folder FOLDER [--rounds 3]
@@ -43,7 +43,7 @@ from egosim_jax.io.mapped import Tensor, read_safetensors
 DTYPES = {
     "dit": torch.bfloat16, "vae": torch.float32, "text": torch.bfloat16, "image": torch.float16,
 }  # fmt: skip
-"""Of the released files."""
+"""Dtypes of the released files."""
 MOST_GB, RATIO = 4.0, 0.8
 """Goals: anonymous memory, and speed as a share of reading's."""
 POLL_S = 0.02
@@ -55,7 +55,7 @@ class Memory:
     """Convert the whole 14B release and find the peak of anonymous memory."""
 
     folder: Path
-    """Where to make and convert it; what is made is removed again."""
+    """Folder to make and convert it in; both are removed again."""
 
     def run(self) -> None:
         """Make, convert, watch, print."""
@@ -83,11 +83,11 @@ class Speed:
     """Convert a 1.3B model of random values and read it, in turn."""
 
     folder: Path
-    """Where to make it; what is made is removed again."""
+    """Folder to make it in; it is removed again."""
     target: Path | None = None
-    """Where to convert and copy to; in the folder if not given."""
+    """Folder to convert and copy to; by default one in `folder`."""
     rounds: int = 3
-    """Times of each."""
+    """Number of rounds."""
 
     def run(self) -> None:
         """Make, convert and read, print."""
@@ -155,10 +155,10 @@ def make_holes(folder: Path, network: str) -> Path:
 
 
 class Holes(io.FileIO):
-    """A file that does not write zeros."""
+    """File that leaves holes instead of writing zeros."""
 
     def write(self, data: Any) -> int:
-        """Write, or go on by as many bytes."""
+        """Write the data, or skip as many bytes of zeros."""
         view = np.frombuffer(data, np.uint8)
         if len(view) < 4096 or view.any():
             return super().write(data)

@@ -126,7 +126,7 @@ def test_translating_to_the_official_names_and_back_gives_every_weight_again(wei
         np.testing.assert_array_equal(again[path], tensor)
 
 
-def test_the_last_block_the_head_and_the_text_half_of_a_file_are_left_out(weights):
+def test_the_last_block_the_head_and_the_text_half_of_a_file_are_ignored(weights):
     rules = table.wan(CONFIG)
     official = translate_back(weights, rules)
     rest = {

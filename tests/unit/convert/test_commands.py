@@ -192,7 +192,7 @@ def test_a_network_or_tokenizer_that_is_asked_for_must_be_there(tmp_path, capsys
     assert "no known network" in capsys.readouterr().err
 
 
-def test_the_hash_in_the_header_tells_weights_apart(tmp_path):
+def test_the_hash_in_the_header_distinguishes_weights(tmp_path):
     save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
     for name in ("a", "b"):
         assert convert(tmp_path / "vae.safetensors", tmp_path / name) == 0

@@ -256,7 +256,7 @@ def test_a_damaged_zip_is_refused_or_read(tmp_path, where):
             read_pth(path)
 
 
-def test_a_usual_optimizer_beside_the_weights_is_read(tmp_path):
+def test_an_optimizer_state_next_to_the_weights_is_read(tmp_path):
     network = torch.nn.Linear(2, 2)
     optimizer = torch.optim.Adam(network.parameters())
     network(torch.rand(1, 2)).sum().backward()

@@ -266,7 +266,7 @@ def test_alpha_none_in_the_header_is_the_rank(tmp_path):
     np.testing.assert_allclose(summand(read_lora(file, CONFIG.dit)), product(pair()), rtol=1e-4)
 
 
-def test_layers_of_a_text_encoder_are_left_out_which_is_said(tmp_path, capsys):
+def test_layers_of_a_text_encoder_are_skipped_with_a_message(tmp_path, capsys):
     both = pair() | pair(name="lora_te_text_model_encoder_layers_0_mlp_fc1")
     changes = read_lora(save(tmp_path / "x.safetensors", both), CONFIG.dit)
     assert changes.keys() == {LAYER}

@@ -1,4 +1,4 @@
-"""Foreign checkpoints are opened in every form that people download, and damage is named."""
+"""Foreign checkpoints are opened in every form that is published, and damage is reported."""
 
 import json
 import struct
