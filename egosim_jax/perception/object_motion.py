@@ -170,6 +170,7 @@ def _support_plane(
 ) -> Float[np.ndarray, " 4"]:
     """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC)."""
     import open3d as o3d
+    from threadpoolctl import threadpool_limits
 
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
@@ -177,7 +178,8 @@ def _support_plane(
         return np.array([0.0, 0.0, 1.0, np.nan])
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
+    with threadpool_limits(1, user_api="openmp"):  # else its threads race, and runs differ
+        plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
     return np.array(plane)
 
 
