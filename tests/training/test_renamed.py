@@ -3,9 +3,8 @@
 import dataclasses
 import json
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -43,17 +42,8 @@ OLD_NAMES = {
 }
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class OldState:
-    """The training state under its old names."""
-
-    step: Any
-    params: Any
-    moments: Any
-    usual_norm: Any
-    left_out: Any
-    average: Any
+OLD_STATE = ("step", "params", "moments", "usual_norm", "left_out", "average")
+OldState = jax.tree_util.register_dataclass(dataclasses.make_dataclass("OldState", OLD_STATE))
 
 
 def with_old_names(text: str) -> str:

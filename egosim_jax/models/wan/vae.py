@@ -282,7 +282,7 @@ class WanVAE(nnx.Module):
             )
 
 
-def standardise_latents(vae: WanVAE, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
+def standardize_latents(vae: WanVAE, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
     """Fold a measured latent mean and deviation into the two quantization convolutions.
 
     `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
