@@ -167,8 +167,10 @@ class Recipe(ABC):
             for stage in self.stages().values():
                 stage.training.check_packages()
             return self.train()
+        from egosim_jax.preflight.targets import compile_offline
         from egosim_jax.train.preflight import preflight
 
+        compile_offline()
         return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
 
     def require(self, *names: str) -> list[Path]:

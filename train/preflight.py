@@ -18,7 +18,7 @@ from typing import Any
 import jax
 
 from egosim_jax.command import DONE, FAILED
-from egosim_jax.preflight.report import Report, TooLarge, compile_for, plain, size, text
+from egosim_jax.preflight.report import OutOfMemory, Report, compile_for, plain, size, text
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.progress import track
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
@@ -70,7 +70,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
     return DONE if fit else FAILED
 
 
-def compile_step(stage: Stage, target: Target) -> Report | TooLarge:
+def compile_step(stage: Stage, target: Target) -> Report | OutOfMemory:
     """Compile an update for a target. Raises `InputError` if batch and mesh do not fit it."""
     task, training = stage
     mesh = make_mesh(training.mesh, target.devices)
@@ -84,7 +84,7 @@ def compile_step(stage: Stage, target: Target) -> Report | TooLarge:
         return compile_for(target, traced, model_flops=task.flops(training.batch_size))
 
 
-def _others(stage: Stage, target: Target, asked: Report | TooLarge) -> dict[Setting, Report]:
+def _others(stage: Stage, target: Target, asked: Report | OutOfMemory) -> dict[Setting, Report]:
     """Return the settings that fit, best first, with as few devices per clip as possible."""
     known = {_setting(stage, target): asked}
     for mesh in _meshes(stage, target):
@@ -106,7 +106,7 @@ def _meshes(stage: Stage, target: Target) -> Iterator[MeshConfig]:
 
 
 def _fitting(
-    stage: Stage, target: Target, known: Mapping[Setting, Report | TooLarge]
+    stage: Stage, target: Target, known: Mapping[Setting, Report | OutOfMemory]
 ) -> dict[Setting, Report]:
     """Return the settings of a mesh that fit."""
     mesh = make_mesh(stage.training.mesh, target.devices)
@@ -178,7 +178,7 @@ def _table(settings: Mapping[Setting, Report], batch: int) -> str:
     lines = ["", "  settings that fit, best first"]
     lines.append(f"    {columns}{'peak':>10}{'roofline s':>11}{'clips/s':>9}")
     for setting, report in settings.items():
-        least = report.least_s
+        least = report.roofline_s
         accumulate = batch * setting.context // report.devices // setting.clips
         lines.append(
             f"    {setting.clips:<17}{accumulate:<12}{setting.context:<9}{setting.remat:<13}"

@@ -19,13 +19,13 @@ from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Experiment
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.models import Models
-from egosim_jax.cli.plan import Plan
+from egosim_jax.cli.preflight import Preflight
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.view import View
 
 Commands = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
-    | Annotated[Plan, tyro.conf.subcommand("plan")]
+    | Annotated[Preflight, tyro.conf.subcommand("preflight")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]

@@ -164,8 +164,10 @@ class RectifiedFlow(Process):
     sigma_max: float = 1.0
     """Upper end of that range: the first noise level, before the shift."""
     timestep_rounding: Literal["none", "bfloat16", "down"] = "none"
-    """`bfloat16` rounds timesteps before they are embedded (spacing 4 above 512), as the EgoSim
-    release; `down` rounds them down to integers, as Wan's own UniPC."""
+    """Rounding of timesteps before they are embedded.
+
+    `bfloat16` (spacing 4 above 512) is the EgoSim release's; `down`, to integers, is that of Wan's
+    own UniPC."""
     prediction: Prediction = "velocity"
     """Quantity that the network predicts: `velocity`, `epsilon` or `x0`."""
 
@@ -238,9 +240,9 @@ class VariancePreserving(Process):
     beta_schedule: Literal["linear", "scaled_linear"] = "scaled_linear"
     """Spacing of the betas: even, or even in their square roots."""
     beta_start: float = 0.00085
-    """First beta."""
+    """Beta of the first timestep."""
     beta_end: float = 0.012
-    """Last beta."""
+    """Beta of the last timestep."""
     snr_shift: float = 1.0
     """Divisor of the signal-to-noise ratio: 1 for CogVideoX 5B, 3 for 2B."""
     zero_terminal_snr: bool = True
@@ -293,12 +295,12 @@ class VariancePreserving(Process):
         return (jnp.minimum(jnp.floor(n * u), n - 1) + 1) / n
 
     def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
-        """Return the times of a sampler; given timesteps must be whole."""
+        """Return the times of a sampler; given timesteps are integers."""
         n = self.train_timesteps
         if not isinstance(steps, int):
             visited = _falling(steps, low=-1, high=n - 1)
             if (visited != np.rint(visited)).any():
-                raise InputError(f"timesteps {list(steps)} must be whole numbers. (--steps)")
+                raise InputError(f"timesteps {list(steps)} must be integers. (--steps)")
         elif _count(steps) > n:
             raise InputError(f"{steps} steps are more than the {n} timesteps. (--steps)")
         elif self.spacing == "trailing":

@@ -1,1 +1,1 @@
-"""Whether a program fits a machine, and how fast it can be there, told without the machine."""
+"""Preflight: compile a program for a machine that need not be present, and read off its costs."""

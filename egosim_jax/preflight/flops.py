@@ -1,8 +1,8 @@
-"""FLOPs of a program, counted where it is written, before any compiler has seen it.
+"""FLOPs of a traced program, counted in its jaxpr.
 
-Products alone count, a multiplication and an addition as two: those of arrays, convolutions, and
-those inside the flash kernels, which a program names and does not spell out. What is computed again
-in a backward pass is there to be seen, and counts; what nothing needs does not.
+Matrix products and convolutions are counted, a multiplication and an addition as two FLOPs, and
+those inside the flash attention kernels, which a jaxpr only names. Rematerialization in a backward
+pass counts; equations whose results are unused do not.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ KERNELS = {
     "dot_product_attention_bwd_wrapper": 5,
     "hopper_attention": 2,
 }
-"""Products in jax's cuDNN kernels, whose backward one computes the scores again, and in ours."""
+"""Products in jax's cuDNN kernels, whose backward recomputes the scores, and in ours."""
 SPLASH = {"splash_mha_fwd": 2, "splash_mha_dkv": 5}
-"""Those in the splash kernels, by how their names begin; the backward one is the fused one."""
+"""Products in the splash kernels, by the beginning of the name; the backward is fused."""
 
 
 def count(jaxpr: Any) -> float:
-    """FLOPs of a traced program (`jax.make_jaxpr`, `jax.jit(...).trace`), on all devices."""
+    """Return the FLOPs of a traced program (`jax.make_jaxpr`, `jax.jit(...).trace`)."""
     return sum((_of(equation) for equation in _used(getattr(jaxpr, "jaxpr", jaxpr))), 0.0)
 
 
 def _used(jaxpr: Any) -> Iterator[Any]:
-    """The equations that an answer needs, last first; what a policy has kept leaves others behind,
-    which no compiler takes over."""
+    """Yield the equations that the outputs need, last first.
+
+    A checkpoint policy leaves unused equations behind, which compilers remove.
+    """
     needed = {id(var) for var in jaxpr.outvars}
     for equation in reversed(jaxpr.eqns):
         if any(id(var) in needed for var in equation.outvars):
@@ -61,15 +63,15 @@ def _of(equation: Any) -> float:
 
 
 def _inner(params: dict[str, Any]) -> list[Any]:
-    """The programs that an equation calls."""
+    """Return the jaxprs that an equation calls."""
     found = (getattr(value, "jaxpr", value) for value in params.values())
     return [value for value in found if hasattr(value, "eqns")]
 
 
 def _convolution(equation: Any) -> float:
-    """Each value of the answer takes a kernel of inputs; each input that is padded in is one, too.
+    """Return the FLOPs of a convolution: a kernel of inputs per output value.
 
-    In the transpose of a strided convolution, most are: those do not count.
+    The zeros between the inputs of a transposed strided convolution do not count.
     """
     kernel, spec = equation.invars[1].aval.shape, equation.params["dimension_numbers"].rhs_spec
     out = equation.outvars[0].aval.shape
@@ -80,6 +82,6 @@ def _convolution(equation: Any) -> float:
 def _splash(equation: Any) -> float:
     name, avals = str(equation.params["name"]), [var.aval for var in equation.invars]
     (products,) = (n for beginning, n in SPLASH.items() if name.startswith(beginning))
-    # Before queries, keys and values come what the kernel knows of its mask, which are integers.
+    # The mask's arrays, of integers, precede queries, keys and values.
     q, k, *_ = (aval.shape for aval in avals if jnp.issubdtype(aval.dtype, jnp.floating))
     return 2.0 * products * prod(q) * k[-2]

@@ -1,10 +1,10 @@
-"""What a compiled program moves: read off the text that XLA prints of it.
+"""Memory traffic, collectives and largest arrays of a compiled program, from its HLO text.
 
 The text is a list of computations, each a list of instructions
 
     %name = type opcode(%operand, ...), attribute=value, ..., metadata={op_name="..."}
 
-A loop's body runs as often as the compiler found out, or as the loop's condition compares with. The
+A loop's trip count is the one that the compiler found, or the bound in the loop's condition. The
 instructions of a fusion are one pass over memory; all others read their operands and write their
 results.
 """
@@ -23,7 +23,7 @@ BITS = {
     "s64": 64, "u64": 64, "f8e4m3fn": 8, "f8e5m2": 8, "bf16": 16, "f16": 16, "f32": 32, "f64": 64,
     "c64": 64, "c128": 128,
 }  # fmt: skip
-"""Of a value of each of XLA's types."""
+"""Bits per value of each XLA type."""
 COLLECTIVES = (
     "all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute",
     "ragged-all-to-all", "collective-broadcast",
@@ -32,7 +32,7 @@ FREE = {
     "parameter", "constant", "tuple", "get-tuple-element", "bitcast", "while", "conditional",
     "call", "after-all", "partition-id", "replica-id", "iota", "optimization-barrier",
 }  # fmt: skip
-"""Instructions that move nothing by themselves."""
+"""Opcodes without memory traffic."""
 
 _ARRAY = re.compile(r"\b([a-z]+\d*\w*)\[([\d,]*)\]")
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.\-]+) .*\{$")
@@ -45,7 +45,7 @@ _OP_NAME = re.compile(r'op_name="([^"]*)"')
 
 @dataclass(frozen=True)
 class Instruction:
-    """A line of the text."""
+    """One HLO instruction."""
 
     name: str
     type: str
@@ -56,50 +56,50 @@ class Instruction:
 
     @property
     def bytes(self) -> int:
-        """Of its result."""
+        """Return the bytes of its result."""
         return _bytes(self.type)
 
     @property
     def source(self) -> str:
-        """The operation of the program that was traced; empty if the compiler made it."""
+        """Return the traced operation it comes from; empty if the compiler added it."""
         found = _OP_NAME.search(self.attributes)
         return found.group(1) if found else ""
 
 
 @dataclass(frozen=True)
-class Moved:
-    """Collectives of a kind, on one device."""
+class CollectiveTraffic:
+    """Traffic of one kind of collective, on one device."""
 
     count: int
-    """How many run."""
+    """Number of executions."""
     bytes: float
-    """That the device sends."""
+    """Bytes that the device sends."""
 
 
 @dataclass(frozen=True)
-class Big:
-    """An array, or several that are alike."""
+class LargeArray:
+    """A large array, or several equal ones."""
 
     bytes: int
-    """Of one."""
+    """Bytes of one array."""
     shape: str
-    """As XLA writes it, with the dtype."""
+    """Dtype and shape in XLA's notation."""
     source: str
-    """The operation that makes it, or the argument."""
+    """Operation that produces it, or the argument."""
     count: int
-    """Alike."""
+    """Number of equal arrays."""
 
 
 @dataclass(frozen=True)
-class Program:
-    """The computations of a compiled program, by name."""
+class HloModule:
+    """The computations of a compiled HLO module, by name."""
 
     computations: Mapping[str, Mapping[str, Instruction]]
     entry: str
 
     @classmethod
-    def read(cls, text: str) -> Program:
-        """Read what `Compiled.as_text` gives."""
+    def read(cls, text: str) -> HloModule:
+        """Parse the text of `Compiled.as_text`."""
         computations: dict[str, dict[str, Instruction]] = {}
         entry, current = "", {}
         for line in text.splitlines():
@@ -113,7 +113,7 @@ class Program:
 
     @cached_property
     def runs(self) -> Mapping[str, int]:
-        """How often each computation runs, but for those inside fusions."""
+        """Return the number of executions of each computation outside fusions."""
         runs: dict[str, int] = defaultdict(int)
 
         def walk(name: str, times: int) -> None:
@@ -127,18 +127,18 @@ class Program:
         walk(self.entry, 1)
         return runs
 
-    def collectives(self) -> dict[str, Moved]:
-        """By kind, on one device: how many run, and what it sends."""
-        found: dict[str, Moved] = {}
+    def collectives(self) -> dict[str, CollectiveTraffic]:
+        """Return the traffic of one device by kind of collective."""
+        found: dict[str, CollectiveTraffic] = {}
         for computation, times in self.runs.items():
             for instruction, sent in self._sent_in(computation):
                 kind = instruction.opcode.removesuffix("-start")
-                have = found.get(kind, Moved(0, 0.0))
-                found[kind] = Moved(have.count + times, have.bytes + times * sent)
+                have = found.get(kind, CollectiveTraffic(0, 0.0))
+                found[kind] = CollectiveTraffic(have.count + times, have.bytes + times * sent)
         return found
 
     def traffic(self) -> float:
-        """Bytes that a device reads from its memory and writes to it."""
+        """Return the bytes that a device reads from its memory and writes to it."""
         return float(
             sum(
                 times * self._passes(instruction, name)
@@ -147,22 +147,23 @@ class Program:
             )
         )
 
-    def largest(self, count: int) -> list[Big]:
-        """The largest arrays that are made or given, those that are alike together."""
-        alike: dict[tuple[str, str], list[Instruction]] = defaultdict(list)
+    def largest(self, count: int) -> list[LargeArray]:
+        """Return the largest arguments and results of instructions, equal ones grouped."""
+        equal: dict[tuple[str, str], list[Instruction]] = defaultdict(list)
         for name in self.runs:
             for instruction in self.computations[name].values():
                 given = instruction.opcode == "parameter" and name == self.entry
                 if (given or self._makes(instruction)) and not instruction.type.startswith("("):
                     kind = instruction.type.partition("{")[0]
-                    alike[kind, instruction.source].append(instruction)
-        bigs = [
-            Big(group[0].bytes, kind, source, len(group)) for (kind, source), group in alike.items()
+                    equal[kind, instruction.source].append(instruction)
+        arrays = [
+            LargeArray(group[0].bytes, kind, source, len(group))
+            for (kind, source), group in equal.items()
         ]
-        return sorted(bigs, key=lambda big: (-big.bytes, big.source))[:count]
+        return sorted(arrays, key=lambda array: (-array.bytes, array.source))[:count]
 
     def _sent_in(self, computation: str) -> Iterator[tuple[Instruction, float]]:
-        """Collectives of a computation and of its fusions, and bytes that each sends."""
+        """Yield the collectives of a computation and its fusions, and the bytes each sends."""
         have = self.computations[computation]
         for instruction in have.values():
             if instruction.opcode == "fusion":
@@ -173,7 +174,7 @@ class Program:
                 yield instruction, _sent(kind, operands, _group(instruction.attributes))
 
     def _makes(self, instruction: Instruction) -> bool:
-        """Whether its result is an array of its own, not a part or a change of another."""
+        """Return whether its result is a new array, not a view or an update of another."""
         if instruction.opcode == "fusion":
             inner = self.computations[_called(instruction)[0]]
             (root,) = (i for i in inner.values() if i.root)
@@ -196,7 +197,7 @@ class Program:
         return max(bounds, default=1)
 
     def _passes(self, instruction: Instruction, computation: str) -> int:
-        """Bytes that an instruction reads and writes."""
+        """Return the bytes that an instruction reads and writes."""
         opcode = instruction.opcode
         if opcode in FREE or opcode.endswith("-done"):
             return 0
@@ -209,28 +210,28 @@ class Program:
         if opcode == "fusion":
             (inner,) = _called(instruction)
             return self._fused(self.computations[inner], instruction.bytes)
-        # What begins a collective or a copy answers with its operands and the result.
+        # The start of a collective or copy returns its operands and the result.
         given = sum(operands) if opcode.endswith("-start") and instruction.type[0] == "(" else 0
         return sum(operands) + instruction.bytes - given
 
     def _fused(self, inner: Mapping[str, Instruction], out: int) -> int:
-        """A fusion reads the slices that it takes and writes those that it changes."""
+        """Return the bytes of a fusion: the slices it takes and those it updates."""
         users: dict[str, list[Instruction]] = defaultdict(list)
         for instruction in inner.values():
             for name in instruction.operands:
                 users[name].append(instruction)
-        moved = 0
+        read = 0
         for parameter in inner.values():
             if parameter.opcode == "parameter":
-                moved += _read(parameter, users)
+                read += _read(parameter, users)
         changed = [i for i in inner.values() if i.opcode == "dynamic-update-slice"]
         for update in changed:
             out -= update.bytes - inner[update.operands[1]].bytes
-        return moved + max(out, 0)
+        return read + max(out, 0)
 
 
 def _read(value: Instruction, users: Mapping[str, list[Instruction]]) -> int:
-    """Bytes of a value that a fusion reads."""
+    """Return the bytes of a value that a fusion reads."""
     used = users[value.name]
     first = all(user.operands[0] == value.name for user in used)
     if used and first and all(user.opcode in ("dynamic-slice", "gather") for user in used):
@@ -248,7 +249,7 @@ def _instruction(name: str, rest: str, root: bool) -> Instruction:
     opcode, _, _ = rest.partition("(")
     end = _closing(rest, len(opcode)) + 1
     given = rest[len(opcode) : end]
-    # A constant's value stands where the operands of others do.
+    # A constant has its value in place of operands.
     attributes = given if opcode == "constant" else rest[end:]
     operands = () if opcode == "constant" else tuple(_OPERAND.findall(given))
     return Instruction(name, kind, opcode, operands, attributes, root)
@@ -276,7 +277,7 @@ def _bytes(type_: str) -> int:
 
 
 def _group(attributes: str) -> int:
-    """Devices that take part in a collective with one another."""
+    """Return the number of devices in a group of a collective."""
     if found := re.search(r"replica_groups=mesh\[([^\]]*)\] \{([^}]*)\}", attributes):
         sizes = dict(re.findall(r"'(\w+)'=(\d+)", found.group(1)))
         return prod(int(sizes[axis]) for axis in re.findall(r"'(\w+)'", found.group(2)))
@@ -288,8 +289,8 @@ def _group(attributes: str) -> int:
 
 
 def _sent(kind: str, operands: int, group: int) -> float:
-    """Bytes that each device of a group sends, in a ring."""
+    """Return the bytes that each device of a group sends, in a ring."""
     if kind == "collective-permute":
         return float(operands)
-    whole = operands * group if kind == "all-gather" else operands
-    return (2 if kind == "all-reduce" else 1) * whole * (group - 1) / group
+    total = operands * group if kind == "all-gather" else operands
+    return (2 if kind == "all-reduce" else 1) * total * (group - 1) / group

@@ -1,7 +1,7 @@
-"""The machines that programs are compiled for, none of which needs to be there.
+"""Target machines to compile for, none of which needs to be present.
 
-XLA's compilers for NVIDIA GPUs and for TPUs come with jax's packages and run anywhere. They are
-told what to compile for: a TPU slice by its name, a GPU by the numbers that its driver would give.
+XLA's compilers for NVIDIA GPUs and for TPUs come with jax's packages and run anywhere. A TPU slice
+is given to them by its name, a GPU by the properties that its driver would report.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ Platform = Literal["cpu", "gpu", "tpu"]
 
 @dataclass(frozen=True, kw_only=True)
 class Chip:
-    """What a GPU's compiler wants to know, as CUDA's device properties give it."""
+    """CUDA device properties that XLA's GPU compiler needs."""
 
     capability: tuple[int, int]
-    """Compute capability."""
+    """CUDA compute capability, major and minor."""
     cores: int
-    """Streaming multiprocessors."""
+    """Number of streaming multiprocessors."""
     shared: int
-    """Bytes of shared memory of each, of which a block may use 1024 less."""
+    """Bytes of shared memory per multiprocessor; a block may use 1024 less."""
     l2: int
-    """Bytes of the second cache."""
+    """Bytes of L2 cache."""
     clock_ghz: float
-    """Highest clock."""
+    """Boost clock in GHz."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Device:
-    """Facts about a device, from its maker's data sheet; NaN where there is none."""
+    """Data sheet of a device; NaN where a number is unknown."""
 
     kind: str
-    """How jax's name of the device begins."""
+    """Beginning of jax's `device_kind`."""
     platform: Platform
-    """As jax calls it."""
+    """jax's name of the platform."""
     flops: float
     """Dense bfloat16 FLOP/s."""
     memory: float
-    """Bytes that a program can see."""
+    """Bytes of device memory."""
     bandwidth: float
-    """Bytes/s between the device and its memory."""
+    """Memory bandwidth in bytes/s."""
     link: float
-    """Bytes/s that it can send to the others of its host or slice."""
+    """Interconnect bandwidth in bytes/s, one way, to the others of its host or slice."""
     chip: Chip | None = None
-    """Of a GPU."""
+    """Compiler properties, if it is a GPU."""
 
 
 GIB = 2**30
@@ -124,63 +124,71 @@ DEVICES: Mapping[str, Device] = {
         link=400e9,
     ),
 }
-"""By the names that targets have."""
-ALONE = {
+"""Devices by the name in a target."""
+OFFLINE_ENV = {
     "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1",
     "TPU_SKIP_MDS_QUERY": "1",
     "TPU_ACCELERATOR_TYPE": "v5p-8",
     "TPU_WORKER_HOSTNAMES": "localhost",
     "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",
 }
-"""Environment in which the compilers look for no driver and no TPU host, and for no other user."""
+"""Environment variables with which the compilers look for no driver, TPU host or lock."""
 GPU_SHARE = 0.95
-"""Of a GPU's memory that XLA may take, with the settings of docs/train.md."""
+"""Share of a GPU's memory that XLA may allocate, with the settings of docs/train.md."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A machine to compile for."""
+    """Machine to compile for."""
 
     name: str
-    """As it was asked for."""
+    """Name, such as h200:8."""
     device: Device
-    """What it has."""
+    """Data sheet of its devices."""
     devices: Sequence[Any]
-    """jax's devices, which can be compiled for and not run on."""
+    """jax devices, for compilation only."""
 
     @property
     def capacity(self) -> float:
-        """Bytes of a device that a program may use."""
+        """Return the bytes of a device that a program may use."""
         return self.device.memory * (GPU_SHARE if self.device.platform == "gpu" else 1)
 
 
 def parse(name: str) -> tuple[str, str]:
-    """A target's device and size. Raises `InputError` if there is no such target."""
+    """Split a target into device and size. Raises `InputError` if it is not a target."""
     kind, colon, size = name.partition(":")
     known = [*DEVICES, "cpu"]
     if kind not in known:
         near = difflib.get_close_matches(kind, known, n=1, cutoff=0.0)[0]
         raise InputError(
-            f"There is no target {name!r}. Nearest device: {near}. Devices: {', '.join(known)}."
+            f"Unknown target {name!r}. Nearest device: {near}. Devices: {', '.join(known)}."
         )
     tpu = kind != "cpu" and DEVICES[kind].platform == "tpu"
     if not re.fullmatch(r"[1-9]\d*(x[1-9]\d*)+" if tpu else r"[1-9]\d*", size) or not colon:
         example = f"{kind}:2x2x2 or {kind}:4x4, a slice" if tpu else f"{kind}:8, a number"
-        raise InputError(f"The target {name!r} has no size of the form {example} of devices.")
+        raise InputError(f"Target {name!r} needs a size of the form {example} of devices.")
     return kind, size
 
 
-def find(name: str) -> Target:
-    """A target by its name: `h200:8`, `v5p:2x2x2`, `cpu:1`.
+def compile_offline() -> None:
+    """Set up this process to compile for absent devices: for entry points, before jax starts.
 
-    Raises `InputError` if there is none of that name, or if its compiler is not installed.
+    Sets the variables of `OFFLINE_ENV` and leaves jax the CPU only.
     """
     import jax
 
-    kind, size = parse(name)
-    for variable, value in ALONE.items():
+    for variable, value in OFFLINE_ENV.items():
         os.environ.setdefault(variable, value)
     jax.config.update("jax_platforms", "cpu")
+
+
+def find(name: str) -> Target:
+    """Return a target by its name: `h200:8`, `v5p:2x2x2`, `cpu:1`.
+
+    GPUs and TPUs need `compile_offline`. Raises `InputError` if the target is unknown, or its
+    compiler is not installed.
+    """
+    kind, size = parse(name)
     if kind == "cpu":
         return Target(name=name, device=_this_processor(), devices=_processors(int(size)))
     device = DEVICES[kind]
@@ -190,7 +198,7 @@ def find(name: str) -> Target:
 
 
 def peak(kind: str) -> float:
-    """Dense bfloat16 FLOP/s of a device that jax calls `kind`; NaN if it is not known."""
+    """Return the dense bfloat16 FLOP/s of jax's `device_kind`; NaN if unknown."""
     known = [device for device in DEVICES.values() if kind.startswith(device.kind)]
     return max(known, key=lambda device: len(device.kind)).flops if known else UNKNOWN
 
@@ -211,8 +219,8 @@ def _processors(count: int) -> Sequence[Any]:
     devices = jax.devices("cpu")
     if count > len(devices):
         raise InputError(
-            f"There are {len(devices)} CPU devices, not {count}: "
-            f"XLA_FLAGS=--xla_force_host_platform_device_count={count} makes as many."
+            f"{count} CPU devices were requested, {len(devices)} are available: set "
+            f"XLA_FLAGS=--xla_force_host_platform_device_count={count}."
         )
     return devices[:count]
 
@@ -234,7 +242,7 @@ def _gpus(device: Device, chip: Chip, count: int) -> Sequence[Any]:
 
 
 def _properties(device: Device, chip: Chip) -> str:
-    """A GPU as the compiler reads it: stream_executor.GpuTargetConfigProto, in text."""
+    """Return a stream_executor.GpuTargetConfigProto in text format."""
     major, minor = chip.capability
     extension = " feature_extension: ACCELERATED_FEATURES" if major >= 9 else ""
     return f"""
@@ -280,5 +288,5 @@ def _slice(name: str) -> Sequence[Any]:
         )
     try:
         return topologies.get_topology_desc(name, platform="tpu").devices
-    except Exception as error:  # jaxlib's own, which names the shapes that there are
-        raise InputError(f"There is no TPU slice {name}: {error}") from error
+    except Exception as error:  # jaxlib's, which names the valid shapes
+        raise InputError(f"Unknown TPU slice {name}: {error}") from error

@@ -222,7 +222,7 @@ def _measure(
     traced = run.trace(*args)
     if options.target is not None:
         report = compile_for(find(options.target), traced, model_flops=needed)
-        yield {**line, "preflight_gib": report.memory.peak / GIB, "least_s": report.least_s}
+        yield {**line, "preflight_gib": report.memory.peak / GIB, "roofline_s": report.roofline_s}
         return
     begun = time.perf_counter()
     compiled = traced.lower().compile()

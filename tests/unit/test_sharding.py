@@ -48,10 +48,12 @@ def test_a_mesh_that_does_not_fit_the_devices_is_refused(sizes):
         make_mesh(config)
 
 
-def test_a_batch_that_cannot_be_dealt_out_is_refused():
+def test_a_batch_that_a_mesh_does_not_divide_is_refused():
     mesh = AbstractMesh((2, 2, 2), ("data", "fsdp", "context"))
     check_batch(8, mesh)
     with pytest.raises(InputError, match=r"A batch of 6 .*data 2 x fsdp 2.* Nearest: 8"):
         check_batch(6, mesh)
-    with pytest.raises(InputError, match=r"Nearest: 16\. Or parts whose number divides 2"):
+    with pytest.raises(
+        InputError, match=r"Nearest: 16\. Or a number of micro-batches that divides 2"
+    ):
         check_batch(8, mesh, accumulate=4)

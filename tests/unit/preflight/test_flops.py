@@ -1,4 +1,4 @@
-"""FLOPs counted in programs, beside the closed formula and XLA's own count."""
+"""FLOPs counted in jaxprs, versus the closed formula and XLA's own count."""
 
 from functools import partial
 
@@ -57,7 +57,7 @@ def test_products_and_convolutions_are_xlas_count(function, args):
     assert counted(function, *args) == pytest.approx(want, rel=1e-6)
 
 
-def test_loops_count_each_turn_and_choices_the_longer_way():
+def test_loops_count_each_iteration_and_branches_the_longer_one():
     w = shape(8, 8)
     loop = lambda x, w: jax.lax.scan(lambda x, _: (x @ w, None), x, length=5)[0]  # noqa: E731
     either = lambda x, w: jax.lax.cond(x[0, 0] > 0, lambda: x @ w, lambda: x)  # noqa: E731
@@ -82,7 +82,7 @@ def test_a_flash_kernel_computes_the_scores_twice(kernel, monkeypatch):
     value = lambda *x: attention(*x, kernel=kernel).astype(jnp.float32).sum()  # noqa: E731
     product = 2 * 2 * 4 * 256 * 256 * 128
     assert counted(value, q, q, q) == 2 * product
-    # Beside the kernel stands a sum over g · out, which splash writes as a product.
+    # Besides the kernel there is a sum over g · out, which splash writes as a product.
     assert counted(jax.grad(value, (0, 1, 2)), q, q, q) == pytest.approx(7 * product, rel=1e-3)
 
 

@@ -1,10 +1,10 @@
-"""What is read off the text of compiled programs: of one that was compiled, and of a short one."""
+"""HLO text: of a short module, and of a program that was compiled."""
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from egosim_jax.preflight.hlo import Program
+from egosim_jax.preflight.hlo import HloModule
 
 TEXT = """HloModule jit_f, is_scheduled=true
 
@@ -52,26 +52,26 @@ ENTRY %main (x.0: f32[8,8], w.0: f32[4,8,8]) -> f32[8,8] {
 }
 """
 MATRIX = 4 * 8 * 8
-"""Bytes."""
+"""Bytes of a matrix."""
 
 
 @pytest.fixture
-def program():
-    return Program.read(TEXT)
+def module():
+    return HloModule.read(TEXT)
 
 
-def test_a_loop_runs_as_often_as_its_condition_says(program):
-    assert program.runs == {"main": 1, "body": 4}
+def test_a_loop_runs_as_often_as_its_condition_says(module):
+    assert module.runs == {"main": 1, "body": 4}
 
 
 def test_a_loop_runs_as_often_as_the_compiler_says():
     config = 'backend_config={"known_trip_count":{"n":"7"}}'
     text = TEXT.replace("body=%body", f"body=%body, {config}")
-    assert Program.read(text).runs["body"] == 7
+    assert HloModule.read(text).runs["body"] == 7
 
 
-def test_collectives_are_counted_with_their_loops_and_as_sent_in_a_ring(program):
-    found = program.collectives()
+def test_collectives_are_counted_with_their_loops_and_as_sent_in_a_ring(module):
+    found = module.collectives()
     assert found.keys() == {"all-gather", "all-reduce"}
     gather, reduce = found["all-gather"], found["all-reduce"]
     assert (gather.count, gather.bytes) == (4, 4 * 2 * MATRIX / 2)
@@ -85,28 +85,28 @@ def test_collectives_are_counted_with_their_loops_and_as_sent_in_a_ring(program)
 def test_groups_of_devices_are_written_in_three_ways(groups, devices):
     text = TEXT.replace("replica_groups={{0,1,2,3}}", f"replica_groups={groups}")
     sent = 4 * 2 * MATRIX * (devices - 1) / devices
-    assert Program.read(text).collectives()["all-reduce"].bytes == sent
+    assert HloModule.read(text).collectives()["all-reduce"].bytes == sent
 
 
-def test_a_fusion_reads_the_slice_that_it_takes(program):
+def test_a_fusion_reads_the_slice_that_it_takes(module):
     fusion = 2 * MATRIX + 4  # a matrix in and out, and the index
     gathered, product, summed = 3 * MATRIX, 4 * MATRIX, 2 * MATRIX
-    assert program.traffic() == 4 * (fusion + gathered + product + summed)
+    assert module.traffic() == 4 * (fusion + gathered + product + summed)
 
 
-def test_the_largest_arrays_are_named_by_what_makes_them(program):
-    first, *others = program.largest(10)
+def test_the_largest_arrays_are_named_by_their_source(module):
+    first, *others = module.largest(10)
     assert (first.bytes, first.shape, first.source) == (4 * MATRIX, "f32[4,8,8]", "w")
-    assert all(big.bytes <= 2 * MATRIX for big in others)
+    assert all(array.bytes <= 2 * MATRIX for array in others)
 
 
-def test_a_program_that_was_compiled_can_be_read():
+def test_the_text_of_a_compiled_program_is_parsed():
     def f(x, w):
         return jax.lax.scan(lambda x, w: (jnp.tanh(x @ w), None), x, w)[0]
 
     compiled = jax.jit(f).lower(jnp.ones((64, 64)), jnp.ones((5, 64, 64))).compile()
-    program = Program.read(compiled.as_text())
-    assert sorted(program.runs.values())[-1] == 5
-    assert program.largest(1)[0].bytes == 5 * 64 * 64 * 4
-    # Each turn reads x and a matrix and writes x, takes the matrix out, and passes over x for tanh.
-    assert 5 * 3 * 64 * 64 * 4 <= program.traffic() <= 5 * 9 * 64 * 64 * 4
+    module = HloModule.read(compiled.as_text())
+    assert sorted(module.runs.values())[-1] == 5
+    assert module.largest(1)[0].bytes == 5 * 64 * 64 * 4
+    # Each iteration reads x and a matrix and writes x, slices the matrix, and applies tanh to x.
+    assert 5 * 3 * 64 * 64 * 4 <= module.traffic() <= 5 * 9 * 64 * 64 * 4

@@ -1,13 +1,23 @@
-"""Targets: their names, what is known of them, and what is said of those that are not."""
+"""Targets: names, data sheets, and errors for unknown ones."""
 
 import importlib.util
 import math
+import os
 
 import pytest
 
 from egosim_jax.preflight import targets
-from egosim_jax.preflight.report import refusal
-from egosim_jax.preflight.targets import DEVICES, GIB, Target, find, parse, peak
+from egosim_jax.preflight.report import parse_oom
+from egosim_jax.preflight.targets import (
+    DEVICES,
+    GIB,
+    OFFLINE_ENV,
+    Target,
+    compile_offline,
+    find,
+    parse,
+    peak,
+)
 from egosim_jax.types import InputError
 
 
@@ -17,7 +27,7 @@ def test_a_target_is_a_device_and_a_size(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("h20:8", "Nearest device: h200"),
         ("h200", "h200:8"),
@@ -27,8 +37,8 @@ def test_a_target_is_a_device_and_a_size(name):
         ("v6e:4x0", "a slice"),
     ],
 )
-def test_another_name_is_refused_with_the_nearest_or_with_the_form(name, said):
-    with pytest.raises(InputError, match=said):
+def test_an_unknown_target_is_refused_with_the_nearest_or_with_the_form(name, message):
+    with pytest.raises(InputError, match=message):
         parse(name)
 
 
@@ -39,39 +49,46 @@ def test_a_compiler_that_is_missing_is_named_with_its_extra(name, extra, monkeyp
         find(name)
 
 
-def test_more_processors_than_there_are_are_refused_with_the_flag():
+def test_more_processors_than_available_are_refused_with_the_flag():
     with pytest.raises(InputError, match="device_count=99"):
         find("cpu:99")
 
 
-def test_every_device_has_its_facts():
+def test_finding_a_target_changes_nothing_of_the_process(monkeypatch):
+    for variable in OFFLINE_ENV:
+        monkeypatch.delenv(variable, raising=False)
+    find("cpu:1")
+    assert not OFFLINE_ENV.keys() & os.environ.keys()
+
+
+def test_every_device_has_its_data_sheet():
     for device in DEVICES.values():
         facts = (device.flops, device.memory, device.bandwidth, device.link)
         assert all(map(math.isfinite, facts))
         assert (device.chip is None) == (device.platform == "tpu")
-        # In the units that are said: from the slowest TPU to the fastest GPU.
+        # In the documented units: from the slowest TPU to the fastest GPU.
         assert 1e14 < device.flops < 1e16
         assert 1e10 < device.memory < 1e12
         assert 5e11 < device.bandwidth < 1e13
         assert 1e11 <= device.link < device.bandwidth
 
 
-def test_the_longest_beginning_of_a_kind_counts():
+def test_the_longest_matching_kind_counts():
     assert peak("TPU v5 lite") == 197e12
     assert peak("TPU v5p") == peak("TPU v5") == 459e12
     assert math.isnan(peak("cpu"))
 
 
 @pytest.mark.parametrize(
-    ("said", "needs"),
+    ("message", "needs"),
     [
         ("RESOURCE_EXHAUSTED: Used 44.01G of 31.25G hbm. Exceeded by 12.76G", 44.01),
         ("required for HLO temporaries (400.00G) exceeds available HBM (31.25G).", 400),
     ],
 )
-def test_what_a_compiler_says_of_memory_is_understood(said, needs):
+def test_out_of_memory_messages_are_parsed(message, needs):
     target = Target(name="v6e:2x2", device=DEVICES["v6e"], devices=())
-    report = refusal(RuntimeError(said), target)
+    report = parse_oom(RuntimeError(message), target)
     assert not report.fits
     assert report.needs == pytest.approx(needs * GIB)
     assert report.capacity == 31.25 * GIB
@@ -80,7 +97,7 @@ def test_what_a_compiler_says_of_memory_is_understood(said, needs):
 def test_another_error_of_a_compiler_stays_one():
     target = Target(name="v6e:2x2", device=DEVICES["v6e"], devices=())
     with pytest.raises(RuntimeError, match="broken"):
-        refusal(RuntimeError("broken"), target)
+        parse_oom(RuntimeError("broken"), target)
 
 
 COMPILERS = {
@@ -95,6 +112,7 @@ INSTALLED = [c for module, c in COMPILERS.items() if importlib.util.find_spec(mo
 )
 def test_a_target_has_its_devices(name, devices):
     """Also of GPUs and TPUs where their compilers are installed: the extras `cuda` and `tpu`."""
+    compile_offline()
     target = find(name)
     assert len(target.devices) == devices
     assert all(device.device_kind.startswith(target.device.kind) for device in target.devices)

@@ -1,4 +1,4 @@
-"""`egosim plan`: whether generating clips fits a machine, and how fast it can be there."""
+"""`egosim preflight`: compile generation for a machine, and report whether it fits."""
 
 from __future__ import annotations
 
@@ -17,48 +17,49 @@ if TYPE_CHECKING:
     from jax.sharding import Mesh
 
     from egosim_jax.networks import ModelConfig
-    from egosim_jax.preflight.report import Report, TooLarge
+    from egosim_jax.preflight.report import OutOfMemory, Report
     from egosim_jax.preflight.targets import Target
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Compile what `generate` runs for a machine that need not be there; say whether it fits.
+class Preflight:
+    """Compile what `generate` runs for a machine that need not be present; report whether it fits.
 
-    Prints, for encoding, denoising and decoding: memory of a device with the weights of all four
-    networks, the largest arrays, collectives, FLOPs and the least time. Exit code 1 if one of them
-    does not fit.
+    Prints, for encoding, denoising and decoding: memory of a device with the weights of all
+    networks, the largest arrays, collectives, FLOPs and the roofline time. Exit code 1 if one of
+    them does not fit.
     """
 
     config: str
     """Name of the model."""
     target: str
-    """The machine, as in h200:1, h200:8, v5p:2x2x2 or cpu:1."""
+    """Machine to compile for, such as h200:1, h200:8, v5p:2x2x2 or cpu:1."""
     batch_size: int | None = None
-    """Clips generated together; by default one for each device that has one of its own."""
+    """Clips generated together; by default one for each group of devices that shares a clip."""
     steps: int | None = None
-    """Denoising steps, if not the model's own."""
+    """Denoising steps, if not the model's."""
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
-    """Layout of the devices; by default each makes clips of its own. Less time for one clip:
+    """Layout of the devices; by default each generates separate clips. Less time for one clip:
     --mesh.data 1 --mesh.context -1. Weights too large for one device: --mesh.data 1
     --mesh.fsdp -1."""
     json: bool = False
-    """Print JSON."""
+    """Print the reports as JSON."""
 
     def run(self) -> int:
         """Compile and print."""
         from egosim_jax import configs
         from egosim_jax.preflight import report as reports
-        from egosim_jax.preflight.targets import find
+        from egosim_jax.preflight.targets import compile_offline, find
         from egosim_jax.sharding import make_mesh, parts
 
         check_counts({"--batch-size": self.batch_size, "--steps": self.steps})
+        compile_offline()
         config, target = configs.get(self.config), find(self.target)
         config = replace(config, steps=self.steps or config.steps)
         mesh = make_mesh(self.mesh, target.devices)
         size = self.batch_size or parts("batch", mesh)
         found = {}
-        for name, report in plan(config, target, mesh, size):
+        for name, report in compile_generation(config, target, mesh, size):
             found[name] = report
             if not self.json:
                 text = reports.text(report)
@@ -71,10 +72,10 @@ class Plan:
         return DONE if all(report.fits for report in found.values()) else FAILED
 
 
-def plan(
+def compile_generation(
     config: ModelConfig, target: Target, mesh: Mesh, size: int
-) -> Iterator[tuple[str, Report | TooLarge]]:
-    """What each program of generation takes, beside the weights of all networks."""
+) -> Iterator[tuple[str, Report | OutOfMemory]]:
+    """Yield the report of each program of generation, with the weights of all networks resident."""
     from flax import nnx
 
     from egosim_jax.generator import Generator
@@ -85,7 +86,7 @@ def plan(
     for name, network in networks.parts().items():
         setattr(networks, name, _stored(network, getattr(config, name).dtype))
     generator = Generator(config, networks, mesh)
-    weights = _on_a_device(nnx.state(generator.networks))
+    weights = _bytes_per_device(nnx.state(generator.networks))
     for name, program, given in generator.programs(size):
         if name == "noise":  # as large as the latents
             continue
@@ -93,7 +94,7 @@ def plan(
 
 
 def _stored(network: nnx.Module, dtype: str) -> nnx.Module:
-    """The network with weights in the dtype in which it computes, as converted ones are."""
+    """Return a network with weights in its compute dtype, as converted ones are."""
     import jax
     from flax import nnx
 
@@ -103,8 +104,8 @@ def _stored(network: nnx.Module, dtype: str) -> nnx.Module:
     )
 
 
-def _on_a_device(shapes: Any) -> int:
-    """Bytes that arrays of these shapes and shardings take of each device."""
+def _bytes_per_device(shapes: Any) -> int:
+    """Return the bytes per device of arrays of these shapes and shardings."""
     import jax
 
     return sum(
@@ -113,10 +114,10 @@ def _on_a_device(shapes: Any) -> int:
     )
 
 
-def _summary(found: Mapping[str, Report | TooLarge], size: int) -> str:
-    """The least time of a batch, if the target's speed is known."""
-    seconds = {name: getattr(report, "least_s", math.nan) for name, report in found.items()}
+def _summary(found: Mapping[str, Report | OutOfMemory], size: int) -> str:
+    """Return the roofline time of a batch; empty if the target's speed is unknown."""
+    seconds = {name: getattr(report, "roofline_s", math.nan) for name, report in found.items()}
     if any(map(math.isnan, seconds.values())):
         return ""
-    parts = ", ".join(f"{name} {least:.3g}" for name, least in seconds.items())
+    parts = ", ".join(f"{name} {roofline:.3g}" for name, roofline in seconds.items())
     return f"{size} clips take at least {sum(seconds.values()):.3g} s: {parts}"

@@ -1,18 +1,19 @@
-"""What fits where: the README's tables, compiled cell by cell by the targets' own compilers.
+"""Preflight of every recipe on every target: the README's tables, compiled cell by cell.
 
     pip install -e '.[cuda,tpu]'
-    python -m tests.benchmarks.fits [--only TEXT]
-    python -m tests.benchmarks.fits --write
+    python -m tests.benchmarks.preflight [--only TEXT]
+    python -m tests.benchmarks.preflight --write
 
-A cell takes from 10 s to 2 minutes on two cores, half a minute more for 64 chips. Cells are kept in
-docs/fits.json, so that a run that was interrupted goes on, and one cell can be made again by
-removing it there; `--write` puts what is known into the README.
+A cell takes from 10 s to 2 minutes on two cores, half a minute more for 64 chips. Cells are stored
+in tests/benchmarks/results/preflight.json: an interrupted run resumes, and a cell that is removed
+there is compiled again; `--write` puts the stored cells into the README.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,28 +21,28 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax import configs
-from egosim_jax.cli.plan import plan
+from egosim_jax.cli.preflight import compile_generation
 from egosim_jax.io.run import write_json, write_text
-from egosim_jax.preflight.report import Report, plain
-from egosim_jax.preflight.targets import find
+from egosim_jax.preflight.report import OutOfMemory, Report
+from egosim_jax.preflight.targets import compile_offline, find
 from egosim_jax.sharding import make_mesh, parts
 from egosim_jax.train import recipes
 from egosim_jax.train.preflight import compile_step
 from egosim_jax.types import MeshConfig
 
-BEGIN, END = "<!-- python -m tests.benchmarks.fits --write -->", "<!-- end -->"
+BEGIN, END = "<!-- python -m tests.benchmarks.preflight --write -->", "<!-- end -->"
 ROOT = Path(__file__).parents[2]
-CELLS = ROOT / "docs" / "fits.json"
+CELLS = Path(__file__).parent / "results" / "preflight.json"
 REMATS = ("full", "attention", "projections", "products", "none", "offload")
 SHARES = (("h200:8", (1, 2, 4)), ("h100:8", (1, 2, 4)), ("v5p:2x2x2", (1,)), ("v6e:8x8", (1,)))
-"""Where all of the 14B is trained, and with how many clips on a device at a time."""
+"""Targets of a full fine-tuning of the 14B, and clips on a device at a time."""
 TARGETS = ("h200:8", "h100:8", "h200:1", "h100:1", "b200:8", "v5p:2x2x2", "v6e:4x4", "v6e:8x8")
 RECIPES = ("egosim_14b", "egosim_1_3b", "egosim_14b_robot", "egosim_14b_fewshot", "egosim_14b_lora")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """A recipe's update: clips on a device at a time and remat are its own unless given."""
+    """A recipe's update; clips on a device at a time and remat are the recipe's unless given."""
 
     recipe: str
     target: str
@@ -61,12 +62,12 @@ class Training:
             accumulate = batch // groups
         training = replace(stage.training, batch_size=batch, grad_accum_steps=accumulate)
         report = compile_step(stage._replace(training=training), target)
-        return {**plain(report), "clips": batch // groups // accumulate, "batch": batch}
+        return {**_stored(report), "clips": batch // groups // accumulate, "batch": batch}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Generation:
-    """Making clips: one for each device, or one that all devices share."""
+    """Generation: one clip for each device, or one that all devices share."""
 
     config: str
     target: str
@@ -79,10 +80,10 @@ class Generation:
         )
         mesh = make_mesh(layout, target.devices)
         size = parts("batch", mesh)
-        reports = dict(plan(config, target, mesh, size))
-        worst = max(reports.values(), key=lambda report: _peak(plain(report)))
-        seconds = [r.least_s if isinstance(r, Report) else float("nan") for r in reports.values()]
-        return {**plain(worst), "least_s": sum(seconds), "batch": size}
+        reports = dict(compile_generation(config, target, mesh, size))
+        cells = [_stored(report) for report in reports.values()]
+        worst = max(cells, key=lambda cell: cell["peak"])
+        return {**worst, "roofline_s": sum(cell["roofline_s"] for cell in cells), "batch": size}
 
 
 Cell = Training | Generation
@@ -105,15 +106,22 @@ def all_cells() -> Iterator[Cell]:
             yield Training(recipe=recipe, target=target)
 
 
-def _peak(values: dict[str, Any]) -> float:
-    return values.get("peak") or values["needs"]
+def _stored(report: Report | OutOfMemory) -> dict[str, Any]:
+    """Return what the tables show of a report."""
+    known = isinstance(report, Report)
+    return {
+        "fits": report.fits,
+        "peak": report.memory.peak if known else report.needs,
+        "capacity": report.capacity,
+        "roofline_s": report.roofline_s if known else math.nan,
+    }
 
 
 def _cell(values: dict[str, Any] | None) -> str:
-    """GiB of a device, and what there are if that is more."""
+    """Return the peak of a device in GiB, and its capacity if that is less."""
     if values is None:
         return ""
-    need, have = (f"{x / 2**30:.0f}" for x in (_peak(values), values["capacity"]))
+    need, have = (f"{x / 2**30:.0f}" for x in (values["peak"], values["capacity"]))
     return need if values["fits"] else f"{need} > {have}"
 
 
@@ -146,26 +154,26 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
     makes = [cell for cell in all_cells() if isinstance(cell, Generation) and found(cell)]
     generation = [
         [f"`{cell.target}`", "one, shared" if cell.shared else "one a device"]
-        + [_cell(found(cell)), f"{known[repr(cell)]['least_s']:.0f} s"]
+        + [_cell(found(cell)), f"{known[repr(cell)]['roofline_s']:.0f} s"]
         for cell in makes
     ]
     return "\n\n".join(
         [
             "All weights of `egosim_14b` trained, batch 32 (64 on 64 devices), GiB of a device by\n"
-            "`--remat` and by clips on a device at a time; if it does not fit, > what the\n"
-            "device has:",
+            "`--remat` and by clips on a device at a time; a peak that does not fit is shown with\n"
+            "the capacity:",
             _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
             "Every recipe as it is, GiB of a device (clips on a device at a time):",
             _rows(["recipe", *(f"`{target}`" for target in targets)], by_target),
             "Generation with `egosim_14b`, 50 steps, with the weights of all networks; the time\n"
-            "is the least that the devices' peak allows:",
-            _rows(["target", "clips", "GiB", "least"], generation),
+            "is the roofline, the least that the devices' peak allows:",
+            _rows(["target", "clips", "GiB", "roofline"], generation),
         ]
     )
 
 
 def write(known: dict[str, dict[str, Any]]) -> None:
-    """Put the tables between the marks in the README."""
+    """Write the tables between the markers in the README."""
     path = ROOT / "README.md"
     before, _, rest = path.read_text("utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
@@ -175,8 +183,9 @@ def write(known: dict[str, dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="measure cells whose name has this text")
-    parser.add_argument("--write", action="store_true", help="only write what is known")
+    parser.add_argument("--write", action="store_true", help="only write the stored cells")
     options = parser.parse_args()
+    compile_offline()
     known = json.loads(CELLS.read_text("utf-8")) if CELLS.exists() else {}
     if options.write:
         write(known)
@@ -189,7 +198,7 @@ def main() -> None:
         write_json(CELLS, known)
         verdict = "fits" if values["fits"] else "does not fit"
         print(
-            f"{number}/{len(todo)} {cell}: {_peak(values) / 2**30:.1f} GiB, {verdict}, "
+            f"{number}/{len(todo)} {cell}: {values['peak'] / 2**30:.1f} GiB, {verdict}, "
             f"{time.monotonic() - begun:.0f} s",
             flush=True,
         )
