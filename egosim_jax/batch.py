@@ -219,7 +219,11 @@ class BatchJob:
         valid, rejected = [], []
         for window in windows:
             problems = check_clip(
-                window.files, self.model.video, start=window.start, policy=self.policy
+                window.files,
+                self.model.video,
+                start=window.start,
+                policy=self.policy,
+                grid=self.model.grid,
             )
             if problems:
                 rejected.append((window, listing(problems)))
@@ -288,6 +292,7 @@ class BatchJob:
                     start=window.start,
                     policy=self.policy,
                     decoding=self.decoding,
+                    grid=self.model.grid,
                 )
                 loaded.append((window, triplet))
             except InputError as error:

@@ -24,26 +24,12 @@ from typing import Literal, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
-TEMPORAL_STRIDE = 4
-"""Pixel frames per latent frame, after the first."""
-SPATIAL_STRIDE = 8
-"""Pixels per latent cell, along each axis."""
 Kind = Literal["human", "robot"]
 """Kind of hands: human with 21 keypoints, or robot grippers with 3."""
 
 
 class InputError(ValueError):
     """Bad usage or bad input: says what happened, the rule, the value and the fix. Exit code 2."""
-
-
-def check_frame_count(frames: int, *, what: str = "a video", fix: str = "--num-frames") -> None:
-    """Raise `InputError` unless `frames` is 4k+1, the lengths the causal video VAE can encode."""
-    if frames < 1 or frames % TEMPORAL_STRIDE != 1:
-        below = max(1, (frames - 1) // TEMPORAL_STRIDE * TEMPORAL_STRIDE + 1)
-        raise InputError(
-            f"{what} of {frames} frames cannot be encoded: the video VAE needs 4k+1 frames. "
-            f"Nearest: {below} or {below + TEMPORAL_STRIDE}. ({fix})"
-        )
 
 
 def check_video(what: str, frames: np.ndarray, shape: tuple[int, int, int] | None = None) -> None:
@@ -76,48 +62,29 @@ class VideoSpec:
     """Length, size and rate of the videos that a model reads and writes."""
 
     frames: int = 61
-    """Pixel frames, 4k+1."""
+    """Pixel frames."""
     height: int = 480
-    """Rows in pixels, a multiple of 16 (VAE stride 8 x patch size 2)."""
+    """Rows in pixels."""
     width: int = 832
-    """Columns in pixels, a multiple of 16."""
+    """Columns in pixels."""
     fps: int = 16
     """Frames per second."""
 
     def __post_init__(self) -> None:
-        """Check 4k+1 frames and sizes in multiples of 16."""
-        check_frame_count(self.frames)
-        for name in ("height", "width"):
-            size = getattr(self, name)
-            if size < 16 or size % 16:
-                raise InputError(
-                    f"{name} {size} does not fit the model: it must be a multiple of 16 (8 pixels "
-                    f"a latent cell, 2 cells a token). Nearest: {max(16, round(size / 16) * 16)}."
-                )
-        check_counts({"fps": self.fps})
-
-    @property
-    def latent_shape(self) -> tuple[int, int, int]:
-        """Frames, rows and columns of the latents: ((f-1)/4+1, h/8, w/8)."""
-        return (
-            (self.frames - 1) // TEMPORAL_STRIDE + 1,
-            self.height // SPATIAL_STRIDE,
-            self.width // SPATIAL_STRIDE,
-        )
+        """Check that all are positive; what a model can encode is up to its `VideoGrid`."""
+        counts = ("frames", "height", "width", "fps")
+        check_counts({name: getattr(self, name) for name in counts})
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoGrid:
-    """Latent grid of a video: the strides of the codec and the patch of the denoiser.
+    """Latent grid of a video: the strides of the codec and the patch of the denoiser."""
 
-    The defaults are Wan 2.1's. They apply where no model is known, as to raw clips.
-    """
-
-    temporal_stride: int = 4
+    temporal_stride: int
     """Pixel frames per latent frame, after the first."""
-    spatial_stride: int = 8
+    spatial_stride: int
     """Pixels per latent cell, along each axis."""
-    patch: int = 2
+    patch: int
     """Latent cells per token, along each axis."""
 
     def check_frames(
@@ -125,7 +92,7 @@ class VideoGrid:
     ) -> None:
         """Raise `InputError` unless the codec can encode so many frames, 4k+1 for a stride of 4."""
         stride = self.temporal_stride
-        if frames < 1 or frames % stride != 1 % stride:
+        if frames < 1 or (frames - 1) % stride:
             below = max(1, (frames - 1) // stride * stride + 1)
             raise InputError(
                 f"{what} of {frames} frames cannot be encoded: the video VAE needs {stride}k+1 "
@@ -155,6 +122,10 @@ class VideoGrid:
             video.height // self.spatial_stride,
             video.width // self.spatial_stride,
         )
+
+
+WAN_GRID = VideoGrid(temporal_stride=4, spatial_stride=8, patch=2)
+"""Latent grid of Wan 2.1 and EgoSim, for clips and shards that name no other."""
 
 
 @dataclass(frozen=True, kw_only=True)

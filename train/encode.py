@@ -224,7 +224,12 @@ def _write(
     spec = encode.config.video
     for part, group in groupby(_read(source, jobs, encode.config, decoding), key=itemgetter(0)):
         with ShardWriter(
-            part, kind="latents", spec=spec, provenance=provenance, shard_bytes=2**62
+            part,
+            kind="latents",
+            spec=spec,
+            grid=encode.config.grid,
+            provenance=provenance,
+            shard_bytes=2**62,
         ) as writer:
             for _, clips in group:
                 fill = [clips[-1]] * (batch_size - len(clips))

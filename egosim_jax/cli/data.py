@@ -12,7 +12,7 @@ import tyro
 
 from egosim_jax.command import DONE, PARTIAL
 from egosim_jax.progress import track
-from egosim_jax.types import VideoSpec, check_counts
+from egosim_jax.types import WAN_GRID, VideoSpec, check_counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,9 @@ class Pack:
     def _spec(self) -> VideoSpec | None:
         if self.size is None:
             return None
-        return VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1])
+        spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1])
+        WAN_GRID.check(spec)
+        return spec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,10 +168,12 @@ class Make:
         from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         check_counts({"--workers": self.workers})
+        spec = VideoSpec(frames=self.frames, height=self.height, width=self.width, fps=self.fps)
+        WAN_GRID.check(spec)
         config = DatasetConfig(
             seeds=tuple(range(self.seed, self.seed + self.scenes)),
             clips=self.clips,
-            spec=VideoSpec(frames=self.frames, height=self.height, width=self.width, fps=self.fps),
+            spec=spec,
             kind=self.kind,
         )
         progress = make_shards(config, out=self.out, workers=self.workers)

@@ -29,11 +29,9 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import UInt8
 
-from egosim_jax.types import InputError, VideoGrid
+from egosim_jax.types import WAN_GRID, InputError, VideoGrid
 
 Packing = Literal["space", "time", "single", "observed"]
-WAN = VideoGrid()
-"""Latent grid of Wan 2.1 and EgoSim."""
 HALF_WHITE = 127
 """The last gray level that is not above one half of 255."""
 
@@ -43,7 +41,7 @@ def pack_mask(
     *,
     packing: Packing = "space",
     channels: int = 4,
-    grid: VideoGrid = WAN,
+    grid: VideoGrid = WAN_GRID,
     padding: Literal["to-4f+1", "none"] = "to-4f+1",
 ) -> UInt8[np.ndarray, "lf lh lw {channels}"]:
     """Return mask channels, 0 or 1, of a gray mask video (255 = not observed).

@@ -14,7 +14,7 @@ from egosim_jax.data.records import Record, RecordError, from_bytes
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.untrusted import quote
 from egosim_jax.io.video import decode_image, decode_video
-from egosim_jax.types import InputError, check_frame_count
+from egosim_jax.types import InputError, VideoGrid
 
 
 def check(folder: Path) -> Iterator[tuple[ShardInfo, list[str]]]:
@@ -64,7 +64,7 @@ def _record_problems(record: Record, manifest: Manifest) -> list[str]:
         problems.append(f"video_id {quote(video_id)} is not a valid file name")
     problems += _shape_problems(record.arrays, manifest.arrays)
     if manifest.kind == "videos":
-        problems += _video_problems(record.arrays)
+        problems += _video_problems(record.arrays, manifest.grid)
     else:
         problems += [
             f"{name} has values that are not finite"
@@ -92,7 +92,7 @@ def _shape_problems(arrays: Mapping[str, np.ndarray], wanted: Mapping[str, Array
     return problems
 
 
-def _video_problems(arrays: Mapping[str, np.ndarray]) -> list[str]:
+def _video_problems(arrays: Mapping[str, np.ndarray], grid: VideoGrid) -> list[str]:
     problems, counts = [], {}
     for name, array in arrays.items():
         try:
@@ -100,7 +100,7 @@ def _video_problems(arrays: Mapping[str, np.ndarray]) -> list[str]:
                 decode_image(array.tobytes(), name=name)
             else:
                 counts[name] = len(decode_video(array.tobytes(), name=name).frames)
-                check_frame_count(counts[name], what=name, fix="pack the clip again")
+                grid.check_frames(counts[name], what=name, fix="pack the clip again")
         except InputError as error:
             problems.append(str(error))
     if len(set(counts.values())) > 1:

@@ -36,7 +36,7 @@ from egosim_jax.io.video import (
     read_video,
     write_video,
 )
-from egosim_jax.types import InputError, Triplet, VideoSpec, check_frame_count
+from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +84,12 @@ def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
 
 
 def check_clip(
-    files: ClipFiles, spec: VideoSpec | None, *, start: int = 0, policy: Policy = "strict"
+    files: ClipFiles,
+    spec: VideoSpec | None,
+    *,
+    start: int = 0,
+    policy: Policy = "strict",
+    grid: VideoGrid = WAN_GRID,
 ) -> list[str]:
     """List the problems that would make `load_triplet` fail, without decoding the videos.
 
@@ -104,8 +109,8 @@ def check_clip(
     except InputError as error:
         problems.append(str(error))
     if policy == "strict":
-        problems += _length_problems(probed, start + (spec.frames if spec else 1))
-        problems += _size_problems(sizes)
+        problems += _length_problems(probed, start + (spec.frames if spec else 1), grid)
+        problems += _size_problems(sizes, grid.spatial_stride * grid.patch)
     return [f"{files.row} ({files.video_id}): {problem}" for problem in problems]
 
 
@@ -116,13 +121,14 @@ def load_triplet(
     start: int = 0,
     policy: Policy = "strict",
     decoding: Decoding = "accurate",
+    grid: VideoGrid = WAN_GRID,
 ) -> Triplet:
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
     The CLIP image is that of the clip for every window. Raises `InputError` with the problems of
     `check_clip`, or naming a damaged video.
     """
-    problems = check_clip(files, spec, start=start, policy=policy)
+    problems = check_clip(files, spec, start=start, policy=policy, grid=grid)
     if problems:
         raise InputError(listing(problems))
     arrays: dict[str, np.ndarray] = {
@@ -177,14 +183,14 @@ def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
     return videos
 
 
-def _length_problems(probed: dict[str, VideoInfo], needed: int) -> list[str]:
+def _length_problems(probed: dict[str, VideoInfo], needed: int, grid: VideoGrid) -> list[str]:
     counts = {name: info.frames for name, info in probed.items()}
     if len(set(counts.values())) > 1:
         return [f"the frame counts disagree: {_table(counts)}. (--lenient repeats or cuts)"]
     problems = []
     for count in set(counts.values()):
         try:
-            check_frame_count(count, what="a clip", fix="--lenient cuts or repeats frames")
+            grid.check_frames(count, what="a clip", fix="--lenient cuts or repeats frames")
         except InputError as error:
             problems.append(str(error))
         if count < needed:
@@ -195,14 +201,15 @@ def _length_problems(probed: dict[str, VideoInfo], needed: int) -> list[str]:
     return problems
 
 
-def _size_problems(sizes: dict[str, tuple[int, int]]) -> list[str]:
+def _size_problems(sizes: dict[str, tuple[int, int]], unit: int) -> list[str]:
     written = {name: f"{width}x{height}" for name, (height, width) in sizes.items()}
     if len(set(written.values())) > 1:
         return [f"the sizes disagree: {_table(written)}. (--lenient resizes each)"]
     return [
-        f"{width}x{height} pixels: width and height must be multiples of 16. (--lenient resizes)"
+        f"{width}x{height} pixels: width and height must be multiples of {unit}. (--lenient "
+        "resizes)"
         for height, width in set(sizes.values())
-        if height % 16 or width % 16
+        if height % unit or width % unit
     ]
 
 

@@ -145,7 +145,7 @@ def _check(arrays: Example, manifest: Manifest) -> None:
         if floating and not np.isfinite(array).all():
             raise InputError(f"{name} has values that are not finite (NaN or infinity).")
         if manifest.kind == "latents" and manifest.spec is not None and name in LATENTS:
-            have, want = array.shape[:-1], manifest.spec.latent_shape
+            have, want = array.shape[:-1], manifest.grid.latent_shape(manifest.spec)
             if have != want:
                 raise InputError(
                     f"{name} has {have} latent frames, rows and columns; expected {want}."

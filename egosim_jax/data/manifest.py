@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 from egosim_jax.data.records import DTYPES, current_name
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec
 
 RecordKind = Literal["videos", "frames", "latents"]
 
@@ -63,6 +63,8 @@ class Manifest:
     """Kind of the records."""
     spec: VideoSpec | None
     """Length and size of the decoded frames, or of the videos behind latents; None for videos."""
+    grid: VideoGrid = WAN_GRID
+    """Latent grid of the videos."""
     arrays: Mapping[str, ArrayInfo]
     """Arrays of every record, by name."""
     shards: tuple[ShardInfo, ...]
@@ -135,9 +137,16 @@ def _manifest(fields: Any, name: str) -> Manifest:
         raise TypeError("an array has an unsupported dtype")
     if spec is not None and not all(type(value) is int for value in spec.values()):
         raise TypeError("a field of the spec is not an integer")
+    grid = VideoGrid(**fields["grid"]) if "grid" in fields else WAN_GRID
+    if any(type(value) is not int or value < 1 for value in vars(grid).values()):
+        raise TypeError("a stride of the grid is not a positive integer")
+    video = None if spec is None else VideoSpec(**spec)
+    if video is not None:
+        grid.check(video)
     return Manifest(
         kind=kind,
-        spec=None if spec is None else VideoSpec(**spec),
+        spec=video,
+        grid=grid,
         arrays=arrays,
         shards=shards,
         provenance=dict(fields["provenance"].items()),

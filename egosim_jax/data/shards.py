@@ -41,7 +41,7 @@ from egosim_jax.data.records import DTYPES, Record, RecordError, from_bytes, to_
 from egosim_jax.io.atomic import LOCK, atomic_folder
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.untrusted import listing, quote_text
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec
 
 _OPTIONS = "group_size:1,uncompressed"
 
@@ -60,6 +60,7 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         *,
         kind: RecordKind,
         spec: VideoSpec | None = None,
+        grid: VideoGrid = WAN_GRID,
         provenance: Mapping[str, Any] | None = None,
         shard_bytes: int = 256 * 2**20,
         overwrite: bool = False,
@@ -67,7 +68,7 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         _check_place(folder, overwrite)
         self.folder = folder
         self.kind: RecordKind = kind
-        self.spec = spec
+        self.spec, self.grid = spec, grid
         self.provenance = dict(provenance or {})
         self.shard_bytes = shard_bytes
         self._place = ExitStack()
@@ -113,6 +114,7 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
                 Manifest(
                     kind=self.kind,
                     spec=self.spec,
+                    grid=self.grid,
                     arrays=self._arrays,
                     shards=tuple(self._shards),
                     provenance=self.provenance,

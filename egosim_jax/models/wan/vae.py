@@ -42,7 +42,7 @@ from egosim_jax.models.wan.vae_layers import (
     norm,
     offset,
 )
-from egosim_jax.types import SPATIAL_STRIDE, TEMPORAL_STRIDE, InputError, check_frame_count
+from egosim_jax.types import InputError, VideoGrid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +80,13 @@ class WanVAEConfig:
         if len(self.dim_mult) != 4 or len(self.temporal_downsample) != 3:
             raise InputError(
                 f"{len(self.dim_mult)} levels with {len(self.temporal_downsample)} steps between "
-                f"them do not give a stride of {SPATIAL_STRIDE} pixels: dim_mult needs 4 entries "
+                "them do not give a stride of 8 pixels: dim_mult needs 4 entries "
                 "and temporal_downsample 3."
             )
         if sum(self.temporal_downsample) != 2:
             raise InputError(
                 f"temporal_downsample {self.temporal_downsample} does not give a stride of "
-                f"{TEMPORAL_STRIDE} frames: exactly two entries must be True."
+                "4 frames: exactly two entries must be True."
             )
         for name in ("latent_mean", "latent_std"):
             if len(getattr(self, name)) != self.z_dim:
@@ -239,7 +239,9 @@ class WanVAE(nnx.Module):
             hidden, cache = self.encoder(frames, cache)
             return cache, hidden
 
-        groups = rearrange(video[:, 1:], "b (n f) h w c -> n b f h w c", f=TEMPORAL_STRIDE)
+        groups = rearrange(
+            video[:, 1:], "b (n f) h w c -> n b f h w c", f=self.config.temporal_stride
+        )
         _, rest = jax.lax.scan(step, cache, groups)
         rest = rearrange(rest, "n b f h w c -> b (n f) h w c")
         moments = self.to_moments(jnp.concatenate([first, rest], axis=1))
@@ -274,11 +276,12 @@ class WanVAE(nnx.Module):
                 "For uint8 frames: frames / 127.5 - 1."
             )
         _, frames, height, width, _ = video.shape
-        check_frame_count(frames)
-        if height % SPATIAL_STRIDE or width % SPATIAL_STRIDE:
+        time, space = self.config.temporal_stride, self.config.spatial_stride
+        VideoGrid(temporal_stride=time, spatial_stride=space, patch=1).check_frames(frames)
+        if height % space or width % space:
             raise InputError(
                 f"A video of {height} x {width} pixels cannot be encoded: rows and columns must "
-                f"be multiples of {SPATIAL_STRIDE}. Resize or crop it."
+                f"be multiples of {space}. Resize or crop it."
             )
 
 

@@ -111,7 +111,7 @@ def test_channels_in_time_hold_the_four_frames_that_a_latent_frame_encodes(frame
 
 
 def test_another_codec_has_other_cells(frames):
-    grid = VideoGrid(temporal_stride=2, spatial_stride=4)
+    grid = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
     packed = pack_mask(frames, grid=grid)
     assert packed.shape == (7, 8, 12, 4)
     np.testing.assert_array_equal(packed[3, 2, 5].reshape(2, 2), frames[6, 8:12:2, 20:24:2] > 127)

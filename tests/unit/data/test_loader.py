@@ -8,7 +8,7 @@ from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import DecodeWindow
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import WAN_GRID, InputError, VideoSpec
 
 RECORDS = 12
 
@@ -176,7 +176,7 @@ def test_too_many_damaged_records_stop_the_run_with_their_names(source, monkeypa
 
 def test_a_record_with_nan_or_latents_of_another_length_is_skipped_and_named(tmp_path):
     spec = VideoSpec(frames=5, height=16, width=32)
-    latents = np.zeros((*spec.latent_shape, 16), np.float32)
+    latents = np.zeros((*WAN_GRID.latent_shape(spec), 16), np.float32)
     nan, longer = latents.copy(), np.concatenate([latents, latents])
     nan[0, 0, 0, 0] = np.nan
     with ShardWriter(tmp_path, kind="latents", spec=spec) as writer:
