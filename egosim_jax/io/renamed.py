@@ -35,6 +35,7 @@ TYPES = {
     "RealTiny": "FromClips",
     "Tabletop": "FromTabletop",
     "FlowSchedule": "RectifiedFlow",
+    "Plan": "DatasetConfig",
 }
 """Classes of config.json: the old name, then today's."""
 RECIPES = ("RealTiny", "Tabletop")

@@ -70,7 +70,7 @@ def test_all_weights_are_tuned_and_generate_a_clip(folder, capsys):
     command = f"generate --config debug --weights {run / 'weights'} --out {folder / 'clip'}"
     assert egosim(command.split()) == 0
 
-    # It goes on, here at its end, with other arithmetic, but not with another objective.
+    # It resumes, here at its end, with other arithmetic, but not with another objective.
     assert tune(folder, "egosim_14b_fewshot", "full", "--dtype", "bfloat16") == 0
     assert len(losses(run)) == 4
     written = read_safetensors(run / "weights" / "dit.safetensors")["head.linear.kernel"]
@@ -110,7 +110,7 @@ def test_a_lora_is_tuned_shown_exported_and_merged(folder, capsys):
 
 
 def test_two_processes_tune_together_and_draw_what_they_share(folder):
-    """As the page on training shows it, each a program of its own."""
+    """As the page on training shows it, each a separate program."""
     address = free_local_address()
     out, latents = folder / "two", folder / "latents"
     command = f"egosim_14b_fewshot --config debug --weights {folder / 'weights'} --out {out} "

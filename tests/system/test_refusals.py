@@ -1,4 +1,4 @@
-"""What the system refuses: each command says so in one line, loses nothing, and goes on later."""
+"""Errors of the system: each command reports one line, loses nothing, and resumes later."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ COMMANDS = {
     "to-torch": "egosim-convert to-torch {made}/weights --config debug --out {out}",
 }
 LONG = {"experiment", "debug", "tabletop"}
-"""Minutes until they are complete: only that they end well is tested."""
+"""Commands that take minutes, of which only the end is tested."""
 FREE = {"evaluate": 1, "view": 1, "lora": 1, "look": 1}
-"""Pages of the full disk that are free; 8 for the others."""
+"""Free pages of the full disk by command; 8 for the others."""
 PASSING = (".lock", ".tmp", ".part", ".part.log")
-"""Files that are of use only until the command is complete."""
+"""Suffixes of files that exist only until the command is complete."""
 UNLOCKED = {"pack", "look", "evaluate", "view", "weights", "lora", "merge", "to-torch"}
-"""Those that put whole files or folders in place, so that two at once cannot spoil anything."""
+"""Commands that write atomically, so that two at once cannot corrupt anything."""
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writers.inputs(folder)
     snapshot.save(folder / "state", writers.state(0))
     for clip in "ab":
-        truth = read_video(folder / "clips0" / clip / "video.mp4")
-        write_video(folder / "generated" / f"{clip}.mp4", truth.frames, 16)
+        target = read_video(folder / "clips0" / clip / "video.mp4")
+        write_video(folder / "generated" / f"{clip}.mp4", target.frames, 16)
     return folder
 
 
@@ -177,7 +177,9 @@ def test_an_interrupt_is_one_line_that_says_how_to_go_on(name, made, tmp_path):
             continue
         assert process.returncode in (1, -signal.SIGINT), said
         assert "Traceback" not in said
-        told = [line for line in said.splitlines() if line.startswith("interrupted; to continue:")]
-        assert len(told) == 1, said
-        assert str(tmp_path / "out") in told[0]
+        printed = [
+            line for line in said.splitlines() if line.startswith("interrupted; to continue:")
+        ]
+        assert len(printed) == 1, said
+        assert str(tmp_path / "out") in printed[0]
         shutil.rmtree(tmp_path / "out", ignore_errors=True)

@@ -120,16 +120,14 @@ def opened(monkeypatch, tmp_path, **options) -> list[str]:
     return commands[0]
 
 
-def test_the_viewer_is_told_to_listen_on_the_loopback_unless_an_address_is_named(
-    monkeypatch, tmp_path
-):
+def test_the_viewer_listens_on_the_loopback_unless_an_address_is_given(monkeypatch, tmp_path):
     command = opened(monkeypatch, tmp_path)
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     command = opened(monkeypatch, tmp_path, host="192.0.2.1")
     assert command[command.index("--bind") + 1] == "192.0.2.1"
 
 
-def test_rerun_listens_where_it_is_told():
+def test_rerun_listens_on_the_given_address():
     port = free_local_address().rpartition(":")[2]
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--serve-grpc"]
     process = subprocess.Popen([*command, "--port", port], stderr=subprocess.DEVNULL)

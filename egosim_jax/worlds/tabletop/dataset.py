@@ -18,7 +18,7 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.records import from_bytes, to_bytes
 from egosim_jax.data.shards import ShardWriter, gather
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.run import open_folder, plain
+from egosim_jax.io.run import open_folder
 from egosim_jax.types import InputError, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, state_after, to_triplet
 
@@ -63,7 +63,7 @@ def make_shards(config: DatasetConfig, *, out: Path, workers: int) -> Iterator[i
     Finished scenes are kept in `out`/parts, so that the same call resumes an interrupted one.
     """
     parts = out / "parts"
-    open_folder(out, {**plain(config), "type": "Plan"})  # the type in folders of earlier versions
+    open_folder(out, config)
     if (out / MANIFEST).exists():
         shutil.rmtree(parts, ignore_errors=True)  # killed between writing shards and removing parts
         yield from config.seeds

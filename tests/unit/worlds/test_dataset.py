@@ -34,6 +34,14 @@ def test_a_finished_folder_is_not_written_again(tmp_path):
     assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
 
 
+def test_a_folder_of_an_earlier_version_is_continued(tmp_path):
+    config = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
+    list(make_shards(config, out=tmp_path, workers=1))
+    record = tmp_path / "config.json"
+    record.write_text(record.read_text("utf-8").replace("DatasetConfig", "Plan"), "utf-8")
+    assert list(make_shards(config, out=tmp_path, workers=1)) == [5]
+
+
 def test_every_fourth_mixed_scene_has_a_robot(tmp_path):
     config = DatasetConfig(seeds=(7, 8, 9), clips=1, spec=SPEC, kind="mixed")
     list(make_shards(config, out=tmp_path, workers=1))
