@@ -18,7 +18,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -39,6 +39,9 @@ from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, r
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog, average, mean_metrics
 from egosim_jax.train.update import Programs, Task, TrainState
 from egosim_jax.types import InputError
+
+Use = Literal["train", "peek", "validate"]
+"""Use of the batches of a data set."""
 
 
 def train(
@@ -133,7 +136,7 @@ class Run:
     def compile(self) -> None:
         """Compile the update, unless the run is at its end, and check the room for checkpoints."""
         if max(self.checkpoints.steps, default=0) < self.training.steps:
-            with self.clock.phase("data"), closing(self._batches(self.source, peek=True)) as peek:
+            with self.clock.phase("data"), closing(self._batches(self.source, "peek")) as peek:
                 example = self._to_devices(next(peek))
             self.clock.flops = self.task.flops(self.training.batch_size)
             with self.clock.phase("compile"):
@@ -202,7 +205,10 @@ class Run:
     def validate(self, shards: Path, step: int, state: TrainState) -> None:
         """Write the validation metrics, means over the batches of `shards`."""
         self.watchdog.rest()
-        with self.clock.phase("validate"), closing(self._batches(shards)) as batches:
+        with (
+            self.clock.phase("validate"),
+            closing(self._batches(ShardReader(shards), "validate")) as batches,
+        ):
             rows = [
                 jax.device_get(
                     self.programs.validate(state.eval_params, self.frozen, self._to_devices(batch))
@@ -244,8 +250,8 @@ class Run:
         )
         return jax.jit(create, out_shardings=sharding, donate_argnums=0)(params)
 
-    def _batches(self, source: ShardReader | Path, *, peek: bool = False) -> Loader:
-        return make_batches(source, self.task, self.training, self.sharding, peek=peek)
+    def _batches(self, source: ShardReader, use: Use = "train") -> Loader:
+        return make_batches(source, self.task, self.training, self.sharding, use)
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         return {
@@ -255,34 +261,27 @@ class Run:
 
 
 def make_batches(
-    source: ShardReader | Path,
-    task: Task,
-    training: TrainConfig,
-    sharding: Any,
-    *,
-    peek: bool = False,
+    source: ShardReader, task: Task, training: TrainConfig, sharding: Any, use: Use = "train"
 ) -> Loader:
     """Return an iterator over this process's shard of each batch.
 
-    Of a folder, which holds validation shards, it makes one pass in order, over the records that
-    fill a batch. With `peek` it starts no worker processes.
+    To train, it shuffles and repeats the records; `peek` is the same without worker processes. To
+    validate, it makes one pass in order, over the records that fill a batch.
     """
-    once = isinstance(source, Path)
-    reader = ShardReader(source) if isinstance(source, Path) else source
-    size = training.batch_size
+    once, size = use == "validate", training.batch_size
     if once:
         devices = parts("batch", sharding.mesh)
-        size = min(size, max(devices, len(reader) // devices * devices))
+        size = min(size, max(devices, len(source) // devices * devices))
     index, count = process_shard(sharding, size)
     return make_loader(
-        reader,
+        source,
         batch_size=size,
         seed=0 if once else training.seed,
         shuffle=not once,
         repeat=not once,
         process_index=index,
         process_count=count,
-        workers=0 if once or peek else training.workers,
+        workers=training.workers if use == "train" else 0,
         transform=task.examples(),
     )
 
