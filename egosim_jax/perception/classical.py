@@ -24,7 +24,7 @@ from egosim_jax.perception.pipeline import Observation, Pipeline
 from egosim_jax.perception.registry import register
 from egosim_jax.rendering.reference import render, splat
 from egosim_jax.rendering.skeleton import SKELETONS
-from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState
+from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState, check_counts
 
 
 def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
@@ -48,6 +48,10 @@ class HandMasks:
     """Flesh nearer to the camera than this is not drawn, in meters."""
     discs: int = 25
     """Number of discs that a capsule is drawn with."""
+
+    def __post_init__(self) -> None:
+        """Check that a capsule has discs."""
+        check_counts({"discs": self.discs})
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation

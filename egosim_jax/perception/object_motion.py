@@ -26,7 +26,7 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
-from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState
+from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
 
 PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
 """Joints that move as one rigid body: wrist and knuckles; all of a gripper."""
@@ -62,6 +62,12 @@ class TrackObjects:
     """Comparison of colors."""
     refinement: Refinement = field(default_factory=Refinement)
     """Refinement of the object's last pose."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers of points and the blur."""
+        check_counts({"min_points": self.min_points, "compared_points": self.compared_points})
+        if self.blur_px <= 0:
+            raise InputError(f"blur_px must be positive, not {self.blur_px}.")
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation

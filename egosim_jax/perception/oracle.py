@@ -21,7 +21,7 @@ class OracleConfig:
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
         """Return the pipeline; raise `InputError` without ground truth."""
-        if ground_truth is None:
+        if not ground_truth:
             raise InputError(
                 "Perception pipeline 'oracle' needs ground truth, and there is none here: use "
                 "'classical'. (--perception)"

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from egosim_jax.geometry import cameras_in_object_frame, transform
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.fuse import dilate
-from egosim_jax.types import Cameras, SceneState
+from egosim_jax.types import Cameras, InputError, SceneState, check_counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,15 @@ class Refinement:
     """Border around the object that is compared, as a fraction of the image width."""
     point_px: int = 2
     """Size of the drawn points in pixels."""
+
+    def __post_init__(self) -> None:
+        """Check that each round has both steps, and the counts."""
+        if len(self.steps_m) != len(self.steps_deg):
+            raise InputError(
+                f"steps_m {self.steps_m} and steps_deg {self.steps_deg} must have one step per "
+                "round each."
+            )
+        check_counts({"min_frames": self.min_frames, "point_px": self.point_px})
 
 
 @dataclass(frozen=True, kw_only=True)

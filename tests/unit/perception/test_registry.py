@@ -6,7 +6,7 @@ from dataclasses import FrozenInstanceError, dataclass
 import pytest
 
 from egosim_jax.io.fingerprint import fingerprint
-from egosim_jax.perception import Pipeline, registry
+from egosim_jax.perception import Observation, Pipeline, registry
 from egosim_jax.types import InputError
 
 BUILT_IN = {"classical": "", "oracle": "", "recorded": " --folder x --name clip"}
@@ -23,7 +23,7 @@ def clean(monkeypatch):
 def test_every_pipeline_is_built_from_a_command_line(name, options):
     config = registry.parse(name + options)
     assert isinstance(config, registry.get(name))
-    assert isinstance(config.build({}), Pipeline)
+    assert isinstance(config.build({0: Observation()}), Pipeline)
     with pytest.raises(FrozenInstanceError):
         config.anything = 1
 
@@ -33,6 +33,20 @@ def test_each_threshold_is_an_option():
     assert (config.motion.reach_m, config.hands.discs) == (0.05, 9)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--hands.discs 0", "discs must be at least 1"),
+        ("--motion.blur-px 0", "blur_px must be positive"),
+        ("--motion.refinement.steps-m 0.01", "one step per round"),
+    ],
+)
+def test_a_threshold_that_cannot_be_is_refused(options, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        registry.parse(f"classical {options}")
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_changed_threshold_changes_the_fingerprint_of_the_pipeline():
     texts = ["classical", "classical --motion.color.max-residual 91", "classical --hands.discs 9"]
     prints = [fingerprint(registry.parse(text).build()) for text in texts]
@@ -40,9 +54,10 @@ def test_a_changed_threshold_changes_the_fingerprint_of_the_pipeline():
     assert prints[0] == fingerprint(registry.parse("classical").build())
 
 
-def test_the_oracle_needs_ground_truth():
+@pytest.mark.parametrize("ground_truth", [None, {}])
+def test_the_oracle_needs_ground_truth(ground_truth):
     with pytest.raises(InputError, match="'oracle' needs ground truth"):
-        registry.parse("oracle").build()
+        registry.parse("oracle").build(ground_truth)
 
 
 @pytest.mark.parametrize("text", ["clasical", "", "nowhere_to_be_found:mine"])
