@@ -18,8 +18,9 @@ from pathlib import Path
 
 import tyro
 
+from egosim_jax.testing import write_latents
 from tests.training.killing import Run
-from tests.training.run_tiny import write_latents
+from tests.training.run_tiny import MODEL
 
 MOST, SAVE_EVERY = 6, 3
 """Updates at most before a kill, and between checkpoints."""
@@ -52,7 +53,7 @@ def main(kills: int = 20, processes: int = 1, seed: int = 0) -> int:
     steps, draw = (MOST + SAVE_EVERY) * kills + 10, random.Random(seed)
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "latents"
-        write_latents(data)
+        write_latents(data, MODEL)
         straight, killed = (
             Run(data, Path(folder) / name, steps=steps, save_every=SAVE_EVERY, processes=processes)
             for name in ("straight", "killed")

@@ -268,9 +268,10 @@ _HOLDERS = (ast.Module, ast.ClassDef)
 
 
 def markdown(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield what to reword in a Markdown file, outside its blocks of code."""
+    """Yield what to reword in a Markdown file, outside its code."""
     fenced = re.compile(r"^```.*?^```", re.M | re.S)
-    yield from phrases(fenced.sub(lambda m: "\n" * m[0].count("\n"), path.read_text()), 1)
+    text = fenced.sub(lambda m: "\n" * m[0].count("\n"), path.read_text())
+    yield from phrases(re.sub(r"`[^`\n]*`", "`0`", text), 1)
 
 
 if __name__ == "__main__":

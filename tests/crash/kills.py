@@ -45,8 +45,8 @@ COMMANDS = {
     "convert": "egosim_jax.convert weights ../torch --config debug",
 }
 """Each without its `--out out`; run in a folder beside those of `INPUTS`."""
-WEIGHTS = "from egosim_jax import configs, generator; from pathlib import Path; "
-WEIGHTS += "generator.Networks.random(configs.get('debug'), seed=0).save(Path('weights'))"
+WEIGHTS = "from egosim_jax import configs, testing; from pathlib import Path; "
+WEIGHTS += "testing.write_weights(Path('weights'), configs.get('debug'))"
 INPUTS = {
     "weights": ["-c", WEIGHTS],
     "torch": [

@@ -5,15 +5,14 @@ from pathlib import Path
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.networks import Networks
+from egosim_jax.testing import write_weights
 
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of `debug`."""
     folder = tmp_path_factory.mktemp("weights")
-    Networks.random(configs.get("debug"), seed=0).save(folder)
-    return folder
+    return write_weights(folder, configs.get("debug"))
 
 
 @pytest.hookimpl(tryfirst=True)

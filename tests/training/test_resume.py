@@ -3,14 +3,15 @@
 `python -m tests.endurance` does the same twenty times.
 """
 
+from egosim_jax.testing import write_latents
 from tests.training.killing import Run
-from tests.training.run_tiny import write_latents
+from tests.training.run_tiny import MODEL
 
 STEPS, SAVE_EVERY = 14, 4
 
 
 def test_a_killed_run_repeats_losses_and_weights_bit_for_bit(tmp_path):
-    write_latents(tmp_path / "latents")
+    write_latents(tmp_path / "latents", MODEL)
     whole, killed = (
         Run(tmp_path / "latents", tmp_path / name, steps=STEPS, save_every=SAVE_EVERY)
         for name in ("whole", "killed")

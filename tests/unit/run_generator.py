@@ -12,7 +12,8 @@ from egosim_jax.generator import Generator
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.networks import Networks
 from egosim_jax.sharding import MeshConfig, make_mesh
-from egosim_jax.types import InputError, Triplet, VideoSpec
+from egosim_jax.testing import random_triplet
+from egosim_jax.types import InputError, VideoSpec
 
 DEBUG = configs.get("debug")
 # 2 x 2 x 4 tokens and 8 heads, which eight devices divide.
@@ -28,32 +29,13 @@ MESHES = {(4, 2, 1): BATCH, (1, 1, 8): 1}
 """Data, fsdp, context; and how many clips: as many as there is room for, and one on all devices."""
 
 
-def triplet(seed: int) -> Triplet:
-    """Random pictures, so that nothing has to be rendered."""
-    rng = np.random.default_rng(seed)
-    video = CONFIG.video
-    frames = (video.frames, video.height, video.width)
-
-    def draw(*shape: int) -> np.ndarray:
-        return rng.integers(0, 256, shape).astype(np.uint8)
-
-    return Triplet(
-        video_id=f"clip_{seed}",
-        prompt=f"take cup {seed}",
-        prior=draw(*frames, 3),
-        mask=255 * draw(*frames).astype(bool).astype(np.uint8),
-        hands=draw(*frames, 3),
-        first_frame=draw(*frames[1:], 3),
-    )
-
-
 def main(folder: Path) -> None:
     """Generate the same clips everywhere."""
     networks = Networks.random(CONFIG, seed=0)
     head = networks.dit.head.linear.kernel
     head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)  # not zero
     networks.save(folder)
-    triplets = [triplet(seed) for seed in range(BATCH)]
+    triplets = [random_triplet(CONFIG.video, seed) for seed in range(BATCH)]
     found = {}
     for sizes, count in {None: BATCH, **MESHES}.items():
         mesh = sizes and make_mesh(

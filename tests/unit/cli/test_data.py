@@ -112,7 +112,7 @@ def test_a_shard_of_no_size_is_refused(clips, out):
 
 
 def test_look_draws_the_first_clip_of_each_value_of_a_column(make_clips, out, tmp_path):
-    Pack(metadata=make_clips(count=5), out=out, size=(16, 32), num_frames=5).run()
+    Pack(metadata=make_clips(clips=5), out=out, size=(16, 32), num_frames=5).run()
     sheet = tmp_path / "sheet.png"
     look = Look(shards=out, out=sheet, by=("split",), streams=("target", "prior"), moments=3)
     assert look.run() == DONE

@@ -10,13 +10,13 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.command import USAGE
 from egosim_jax.data.clips import write_clips
-from egosim_jax.networks import Networks
+from egosim_jax.testing import write_weights
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 
 def test_a_lora_of_other_weights_is_refused(tmp_path, capsys):
-    Networks.random(configs.get("debug"), seed=0).save(tmp_path / "weights")
+    write_weights(tmp_path / "weights", configs.get("debug"))
     adapter = tmp_path / "lora.safetensors"
     save_file({"a": np.zeros(3, np.float32)}, adapter, metadata={"base_sha256": "5" * 64})
     options = ["--weights", str(tmp_path / "weights"), "--lora", str(adapter)]

@@ -14,7 +14,7 @@ from egosim_jax.command import ExitCode
 from egosim_jax.convert.commands import ToTorch
 from egosim_jax.io import hub
 from egosim_jax.io.untrusted import read_json
-from egosim_jax.networks import Networks
+from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError
 from tests.hub import COMMIT, Hub, serve
 
@@ -26,7 +26,7 @@ def served(tmp_path, monkeypatch):
     """A release of `debug` with the files of EgoSim-14B."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     ours, folder = tmp_path / "ours", tmp_path / "hub"
-    Networks.random(configs.get("debug"), seed=0).save(ours)
+    write_weights(ours, configs.get("debug"))
     ToTorch(weights=ours, config="debug", out=folder).run()
     for name in filter(lambda name: name.endswith(".pth"), FILES):
         written = (folder / name).with_suffix(".safetensors")

@@ -106,7 +106,7 @@ def test_strict_refuses_frame_counts_that_disagree(files):
 
 
 def test_strict_refuses_a_count_that_is_not_4k_plus_1(make_clips):
-    (files,) = read_metadata(make_clips(count=1, frames=10))
+    (files,) = read_metadata(make_clips(clips=1, frames=10))
     with pytest.raises(InputError, match=r"10 frames cannot be encoded.*Nearest: 9 or 13"):
         load_triplet(files, NATIVE)
 
@@ -123,7 +123,7 @@ def test_strict_refuses_sizes_that_disagree(files):
 
 
 def test_strict_refuses_sizes_that_are_not_multiples_of_16(make_clips):
-    (files,) = read_metadata(make_clips(count=1, height=24))
+    (files,) = read_metadata(make_clips(clips=1, height=24))
     with pytest.raises(InputError, match="48x24 pixels: width and height must be multiples of 16"):
         load_triplet(files, NATIVE)
 
