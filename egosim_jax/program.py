@@ -11,7 +11,7 @@ import numpy as np
 from flax import nnx
 from jax.sharding import Mesh, PartitionSpec
 
-from egosim_jax.io.executables import kept, share_with_jax
+from egosim_jax.io.executables import cached_compile, share_with_jax
 from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
 
 Module = TypeVar("Module")
@@ -58,7 +58,7 @@ class Program:
             compiled = (
                 compile()
                 if self._about is None
-                else kept(self._about, (self._params, given), compile)
+                else cached_compile(self._about, (self._params, given), compile)
             )
         self._compiled[_signature(args)] = compiled
         return compiled

@@ -1,9 +1,9 @@
-"""Programs that were compiled at an earlier start, ready to run without tracing or compiling.
+"""Persistent cache of compiled functions, which then run without tracing or compiling.
 
-They lie in a `PrivateCache`, because reading one runs code that is in it. A program is found again
-by the digest of all that it depends on: its name and config, the shapes of what it is given, the
-devices, the versions of the libraries, XLA's flags, and our own code. What jax compiles besides
-lies in another (`share_with_jax`).
+The files are in a `PrivateCache`, because reading one runs native code in it. Its key is the digest
+of everything that the compiled function depends on: its name and config, the shapes of its
+arguments, the devices, the versions of the libraries, XLA's flags, and the modules of this package
+that run while it is traced. jax's own compilation cache is in another one (`share_with_jax`).
 """
 
 from __future__ import annotations
@@ -27,48 +27,52 @@ from egosim_jax.io.private import PrivateCache
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
 VARIABLES = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
-FOLDER, MOST = "executables", 64
-"""Name of the cache, and how many programs it keeps."""
-OF_JAX, MOST_OF_JAX = "jax", 1024
-"""Name of the cache of what jax compiles by itself, and how many programs it keeps."""
+TRACED = (
+    "conditioning", "diffusion", "models", "generator.py", "networks.py", "program.py",
+    "sharding.py", "types.py",
+)  # fmt: skip
+"""Modules that run while a function is traced, and so determine what is compiled."""
+FOLDER, MAX_FILES = "executables", 64
+"""Name of the cache, and its maximum number of compiled functions."""
+JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
+"""Name of jax's own compilation cache, and its maximum number of files."""
 
 
-def kept(about: Any, given: Any, compile: Callable[[], Any]) -> Any:
-    """The compiled program that `about` names, of arrays or shapes `given`, compiled only once.
+def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
+    """Return the compiled function of this key and these arguments, from the cache if it is there.
 
-    Where nothing can be kept, because the folder is not the user's alone or several processes share
-    the program, it is compiled.
+    `args` are arrays or shapes. Without a private folder, or with several processes, it is compiled
+    and not stored.
     """
     from jax.experimental import serialize_executable
 
-    if jax.process_count() > 1 or (cache := PrivateCache.open(FOLDER, most=MOST)) is None:
-        return compile()
-    name = _digest(about, given)
+    if jax.process_count() > 1 or (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
+        return compile_fn()
+    name = _digest(key, args)
     if (data := cache.get(name)) is not None:
         try:
             return serialize_executable.deserialize_and_load(*pickle.loads(data))  # noqa: S301
-        except Exception as error:  # whatever is wrong with it, it can be made again
+        except Exception as error:  # whatever is wrong with it, it can be compiled again
             warnings.warn(f"{name} cannot be used and is compiled again: {error}", stacklevel=2)
-    with _anew():
-        compiled = compile()
+    with _without_jax_cache():
+        compiled = compile_fn()
     try:
         cache.put(name, pickle.dumps(serialize_executable.serialize(compiled)))
-    except (ValueError, NotImplementedError) as error:  # programs that cannot be serialized
-        warnings.warn(f"{name} was not kept: {error}", stacklevel=2)
+    except (ValueError, NotImplementedError) as error:  # cannot be serialized
+        warnings.warn(f"{name} was not stored: {error}", stacklevel=2)
     return compiled
 
 
 def share_with_jax() -> None:
-    """Let jax keep what it compiles in a `PrivateCache`, too, unless its user chose a folder.
+    """Store jax's own compilation cache in a `PrivateCache`, unless the user chose a folder.
 
-    Its own files have no checksum where it compresses with zstandard, and it takes them from
-    anybody.
+    Without it, jax's files have no checksum if zstandard compresses them, and any user's are read.
     """
     from jax._src import compilation_cache
 
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
-    if (cache := PrivateCache.open(OF_JAX, most=MOST_OF_JAX)) is None:
+    if (cache := PrivateCache.open(JAX_FOLDER, most=JAX_MAX_FILES)) is None:
         return
     original = compilation_cache.get_file_cache
 
@@ -89,16 +93,16 @@ def share_with_jax() -> None:
 
 
 @contextmanager
-def _anew() -> Iterator[None]:
-    """Compile without jax's own cache: a CPU's program that comes from it cannot be written again.
+def _without_jax_cache() -> Iterator[None]:
+    """Compile without jax's own cache: CPU executables loaded from it cannot be serialized again.
 
-    What was written would lack the program's functions, and say so when it is run.
+    The file would lack their functions, and fail when it is run.
     """
     from jax.experimental.compilation_cache import compilation_cache
 
     enabled = jax.config.values["jax_enable_compilation_cache"]
     jax.config.update("jax_enable_compilation_cache", False)
-    compilation_cache.reset_cache()  # which remembers whether it is used
+    compilation_cache.reset_cache()  # it stores whether it is used
     try:
         yield
     finally:
@@ -106,13 +110,13 @@ def _anew() -> Iterator[None]:
         compilation_cache.reset_cache()
 
 
-def _digest(about: Any, given: Any) -> str:
-    leaves = jax.tree_util.tree_flatten_with_path(given)[0]
+def _digest(key: Any, args: Any) -> str:
+    leaves = jax.tree_util.tree_flatten_with_path(args)[0]
     devices = jax.devices()
     parts = {
-        "about": repr(about),
-        "given": [
-            [jax.tree_util.keystr(path), leaf.shape, str(leaf.dtype), _where(leaf)]
+        "key": repr(key),
+        "args": [
+            [jax.tree_util.keystr(path), leaf.shape, str(leaf.dtype), _sharding(leaf)]
             for path, leaf in leaves
         ],
         "devices": [devices[0].device_kind, len(devices), devices[0].client.platform_version],
@@ -126,14 +130,14 @@ def _digest(about: Any, given: Any) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _where(leaf: Any) -> str:
+def _sharding(leaf: Any) -> str:
     sharding = getattr(leaf, "sharding", None)
     return "" if sharding is None else f"{sharding} {getattr(sharding, 'mesh', '')}"
 
 
 @functools.cache
 def _processor() -> str:
-    """What this processor can do: a home may be shared by machines of several kinds."""
+    """Return the CPU's feature flags: machines of several kinds may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:
@@ -143,8 +147,10 @@ def _processor() -> str:
 
 @functools.cache
 def _code() -> str:
-    """Of this package, whose functions are what is compiled."""
+    """Return the digest of the modules that run while a function is traced."""
     digest = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*.py")):
-        digest.update(path.read_bytes())
+    for name in TRACED:
+        path = PACKAGE / name
+        for module in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            digest.update(module.read_bytes())
     return digest.hexdigest()

@@ -274,7 +274,7 @@ def _kept(place: Path) -> tuple[Any, int]:
 
     os.environ["XDG_CACHE_HOME"] = str(place)
     given = (jax.ShapeDtypeStruct((3,), jnp.float32),)
-    return executables.kept("double", given, compile), len(compiled)
+    return executables.cached_compile("double", given, compile), len(compiled)
 
 
 def _read_kept(place: Path) -> Read:

@@ -1,17 +1,21 @@
-"""Compiled programs are found again, and only by those who may."""
+"""Compiled functions are found in the cache, and only by their user."""
 
 import os
 import random
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+from egosim_jax import configs
+from egosim_jax.generator import Generator
 from egosim_jax.io import executables, private
-from egosim_jax.io.executables import kept
+from egosim_jax.io.executables import cached_compile
+from egosim_jax.networks import Networks
 
 GIVEN = (jax.ShapeDtypeStruct((3,), jnp.float32),)
 WIDE = jax.ShapeDtypeStruct((64, 64), jnp.float32)
@@ -25,7 +29,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def double():
-    """What compiles a program, and how often it did."""
+    """A function that compiles, and counts its calls."""
 
     def compile():
         compile.times += 1
@@ -35,8 +39,8 @@ def double():
     return compile
 
 
-def test_a_program_is_compiled_once(folder, double):
-    first, second = (kept("double", GIVEN, double) for _ in range(2))
+def test_a_function_is_compiled_once(folder, double):
+    first, second = (cached_compile("double", GIVEN, double) for _ in range(2))
     x = jnp.arange(3.0)
     assert double.times == 1
     assert (first(x) == 2 * x).all()
@@ -44,8 +48,8 @@ def test_a_program_is_compiled_once(folder, double):
     assert second.out_info.shape == (3,)
 
 
-def test_the_folder_is_the_users_alone(folder, double):
-    kept("double", GIVEN, double)
+def test_the_folder_is_private(folder, double):
+    cached_compile("double", GIVEN, double)
     assert folder.stat().st_mode & 0o777 == 0o700
     assert len(list(folder.iterdir())) == 1
 
@@ -55,7 +59,7 @@ def test_a_folder_that_others_can_write_is_not_used(folder, double):
     folder.chmod(0o770)
     for _ in range(2):
         with pytest.warns(UserWarning, match="others may use it"):
-            kept("double", GIVEN, double)
+            cached_compile("double", GIVEN, double)
     assert double.times == 2
     assert not list(folder.iterdir())
 
@@ -70,33 +74,55 @@ def test_a_folder_that_others_can_write_is_not_used(folder, double):
     ],
     ids=["flags", "code", "processor", "versions"],
 )
-def test_what_a_program_depends_on_tells_it_from_others(folder, double, change, monkeypatch):
-    kept("double", GIVEN, double)
+def test_each_dependency_is_part_of_the_key(folder, double, change, monkeypatch):
+    cached_compile("double", GIVEN, double)
     change(monkeypatch)
-    kept("double", GIVEN, double)
+    cached_compile("double", GIVEN, double)
     assert double.times == 2
 
 
-def test_another_config_or_shape_is_another_program(folder, double):
+def test_every_module_that_runs_while_tracing_is_part_of_the_key():
+    config = configs.get("debug")
+    generator = Generator(config, Networks.abstract(config))
+    files = set()
+
+    def record(frame, event, _):
+        if event == "call":
+            files.add(frame.f_code.co_filename)
+
+    jax.clear_caches()
+    for _, function, args in generator.programs(1):
+        sys.setprofile(record)
+        try:
+            function.trace(*args)
+        finally:
+            sys.setprofile(None)
+    package = executables.PACKAGE.resolve()
+    ran = {Path(file).resolve() for file in files}
+    ours = {path.relative_to(package) for path in ran if path.is_relative_to(package)}
+    assert {path.parts[0] for path in ours} <= set(executables.TRACED)
+
+
+def test_another_key_or_shape_is_another_function(folder, double):
     other = (jax.ShapeDtypeStruct((4,), jnp.float32),)
-    for about, given in (("double", GIVEN), ("half", GIVEN), ("double", other)):
-        kept(about, given, double)
+    for key, args in (("double", GIVEN), ("half", GIVEN), ("double", other)):
+        cached_compile(key, args, double)
     assert double.times == 3
 
 
-def test_a_damaged_file_is_made_again(folder, double):
-    kept("double", GIVEN, double)
+def test_a_damaged_file_is_compiled_again(folder, double):
+    cached_compile("double", GIVEN, double)
     (path,) = folder.iterdir()
     path.write_bytes(path.read_bytes()[:100])
     with pytest.warns(UserWarning, match="damaged"):
-        kept("double", GIVEN, double)
+        cached_compile("double", GIVEN, double)
     assert double.times == 2
-    kept("double", GIVEN, double)
+    cached_compile("double", GIVEN, double)
     assert double.times == 2
 
 
 def test_every_flipped_bit_is_noticed_before_anything_is_loaded(folder, double, monkeypatch):
-    kept("double", GIVEN, double)
+    cached_compile("double", GIVEN, double)
     (path,) = folder.iterdir()
     generator = random.Random(0)
     monkeypatch.setattr(executables.pickle, "loads", lambda data: pytest.fail("it was loaded"))
@@ -105,7 +131,7 @@ def test_every_flipped_bit_is_noticed_before_anything_is_loaded(folder, double, 
         damaged[generator.randrange(len(damaged))] ^= 1 << generator.randrange(8)
         path.write_bytes(damaged)
         with pytest.warns(UserWarning, match="damaged"):
-            kept("double", GIVEN, double)
+            cached_compile("double", GIVEN, double)
         assert double.times == case + 2
         assert path.read_bytes() != damaged
 
@@ -122,13 +148,13 @@ def test_every_flipped_bit_is_noticed_before_anything_is_loaded(folder, double, 
     ids=["mode", "hard link", "symbolic link", "pipe", "owner"],
 )
 def test_a_file_that_others_could_have_written_is_not_loaded(folder, double, change, why):
-    kept("double", GIVEN, double)
+    cached_compile("double", GIVEN, double)
     (path,) = folder.iterdir()
     change(path)
     with pytest.warns(UserWarning, match=why):
-        kept("double", GIVEN, double)
+        cached_compile("double", GIVEN, double)
     assert double.times == 2
-    kept("double", GIVEN, double)
+    cached_compile("double", GIVEN, double)
     assert double.times == 2
     assert path.stat().st_mode & 0o777 == 0o600
 
@@ -143,10 +169,10 @@ def test_a_file_that_others_could_have_written_is_not_loaded(folder, double, cha
     ids=["owner", "link", "above"],
 )
 def test_a_folder_that_others_could_change_is_not_used(folder, double, change, why):
-    kept("double", GIVEN, double)
+    cached_compile("double", GIVEN, double)
     change(folder)
     with pytest.warns(UserWarning, match=why):
-        kept("double", GIVEN, double)
+        cached_compile("double", GIVEN, double)
     assert double.times == 2
 
 
@@ -178,35 +204,35 @@ def test_jaxs_own_cache_follows_the_same_policy(tmp_path):
         return done.stdout, done.stderr
 
     folder = tmp_path / "egosim_jax" / "jax"
-    want, said = run()
-    assert not said
+    want, stderr = run()
+    assert not stderr
     files = {path: path.read_bytes() for path in folder.iterdir()}
     assert files
     assert all(path.stat().st_mode & 0o777 == 0o600 for path in files)
     assert run() == (want, "")
     for path, data in files.items():
         path.write_bytes(data[:-40] + bytes([data[-40] ^ 1]) + data[-39:])
-    got, said = run()
+    got, stderr = run()
     assert got == want
-    assert "damaged" in said
+    assert "damaged" in stderr
     assert run() == (want, "")
     folder.chmod(0o777)
-    got, said = run()
+    got, stderr = run()
     assert got == want
-    assert "others may use it" in said
+    assert "others may use it" in stderr
 
 
-def test_the_oldest_are_forgotten(folder, double, monkeypatch):
-    monkeypatch.setattr(executables, "MOST", 2)
+def test_the_oldest_are_deleted(folder, double, monkeypatch):
+    monkeypatch.setattr(executables, "MAX_FILES", 2)
     for number in range(4):
-        kept(number, GIVEN, double)
+        cached_compile(number, GIVEN, double)
     assert len(list(folder.iterdir())) == 2
-    kept(3, GIVEN, double)
+    cached_compile(3, GIVEN, double)
     assert double.times == 4
 
 
-def test_what_jaxs_own_cache_has_is_kept_whole(folder, tmp_path):
-    """A CPU's program that was read from there would be written without its functions."""
+def test_what_jaxs_own_cache_has_is_stored_completely(folder, tmp_path):
+    """CPU executables loaded from it would be written without their functions."""
 
     def compile():
         return jax.jit(lambda x: jnp.sort(jnp.sin(x) @ jnp.cos(x))).lower(WIDE).compile()
@@ -221,8 +247,8 @@ def test_what_jaxs_own_cache_has_is_kept_whole(folder, tmp_path):
         compile()
         assert list((tmp_path / "jax").glob("*-cache"))
         jax.clear_caches()
-        want = kept("sorted", (WIDE,), compile)(x)
-        assert (kept("sorted", (WIDE,), compile)(x) == want).all()
+        want = cached_compile("sorted", (WIDE,), compile)(x)
+        assert (cached_compile("sorted", (WIDE,), compile)(x) == want).all()
     finally:
         jax.config.update(least, before[0])
         jax.config.update("jax_compilation_cache_dir", before[1])
