@@ -24,6 +24,9 @@ from egosim_jax.state import snapshot
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Clip, SceneState, check_seed
 
+OUTPUTS = ("clip_*/*",)
+"""Globs of files that only a journaled simulation writes."""
+
 
 class Rollout:
     """A simulation in a folder, which can be interrupted and resumed."""
@@ -49,7 +52,7 @@ class Rollout:
         """
         check_seed(seed, name="seed")
         with lock_folder(self.folder):
-            journal = Journal(self.folder, outputs=("clip_*/*",))
+            journal = Journal(self.folder, outputs=OUTPUTS)
             journal.require("run", self._made_of(state, seed, first_frame))
             for number, action in enumerate(actions, start=1):
                 journal.require(f"{number} action", {"action": fingerprint(action)})

@@ -40,7 +40,7 @@ class Step:
     view: View
     """State before the step, seen along the action's camera path."""
     clip: Clip
-    """Generated video."""
+    """Clip generated from the view and the action."""
     state: SceneState
     """State after the step."""
 

@@ -384,3 +384,43 @@ class Perceived:
     """Poses of tracked objects; the first frame's is that in the state before."""
     interacted_frames: Mapping[int, Bool[np.ndarray, " f"]]
     """Frames in which hands acted on each object; only objects with at least one."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class GroundTruth:
+    """Ground truth of one clip; None where it is unknown."""
+
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """Recorded or ray-cast video of the action."""
+    depth_m: Float32[np.ndarray, "f h w"] | None = None
+    """Depth along the camera's z axis in meters; infinite where a ray hits nothing."""
+    object_ids: Int32[np.ndarray, "f h w"] | None = None
+    """Object instance of each pixel: 0 background, negative hands and arms, else the state's."""
+    motions: Mapping[int, Float[np.ndarray, "f 4 4"]] | None = None
+    """Rigid motion in the world of each object that moves, relative to its pose in frame 0."""
+    target_id: int | None = None
+    """Object that the hands act on."""
+
+    def __post_init__(self) -> None:
+        """Check that the frames are a video and that everything else fits them."""
+        check_video("The ground truth", self.frames)
+        shape = self.frames.shape[:3]
+        for name, dtype in (("depth_m", np.float32), ("object_ids", np.int32)):
+            value = getattr(self, name)
+            if value is not None and (value.shape != shape or value.dtype != dtype):
+                raise InputError(
+                    f"Ground truth {name} is {value.dtype} {value.shape}: it must be "
+                    f"{np.dtype(dtype)} {shape}, one value per pixel of the frames."
+                )
+        if self.depth_m is not None and not (self.depth_m > 0).all():
+            raise InputError(
+                "Ground truth depth_m has values that are not positive: depth is in meters along "
+                "the camera's z axis, and infinite where it is unknown."
+            )
+        for number, motion in (self.motions or {}).items():
+            if np.shape(motion) != (shape[0], 4, 4) or not np.isfinite(motion).all():
+                raise InputError(
+                    f"The ground-truth motion of object {number} must be finite and have shape "
+                    f"({shape[0]}, 4, 4), not {np.shape(motion)}."
+                )

@@ -15,6 +15,7 @@ import tyro
 from egosim_jax import command
 from egosim_jax.cli.data import Data
 from egosim_jax.cli.doctor import Doctor
+from egosim_jax.cli.episode import Episode
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Experiment
 from egosim_jax.cli.generate import Generate
@@ -27,6 +28,7 @@ Commands = (
     Annotated[Generate, tyro.conf.subcommand("generate")]
     | Annotated[Preflight, tyro.conf.subcommand("preflight")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Episode, tyro.conf.subcommand("episode")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Data, tyro.conf.subcommand("data")]

@@ -8,19 +8,20 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 
-from egosim_jax.cli.simulate import DEFINITIONS, MEASURES, backend, score
 from egosim_jax.experiments.config import Continuous
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import read_json
+from egosim_jax.metrics.loop import DEFINITIONS, MEASURES, score_step
 from egosim_jax.metrics.report import Summary, print_table, summarize
+from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rollout import Rollout
 from egosim_jax.simulator import Simulator
 from egosim_jax.types import check_counts
-from egosim_jax.worlds.tabletop import make_sequence, to_action
+from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
 Scores = Sequence[Mapping[str, float]]
 """Scores of one sequence, clip by clip."""
@@ -60,20 +61,29 @@ def _simulate(settings: Continuous, generator: Generator, method: str, seed: int
     path = folder / "scores.json"
     if path.exists():
         return read_json(path)
-    clips = list(make_sequence(seed, spec=generator.config.video, clips=settings.clips))
-    name = METHODS[method]
+    video, name = generator.config.video, METHODS[method]
+    clips = list(make_sequence(seed, spec=video, clips=settings.clips))
+    episode = to_episode(clips, fps=video.fps)
     simulator = Simulator(
         generator=generator,
-        perception=None if name is None else backend(name, clips),
-        fps=generator.config.video.fps,
+        perception=registry.parse(name).build(episode.observations()) if name else None,
+        fps=video.fps,
     )
     steps = Rollout(simulator, folder).run(
-        clips[0].state,
-        [to_action(clip) for clip in clips],
-        seed=seed,
-        first_frame=clips[0].first.colors,
+        episode.state, episode.actions, seed=seed, first_frame=episode.first_frame
     )
-    scores = [score(step, clip) for step, clip in zip(steps, clips, strict=True)]
+    scores = [
+        score_step(
+            step.clip.frames,
+            ground_truth,
+            cameras=action.cameras,
+            before=step.view,
+            after=simulator.render(step.state, action),
+        )
+        for step, action, ground_truth in zip(
+            steps, episode.actions, episode.ground_truth, strict=True
+        )
+    ]
     write_json(path, scores)
     return scores
 

@@ -8,7 +8,6 @@ from itertools import count, islice
 
 import numpy as np
 
-from egosim_jax.cli.simulate import backend
 from egosim_jax.experiments.config import Update
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generator import Generator
@@ -16,11 +15,12 @@ from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.io.run import write_json
 from egosim_jax.metrics.report import print_table, summarize
 from egosim_jax.metrics.update import ON_SURFACE_M, object_accuracy, symmetric_distance
+from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts
-from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action
+from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action, to_ground_truth
 
 LARGE = VideoSpec(frames=17, height=480, width=832, fps=8)
 """Clips of the official size."""
@@ -81,7 +81,7 @@ def _rows(
 
 def evaluate(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, float]:
     """Score the state after perceiving and fusing some frames of a clip."""
-    perceive = backend(perception, [clip])
+    perceive = registry.parse(perception).build({clip.number: to_ground_truth(clip)})
     before = clip.state
     perceived = perceive(Clip(frames=frames, fps=LARGE.fps), to_action(clip), before)
     after = fuse(before, perceived)

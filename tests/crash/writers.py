@@ -27,7 +27,6 @@ from PIL import Image
 from safetensors.numpy import save_file
 
 from egosim_jax import configs
-from egosim_jax.cli import view
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.data.clips import write_clips
@@ -43,6 +42,7 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import read_lines
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.networks import Networks
+from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.state import snapshot
 from egosim_jax.train import encode
 from egosim_jax.types import SceneState, Triplet, VideoSpec
@@ -309,7 +309,7 @@ WRITERS = {
         _file("state.ply", lambda path: _sha256(snapshot.read_ply(path).points_m)),
     ),
     "portrait": Writer(
-        lambda place, _, version: view.write_portrait(place / "a.png", state(version), up="z"),
+        lambda place, _, version: write_portrait(place / "a.png", state(version), up="z"),
         _file("a.png", _picture),
     ),
     "sheet": Writer(_sheet, _file("sheet.png", _picture)),

@@ -14,6 +14,7 @@ from egosim_jax.cli import view
 from egosim_jax.cli.__main__ import main
 from egosim_jax.experiments import update
 from egosim_jax.io.video import probe_video
+from egosim_jax.rendering.portrait import portrait
 from egosim_jax.state.snapshot import load, read_ply
 from egosim_jax.types import SceneState, VideoSpec
 
@@ -55,7 +56,7 @@ def test_the_recording_has_the_scene_the_hands_and_the_pictures(simulated):
     printed = subprocess.run(
         [*command, str(simulated / "simulation.rrd")], capture_output=True, text=True, check=True
     ).stdout
-    for entity in ("/world/state", "/world/hands/0", "/world/camera", "/view", "/truth"):
+    for entity in ("/world/state", "/world/hands/0", "/world/camera", "/view", "/ground_truth"):
         assert entity in printed
 
 
@@ -109,7 +110,7 @@ def test_what_is_up_is_drawn_above(up, top):
         last_seen=np.zeros(1000, np.int32),
         intrinsics_px=np.eye(3),
     )
-    for picture in view.portrait(state, up=up):
+    for picture in portrait(state, up=up):
         red, green = (np.argwhere(picture[..., k] > 0)[:, 0].mean() for k in (0, 1))
         assert red < green - 50
 

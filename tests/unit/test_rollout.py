@@ -117,7 +117,7 @@ def test_a_run_killed_after_any_phase_ends_the_same(tmp_path, phase):
 
 @dataclass
 class Named:
-    """A part of the loop with a fingerprint of its own that fails if it is called again."""
+    """A part of the loop with a fixed fingerprint that fails if it is called again."""
 
     part: object
     broken: bool = False

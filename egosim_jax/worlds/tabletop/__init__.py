@@ -7,18 +7,19 @@ the clip before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from egosim_jax.episode import Episode
 from egosim_jax.geometry import look_at, pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.reference import draw_hands, render
-from egosim_jax.types import Action, Cameras, Kind, SceneState, Triplet, VideoSpec
+from egosim_jax.types import Action, Cameras, GroundTruth, Kind, SceneState, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.bodies import Part
@@ -240,6 +241,27 @@ def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
 def to_action(clip: TabletopClip) -> Action:
     """Return cameras, hand joints and prompt of the clip."""
     return Action(cameras=clip.cameras, joints_m=clip.joints_m, kind=clip.kind, prompt=clip.caption)
+
+
+def to_episode(clips: Sequence[TabletopClip], *, fps: int) -> Episode:
+    """Return a sequence as an episode with ground truth."""
+    truths = [to_ground_truth(clip) for clip in clips]
+    return Episode(
+        state=clips[0].state,
+        actions=tuple(to_action(clip) for clip in clips),
+        fps=fps,
+        first_frame=clips[0].first.colors,
+        ground_truth=tuple(
+            GroundTruth(
+                frames=clip.frames,
+                depth_m=truth.depth_m,
+                object_ids=truth.object_ids,
+                motions=truth.motions,
+                target_id=clip.body_ids[clip.target],
+            )
+            for clip, truth in zip(clips, truths, strict=True)
+        ),
+    )
 
 
 def to_ground_truth(clip: TabletopClip) -> Observation:

@@ -254,8 +254,7 @@ def test_a_first_frame_without_points_is_refused(renderer):
 
 
 def test_hands_close_to_the_camera_are_drawn_alike():
-    """Shapes that reach through the near plane or fill the picture, and more of them than a chunk
-    holds."""
+    """Some shapes reach through the near plane, and they fill more than one chunk."""
     rng = np.random.default_rng(2)
     cameras = make_cameras(2)
     forward, eye = cameras.world_from_camera[:, :3, 2], cameras.world_from_camera[:, :3, 3]

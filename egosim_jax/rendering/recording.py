@@ -1,8 +1,8 @@
-"""A simulation as a Rerun recording: scene, cameras, hands and videos, to be looked at in time.
+"""Rerun recordings of simulations: scene, cameras, hands and videos over time.
 
-Entities, in meters and the world's coordinates: `world/state`, the points before each clip;
-`world/hands/N`, the skeletons; `world/camera`, with the generated picture in its frustum; beside
-it `view` and `truth`. The timeline `frame` counts through all clips.
+Entities, in meters and world coordinates: `world/state`, the points before each clip;
+`world/hands/N`, the skeletons; `world/camera`, with the generated frame in its frustum; and the
+videos `view` and `ground_truth`. The timeline `frame` counts through all clips.
 """
 
 from __future__ import annotations
@@ -11,23 +11,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.rendering.portrait import Up
+from egosim_jax.rendering.skeleton import SKELETONS
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from egosim_jax.simulator import Step
     from egosim_jax.types import Action, SceneState
 
+RECORDING = "simulation.rrd"
+"""File name of a recording in the folder of a simulation."""
 POINT_M, BONE_M = 0.0015, 0.004
-"""Radius of points and of bones."""
-QUALITY = 85
-"""Of the pictures, which are kept as JPEG."""
+"""Radius of points and of bones in meters."""
+JPEG_QUALITY = 85
+"""Quality of the recorded frames."""
 
 
 class Recording:
-    """A recording under way; it is there under its name once it is closed."""
+    """Rerun recording in progress; its file is complete once it is closed."""
 
-    def __init__(self, path: Path, name: str):
+    def __init__(self, path: Path, name: str, *, up: Up):
         import rerun as rr
         import rerun.blueprint as rrb
 
@@ -35,16 +38,28 @@ class Recording:
         self._rr, self._frame = rr, 0
         self._stream = rr.RecordingStream("egosim", recording_id=name)
         self._stream.save(self._writing.__enter__())
-        pictures = (("view", "/view"), ("generated", "/world/camera"), ("truth", "/truth"))
+        pictures = (
+            ("view", "/view"),
+            ("generated", "/world/camera"),
+            ("ground truth", "/ground_truth"),
+        )
         column = rrb.Vertical(*(rrb.Spatial2DView(name=n, origin=o) for n, o in pictures))
         scene = rrb.Spatial3DView(name="world", origin="/world")
         self._stream.send_blueprint(rrb.Blueprint(rrb.Horizontal(scene, column)))
-        self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        axes = rr.ViewCoordinates
+        world = axes.RIGHT_HAND_Z_UP if up == "z" else axes.RIGHT_HAND_Y_DOWN
+        self._stream.log("world", world, static=True)
 
-    def add(self, state: SceneState, action: Action, step: Step, truth: np.ndarray) -> None:
-        """Record a clip: the state before it, and what was done, generated and true, by frame."""
-        from egosim_jax.rendering.skeleton import SKELETONS
-
+    def add(
+        self,
+        state: SceneState,
+        action: Action,
+        *,
+        view: np.ndarray,
+        frames: np.ndarray,
+        ground_truth: np.ndarray | None,
+    ) -> None:
+        """Record a clip: the state before it, the action, and its videos `f h w 3`."""
         rr, log = self._rr, self._stream.log
         bones = SKELETONS[action.kind].bones
         cameras = action.cameras
@@ -63,15 +78,16 @@ class Recording:
                     image_plane_distance=0.15,
                 ),
             )
-            log("world/camera", self._picture(step.clip.frames[frame]))
-            log("view", self._picture(step.view.frames[frame]))
-            log("truth", self._picture(truth[frame]))
+            log("world/camera", self._picture(frames[frame]))
+            log("view", self._picture(view[frame]))
+            if ground_truth is not None:
+                log("ground_truth", self._picture(ground_truth[frame]))
             for number, joints in enumerate(action.joints_m[frame]):
                 log(f"world/hands/{number}", rr.LineStrips3D(joints[bones], radii=BONE_M))
             self._frame += 1
 
     def close(self, state: SceneState) -> None:
-        """Record the last state and give the file its name."""
+        """Record the last state and move the file to its path."""
         self._stream.set_time("frame", sequence=self._frame)
         self._points(state)
         self._stream.flush()
@@ -83,4 +99,4 @@ class Recording:
         self._stream.log("world/state", points)
 
     def _picture(self, frame: np.ndarray) -> Any:
-        return self._rr.Image(frame).compress(jpeg_quality=QUALITY)
+        return self._rr.Image(frame).compress(jpeg_quality=JPEG_QUALITY)

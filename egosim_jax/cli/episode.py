@@ -1,0 +1,311 @@
+"""`egosim episode`: make, check and show episodes, the inputs of `egosim simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from egosim_jax.command import DONE
+from egosim_jax.rendering import RendererName
+from egosim_jax.types import InputError, check_counts, check_seed
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egosim_jax import episode as episodes
+    from egosim_jax.types import Action, Cameras, SceneState
+
+PICTURES = 6
+"""Frames of each video on a contact sheet."""
+ARRAYS = ("world_from_camera", "intrinsics_px", "joints_m")
+MAX_JSON_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class MakeEpisode:
+    """Make an episode of the tabletop world, or of your own cameras, hands and scene.
+
+    Without --actions it is drawn by the seed, at the length and size of a model's clips, with
+    ground truth. With --actions there is one .npz or .json file per clip, of world_from_camera
+    (f, 4, 4), intrinsics_px (3, 3) and joints_m (f, hands, 21 or 3, 3), in meters and OpenCV axes;
+    null or NaN where a hand is missing. A .json file may also have a prompt. The scene is a
+    --state, or an --image without hands with its --depth, seen from the first camera.
+    """
+
+    out: Path
+    """Folder to write, or a file whose name ends in .zip."""
+    config: str = "tabletop"
+    """Model whose length, size and frame rate the clips have."""
+    seed: int = 0
+    """Seed of scene and actions in the tabletop world."""
+    clips: int = 3
+    """Number of clips of the tabletop world."""
+    robot: bool = False
+    """Use a robot gripper instead of human hands in the tabletop world."""
+    actions: tuple[Path, ...] = ()
+    """Files of your own cameras and hand joints, one per clip."""
+    prompts: tuple[str, ...] = ()
+    """Prompt of each clip, where the files have none."""
+    state: Path | None = None
+    """Folder of a state, or a .ply of colored points."""
+    image: Path | None = None
+    """RGB image of the scene without hands, from the first camera, at any resolution."""
+    depth: Path | None = None
+    """Depth of the image in meters: an .npz file with the array depth_m."""
+
+    def run(self) -> int:
+        """Make, check and write the episode."""
+        check_counts({"--clips": self.clips})
+        check_seed(self.seed)
+        episode = self._own() if self.actions else self._tabletop()
+        episode.save(self.out)
+        print(f"{self.out}: {summary(episode)}")
+        return DONE
+
+    def _tabletop(self) -> episodes.Episode:
+        from egosim_jax import configs
+        from egosim_jax.worlds.tabletop import make_sequence, to_episode
+
+        if given := [n for n in ("prompts", "state", "image", "depth") if getattr(self, n)]:
+            raise InputError(f"--{given[0]} needs --actions: the tabletop world makes its own.")
+        video = configs.get(self.config).video
+        kind = "robot" if self.robot else "human"
+        clips = list(make_sequence(self.seed, spec=video, clips=self.clips, kind=kind))
+        return to_episode(clips, fps=video.fps)
+
+    def _own(self) -> episodes.Episode:
+        from egosim_jax import configs
+        from egosim_jax.cli.simulate import check_fits
+        from egosim_jax.episode import Episode
+
+        if self.prompts and len(self.prompts) != len(self.actions):
+            raise InputError(
+                f"{len(self.prompts)} prompts for {len(self.actions)} files: give one per clip. "
+                "(--prompts)"
+            )
+        video = configs.get(self.config).video
+        prompts = self.prompts or (None,) * len(self.actions)
+        actions = tuple(
+            read_action(path, height=video.height, width=video.width, prompt=prompt)
+            for path, prompt in zip(self.actions, prompts, strict=True)
+        )
+        state, image = self._scene(actions[0].cameras)
+        episode = Episode(state=state, actions=actions, fps=video.fps, first_frame=image)
+        check_fits(episode, video, self.config)
+        return episode
+
+    def _scene(self, cameras: Cameras) -> tuple[SceneState, np.ndarray | None]:
+        """Return the state, and the image at the size of the clips if there is one."""
+        from egosim_jax.data.transforms import resize_video
+        from egosim_jax.io.video import read_image
+        from egosim_jax.state.snapshot import load, read_ply
+
+        image = None if self.image is None else read_image(self.image)
+        size = cameras.height, cameras.width
+        frame = None if image is None else resize_video(image[None], *size)[0]
+        if self.state is not None and self.depth is None:
+            read = read_ply if self.state.suffix == ".ply" else load
+            return read(self.state), frame
+        if image is not None and self.depth is not None and self.state is None:
+            return self._lift(image, self.depth, cameras), frame
+        raise InputError("The scene must be given once: by --state, or by --image and --depth.")
+
+    def _lift(self, image: np.ndarray, depth: Path, cameras: Cameras) -> SceneState:
+        """Return the state of the image and its depth, seen from the first camera."""
+        import numpy as np
+
+        from egosim_jax.io.npz import read_arrays
+        from egosim_jax.state.depth import state_from_depth
+
+        depth_m = read_arrays(depth, {}, others=("depth_m",), packed=True)["depth_m"]
+        if depth_m.shape != image.shape[:2]:
+            raise InputError(
+                f"{depth} has shape {depth_m.shape} and {self.image} {image.shape[:2]}: depth "
+                "must have one value per pixel of the image. Resize one of them."
+            )
+        scale = np.array([image.shape[1] / cameras.width, image.shape[0] / cameras.height, 1])
+        intrinsics = cameras.intrinsics_px * scale[:, None]
+        intrinsics[:2, 2] += (scale[:2] - 1) / 2
+        return state_from_depth(image, depth_m, intrinsics, cameras.world_from_camera[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckEpisode:
+    """Validate an episode: files, joints, units, cameras, frame of reference.
+
+    Prints a summary, or what is wrong and how to fix it.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """Folder or .zip of the episode."""
+    config: str | None = None
+    """Model that the clips must fit in length, size and frame rate."""
+
+    def run(self) -> int:
+        """Load the episode, which checks all of it."""
+        from egosim_jax import configs
+        from egosim_jax.cli.simulate import check_fits
+        from egosim_jax.episode import Episode
+
+        episode = Episode.load(self.path)
+        if self.config is not None:
+            check_fits(episode, configs.get(self.config).video, self.config)
+        print(f"{self.path}: {summary(episode)}")
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowEpisode:
+    """Draw an episode's inputs: the view of the state with the hands of each clip.
+
+    Writes one contact sheet: a row of the first state along the cameras of the clip, with the hands
+    drawn over it, and a row of the ground truth if there is one.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """Folder or .zip of the episode."""
+    out: Path | None = None
+    """Picture to write; NAME.png in the current folder if not given."""
+    renderer: RendererName = "jax"
+    """Renderer of the view and the hands."""
+
+    def run(self) -> int:
+        """Render and write the contact sheet."""
+        from egosim_jax.data.sheet import SheetClip, draw_sheet
+        from egosim_jax.episode import Episode
+
+        episode = Episode.load(self.path)
+        last = episode.shape[0] - 1
+        moments = [last * k // (PICTURES - 1) for k in range(PICTURES)]
+        truths = episode.ground_truth or (None,) * len(episode.actions)
+        sheet = []
+        for number, (action, truth) in enumerate(
+            zip(episode.actions, truths, strict=True), start=1
+        ):
+            videos = {"view with hands": self._overlay(episode.state, action)}
+            if truth is not None:
+                videos["ground truth"] = truth.frames
+            title = f"{number}: {action.prompt}   ({', '.join(videos)})"
+            sheet.append(SheetClip(title, list(videos.values())))
+        out = self.out or Path(f"{self.path.stem}.png")
+        draw_sheet(sheet, out, moments=moments)
+        print(out)
+        return DONE
+
+    def _overlay(self, state: SceneState, action: Action) -> np.ndarray:
+        import numpy as np
+
+        from egosim_jax import rendering
+
+        renderer = rendering.get(self.renderer)
+        view = renderer.render(state, action.cameras, point_px=2)
+        hands, depth_m = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)
+        return np.where((depth_m < view.depth_m)[..., None], hands, view.frames)
+
+
+def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> Action:
+    """Return the action of a user's .npz or .json file (`MakeEpisode`).
+
+    `prompt` replaces the file's. The number of joints gives the kind of hands. Raises `InputError`
+    naming the file.
+    """
+    import numpy as np
+
+    from egosim_jax.io.npz import read_arrays
+    from egosim_jax.types import JOINTS, Action, Cameras
+
+    values: Mapping[str, Any]
+    if path.suffix == ".json":
+        values = _read_json(path)
+    elif path.suffix == ".npz":
+        values = read_arrays(path, {}, others=ARRAYS, packed=True)
+    else:
+        raise InputError(f"{path}: actions are read from .npz and .json files. (--actions)")
+    prompt = prompt or values.get("prompt")
+    if not prompt:
+        raise InputError(f"{path} has no prompt: give one per clip. (--prompts)")
+    joints = np.asarray(values["joints_m"])
+    kinds = {count: kind for kind, count in JOINTS.items()}
+    try:
+        if joints.ndim != 4 or joints.shape[2] not in kinds:
+            raise InputError(
+                f"joints_m has shape {joints.shape}: it must be (frames, hands, joints, 3), with "
+                "21 joints of a human hand or 3 of a gripper."
+            )
+        return Action(
+            cameras=Cameras(
+                world_from_camera=np.asarray(values["world_from_camera"], float),
+                intrinsics_px=np.asarray(values["intrinsics_px"], float),
+                height=height,
+                width=width,
+            ),
+            joints_m=joints.astype(float),
+            kind=kinds[joints.shape[2]],
+            prompt=prompt,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return the arrays and the prompt of a .json file; a hand that is null has joints of NaN."""
+    import numpy as np
+
+    from egosim_jax.io.untrusted import quote, read_json
+
+    written = read_json(path, limit=MAX_JSON_BYTES)
+    if not isinstance(written, dict) or not written.keys() <= {*ARRAYS, "prompt"}:
+        raise InputError(f"{path}: must be an object of {', '.join(ARRAYS)} and prompt.")
+    values: dict[str, Any] = {"prompt": written.get("prompt")}
+    for name in ARRAYS:
+        rows = written.get(name)
+        if name == "joints_m" and isinstance(rows, list):
+            rows = _fill_missing(rows)
+        try:
+            values[name] = np.array(rows, float)
+        except (ValueError, TypeError):
+            raise InputError(
+                f"{path}: {name} is {quote(rows)}, not an array of numbers: all rows must have "
+                "equal lengths."
+            ) from None
+    return values
+
+
+def _fill_missing(frames: list[Any]) -> list[Any]:
+    """Return frames of hands with null replaced by as many NaN joints as the others have."""
+    given = [hand for hands in frames if isinstance(hands, list) for hand in hands if hand]
+    nan = [[float("nan")] * 3] * len(given[0]) if given and isinstance(given[0], list) else None
+    return [
+        [nan if hand is None else hand for hand in hands] if isinstance(hands, list) else hands
+        for hands in frames
+    ]
+
+
+def summary(episode: episodes.Episode) -> str:
+    """Return one line about an episode."""
+    frames, height, width = episode.shape
+    known = "with" if episode.ground_truth else "without"
+    return (
+        f"{len(episode.actions)} clips of {frames} frames of {width}x{height} at {episode.fps} "
+        f"fps, {episode.actions[0].kind} hands, {len(episode.state.points_m)} points, {known} "
+        "ground truth"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """Make, check and show episodes: a scene, cameras, hands and prompts to simulate."""
+
+    command: (
+        Annotated[MakeEpisode, tyro.conf.subcommand("make")]
+        | Annotated[CheckEpisode, tyro.conf.subcommand("check")]
+        | Annotated[ShowEpisode, tyro.conf.subcommand("show")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()

@@ -1,0 +1,442 @@
+"""Episodes: a scene and the actions in it, as a folder or as bytes.
+
+    episode.json            description: see below
+    state/                  scene before the first clip (state/snapshot.py)
+    clip_1/action.npz       world_from_camera `f 4 4`, intrinsics_px `3 3`, joints_m `f n j 3`
+    clip_1/ground_truth.npz frames, and where known depth_m, object_ids, motion_ids and motions
+    clip_2/...              one folder per clip
+    first_frame.png         first frame of the first clip, if it is known
+
+    {"format": "egosim_jax.episode", "version": 1, "kind": "human", "fps": 16,
+     "height": 480, "width": 832, "prompts": ["The left hand ..."], "target_ids": [14],
+     "sha256": {"clip_1/action.npz": "9a...", ...}}
+
+The byte format is a zip archive of these files, not compressed. Cameras follow OpenCV (x right, y
+down, z forward), everything is in meters and in one world frame. A human hand has 21 joints: the
+wrist, then thumb, index, middle, ring and little finger from knuckle to tip; a gripper has three:
+the wrist and the tips of thumb and index. A missing hand has joints of NaN. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from egosim_jax.geometry import invert, pixels_of, transform
+from egosim_jax.io.atomic import atomic_folder, atomic_write
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.npz import DAMAGE, read_arrays
+from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes, read_json
+from egosim_jax.io.video import read_image
+from egosim_jax.perception.pipeline import Observation
+from egosim_jax.state import snapshot
+from egosim_jax.state.depth import DEPTH_M
+from egosim_jax.types import (
+    JOINTS,
+    Action,
+    Cameras,
+    GroundTruth,
+    InputError,
+    SceneState,
+    check_counts,
+)
+
+FORMAT, VERSION = "egosim_jax.episode", 1
+DESCRIPTION, FIRST_FRAME = "episode.json", "first_frame.png"
+MAX_CLIPS, MAX_BYTES = 1000, 1 << 32
+"""Most clips of an episode, and most bytes of one in the byte format."""
+MAX_SPEED_M_S = 20.0
+"""Fastest camera that is accepted, in meters per second."""
+_NAMES = re.compile(r"episode\.json|first_frame\.png|state/(?:points\.npz|state\.json)"
+                    r"|clip_[1-9]\d{0,3}/(?:action|ground_truth)\.npz")  # fmt: skip
+_FINGERS = np.arange(1, 21).reshape(5, 4)
+ORDERS = {
+    "MANO's (index, middle, little, ring, thumb, then the tips)": np.array(
+        [0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20]
+    ),
+    "from tip to knuckle": np.array([0, *_FINGERS[:, ::-1].ravel()]),
+    "from tip to knuckle with the wrist last": np.array([20, *(_FINGERS[:, ::-1] - 1).ravel()]),
+    "with the wrist last": np.array([20, *range(20)]),
+    "by joint, each over all fingers": np.array([0, *np.arange(1, 21).reshape(4, 5).T.ravel()]),
+}
+"""Other orders of a human hand's joints in use, as indices that bring them into ours."""
+UNEQUAL = 1.25
+"""Ratio of the lengths of a gripper's fingers that is too large to be one in our order."""
+SHORTER = 0.75
+"""Bones shorter by this factor under another order mean that the joints are in that order."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """A scene, the actions in it, and optional ground truth: the input of a simulation."""
+
+    state: SceneState
+    """Scene before the first clip."""
+    actions: tuple[Action, ...]
+    """Cameras, hand joints and prompt of each clip."""
+    fps: int
+    """Frame rate of cameras and hands, in frames per second."""
+    first_frame: UInt8[np.ndarray, "h w 3"] | None = None
+    """First frame of the first clip, without hands; None if it is not known."""
+    ground_truth: tuple[GroundTruth, ...] = ()
+    """Ground truth of each clip; empty if it is not known."""
+
+    def __post_init__(self) -> None:
+        """Check everything that would make a simulation meaningless; raise `InputError`."""
+        if not self.actions:
+            raise InputError("An episode must have at least one action.")
+        if len(self.actions) > MAX_CLIPS:
+            raise InputError(f"{len(self.actions)} clips are more than {MAX_CLIPS}, the most.")
+        check_counts({"fps": self.fps})
+        if len(self.ground_truth) not in (0, len(self.actions)):
+            raise InputError(
+                f"{len(self.ground_truth)} clips of ground truth for {len(self.actions)} actions: "
+                "give one per action, or none."
+            )
+        for number, action in enumerate(self.actions, start=1):
+            with _named(f"clip {number}"):
+                _check_equal(action, self.actions[0])
+                _check_speed(action.cameras, self.fps)
+                _check_order(action)
+        shape = self.shape
+        if self.first_frame is not None and self.first_frame.shape != (*shape[1:], 3):
+            raise InputError(
+                f"The first frame is {self.first_frame.shape}: it must be {(*shape[1:], 3)}, as "
+                "large as the cameras' pictures."
+            )
+        for number, ground_truth in enumerate(self.ground_truth, start=1):
+            if ground_truth.frames.shape[:3] != shape:
+                raise InputError(
+                    f"The ground truth of clip {number} is {ground_truth.frames.shape[:3]}: it "
+                    f"must be {shape}, as the action."
+                )
+        _check_scene(self.state, self.actions[0].cameras)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, height and width of each clip."""
+        cameras = self.actions[0].cameras
+        return len(cameras.world_from_camera), cameras.height, cameras.width
+
+    def observations(self) -> dict[int, Observation] | None:
+        """Return the ground truth for perception, by the state's step; None where it is partial."""
+        steps = range(self.state.step, self.state.step + len(self.actions))
+        found = {
+            step: Observation(
+                cameras=action.cameras,
+                depth_m=known.depth_m,
+                object_ids=known.object_ids,
+                motions=known.motions,
+                names=self.state.names,
+            )
+            for step, action, known in zip(steps, self.actions, self.ground_truth, strict=False)
+        }
+        whole = (
+            getattr(o, n) for o in found.values() for n in ("depth_m", "object_ids", "motions")
+        )
+        return found if found and all(value is not None for value in whole) else None
+
+    def save(self, path: Path | str) -> None:
+        """Write a folder, or the byte format where the path ends in .zip."""
+        path = Path(path)
+        if path.suffix == ".zip":
+            with atomic_write(path) as temporary:
+                temporary.write_bytes(self.to_bytes())
+            return
+        with atomic_folder(path) as folder:
+            _write(folder, self)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Episode:
+        """Read a folder or a .zip. Raises `InputError` for what is damaged or not valid."""
+        path = Path(path)
+        with _named(quote_path(path)):
+            if path.is_dir():
+                return _read(path)
+            return cls.from_bytes(read_bytes(path, limit=MAX_BYTES))
+
+    def to_bytes(self) -> bytes:
+        """Return the byte format; equal episodes have equal bytes."""
+        data = io.BytesIO()
+        with tempfile.TemporaryDirectory() as name, zipfile.ZipFile(data, "w") as archive:
+            folder = Path(name)
+            _write(folder, self)
+            for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+                entry = zipfile.ZipInfo(str(file.relative_to(folder)))
+                archive.writestr(entry, file.read_bytes())
+        return data.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Episode:
+        """Read the byte format. Raises `InputError` for what is damaged or not valid."""
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            try:
+                with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                    _extract(archive, folder)
+            except InputError:
+                raise
+            except DAMAGE as error:
+                raise InputError(
+                    f"not a readable zip archive: {quote_text(str(error))}."
+                ) from error
+            return _read(folder)
+
+
+def _check_equal(action: Action, first: Action) -> None:
+    """Raise `InputError` unless a clip has the first one's kind, length and size."""
+    have, want = (
+        (a.kind, len(a.cameras.world_from_camera), a.cameras.height, a.cameras.width)
+        for a in (action, first)
+    )
+    if have != want:
+        raise InputError(
+            f"it has {have[0]} hands, {have[1]} frames of {have[3]}x{have[2]}, and clip 1 has "
+            f"{want[0]}, {want[1]} of {want[3]}x{want[2]}: all clips must agree."
+        )
+
+
+def _check_speed(cameras: Cameras, fps: int) -> None:
+    centers = cameras.world_from_camera[:, :3, 3]
+    speed = np.linalg.norm(np.diff(centers, axis=0), axis=1) * fps
+    if len(speed) and speed.max() > MAX_SPEED_M_S:
+        frame = int(speed.argmax())
+        raise InputError(
+            f"the camera moves at {speed.max():.4g} m/s from frame {frame} to {frame + 1}, more "
+            f"than {MAX_SPEED_M_S:g} m/s: world_from_camera must be in meters."
+        )
+
+
+def _check_order(action: Action) -> None:
+    """Raise `InputError` if the joints of the hands are plausible only in another order."""
+    hands = action.joints_m[np.isfinite(action.joints_m).all(axis=(2, 3))]
+    if not len(hands):
+        return
+    if action.kind == "robot":
+        sides = np.linalg.norm(hands[:, 1:] - hands[:, :1], axis=-1)
+        ratio = (sides.max(axis=1) / np.maximum(sides.min(axis=1), 1e-9)).max()
+        if ratio > UNEQUAL:
+            raise InputError(
+                f"the fingers of a gripper differ in length by a factor of {ratio:.3g}, more than "
+                f"{UNEQUAL}: its joints must be in the order wrist, thumb tip, index tip."
+            )
+        return
+    lengths = {name: _bone_length(hands[:, order]) for name, order in ORDERS.items()}
+    name = min(lengths, key=lambda name: lengths[name])
+    if lengths[name] < SHORTER * _bone_length(hands):
+        raise InputError(
+            f"the joints of the hands seem to be in the order {name}: the bones are "
+            f"{lengths[name] / _bone_length(hands):.2f} times as long in it. The order must be "
+            "wrist, then thumb, index, middle, ring and little finger, each from knuckle to tip; "
+            f"reorder them by joints_m[:, :, {ORDERS[name].tolist()}]."
+        )
+
+
+def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
+    outer = np.arange(1, JOINTS["human"])
+    inner = np.where(outer % 4 == 1, 0, outer - 1)
+    return float(np.linalg.norm(hands[:, outer] - hands[:, inner], axis=-1).sum())
+
+
+def _check_scene(state: SceneState, cameras: Cameras) -> None:
+    """Raise `InputError` unless the first camera sees points at distances of meters."""
+    local = transform(invert(cameras.world_from_camera[0]), state.points_m.astype(float))
+    inside = pixels_of(cameras, local)[2]
+    if not inside.any():
+        raise InputError(
+            f"The first camera sees none of the {len(local)} points of the state: state and "
+            "cameras must be in one world frame (OpenCV axes, world_from_camera), in meters."
+        )
+    median = float(np.median(local[inside, 2]))
+    if not DEPTH_M[0] <= median <= DEPTH_M[1]:
+        raise InputError(
+            f"The points that the first camera sees are {median:.4g} m away (median): it must be "
+            f"from {DEPTH_M[0]} to {DEPTH_M[1]} m. Convert the state to meters."
+        )
+
+
+def _write(folder: Path, episode: Episode) -> None:
+    snapshot.save(folder / "state", episode.state)
+    for number, action in enumerate(episode.actions, start=1):
+        clip = folder / f"clip_{number}"
+        clip.mkdir()
+        cameras = action.cameras
+        np.savez(
+            clip / "action.npz",
+            world_from_camera=np.asarray(cameras.world_from_camera, float),
+            intrinsics_px=np.asarray(cameras.intrinsics_px, float),
+            joints_m=action.joints_m,
+        )
+    for number, known in enumerate(episode.ground_truth, start=1):
+        arrays: dict[str, Any] = {
+            name: value
+            for name in ("frames", "depth_m", "object_ids")
+            if (value := getattr(known, name)) is not None
+        }
+        if known.motions is not None:
+            numbers = sorted(known.motions)
+            arrays["motion_ids"] = np.array(numbers, np.int32)
+            paths = [np.asarray(known.motions[n], float) for n in numbers]
+            arrays["motions"] = np.array(paths).reshape(len(paths), len(known.frames), 4, 4)
+        np.savez(folder / f"clip_{number}" / "ground_truth.npz", **arrays)
+    if episode.first_frame is not None:
+        Image.fromarray(episode.first_frame).save(folder / FIRST_FRAME)
+    _, height, width = episode.shape
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    description = {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": episode.actions[0].kind,
+        "fps": episode.fps,
+        "height": height,
+        "width": width,
+        "prompts": [action.prompt for action in episode.actions],
+        "target_ids": [known.target_id for known in episode.ground_truth],
+        "sha256": {str(file.relative_to(folder)): sha256(file) for file in files},
+    }
+    text = json.dumps(description, indent=2) + "\n"
+    (folder / DESCRIPTION).write_text(text, encoding="utf-8")
+
+
+def _extract(archive: zipfile.ZipFile, folder: Path) -> None:
+    """Write the entries of the byte format to a folder; refuse any other entry."""
+    entries = archive.infolist()
+    names = [entry.filename for entry in entries]
+    if len(set(names)) != len(names) or len(names) > 2 * MAX_CLIPS + 4:
+        raise InputError("an archive of duplicate or too many entries.")
+    for entry in entries:
+        stored = (
+            entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
+        )
+        if not _NAMES.fullmatch(entry.filename) or not stored:
+            raise InputError(
+                f"entry {quote(entry.filename)} is compressed or not part of an episode: an "
+                "episode is an archive of stored files, as Episode.save writes."
+            )
+        path = folder / entry.filename
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(archive.read(entry))
+
+
+def _read(folder: Path) -> Episode:
+    written = read_json(folder / DESCRIPTION)
+    if not isinstance(written, dict) or written.get("format") != FORMAT:
+        raise InputError(f"{DESCRIPTION} does not describe an episode ({FORMAT}).")
+    if type(written.get("version")) is not int or written["version"] != VERSION:
+        raise InputError(
+            f"episode of version {quote(written.get('version'))}; this program reads version "
+            f"{VERSION}."
+        )
+    for name, kind in {"kind": str, "fps": int, "height": int, "width": int, "prompts": list,
+                       "target_ids": list, "sha256": dict}.items():  # fmt: skip
+        if type(written.get(name)) is not kind:
+            raise InputError(
+                f"{DESCRIPTION}: {name} is {quote(written.get(name))}, not {kind.__name__}."
+            )
+    prompts, targets = written["prompts"], written["target_ids"]
+    if not 0 < len(prompts) <= MAX_CLIPS:
+        raise InputError(f"{DESCRIPTION}: {len(prompts)} prompts; an episode has 1 to {MAX_CLIPS}.")
+    if not all(isinstance(prompt, str) for prompt in prompts):
+        raise InputError(f"{DESCRIPTION}: every prompt must be text.")
+    if not all(target is None or type(target) is int for target in targets):
+        raise InputError(f"{DESCRIPTION}: target_ids must be object ids or null.")
+    truths = [f"clip_{number}/ground_truth.npz" for number, _ in enumerate(targets, start=1)]
+    has_image = FIRST_FRAME in written["sha256"]
+    _check_files(
+        folder,
+        written["sha256"],
+        expected={
+            "state/points.npz",
+            "state/state.json",
+            *(f"clip_{number}/action.npz" for number, _ in enumerate(prompts, start=1)),
+            *truths,
+            *([FIRST_FRAME] if has_image else []),
+        },
+    )
+    return Episode(
+        state=snapshot.load(folder / "state"),
+        actions=tuple(
+            _read_action(folder / f"clip_{number}" / "action.npz", written, prompt)
+            for number, prompt in enumerate(prompts, start=1)
+        ),
+        fps=written["fps"],
+        first_frame=read_image(folder / FIRST_FRAME) if has_image else None,
+        ground_truth=tuple(
+            _read_ground_truth(folder / name, target)
+            for name, target in zip(truths, targets, strict=True)
+        ),
+    )
+
+
+def _check_files(folder: Path, recorded: Mapping[str, Any], *, expected: set[str]) -> None:
+    missing, unknown = sorted(expected - recorded.keys()), sorted(recorded.keys() - expected)
+    if missing or unknown:
+        raise InputError(
+            f"{DESCRIPTION}: sha256 must name exactly the files of the episode; missing: "
+            f"{', '.join(missing) or 'none'}; unknown: {', '.join(map(quote, unknown)) or 'none'}."
+        )
+    for name in sorted(expected):
+        if sha256(folder / name) != recorded[name]:
+            raise InputError(
+                f"{name} is damaged or was changed after the episode was written (SHA-256). "
+                "Restore it, or write the episode again."
+            )
+
+
+def _read_action(path: Path, written: Mapping[str, Any], prompt: str) -> Action:
+    names = {"world_from_camera": "float64", "intrinsics_px": "float64"}
+    arrays = read_arrays(path, names, others=("joints_m",))
+    with _named(path.parent.name):
+        return Action(
+            cameras=Cameras(
+                world_from_camera=arrays["world_from_camera"],
+                intrinsics_px=arrays["intrinsics_px"],
+                height=written["height"],
+                width=written["width"],
+            ),
+            joints_m=arrays["joints_m"],
+            kind=written["kind"],
+            prompt=prompt,
+        )
+
+
+def _read_ground_truth(path: Path, target_id: int | None) -> GroundTruth:
+    optional = {
+        "depth_m": "float32",
+        "object_ids": "int32",
+        "motion_ids": "int32",
+        "motions": "float64",
+    }
+    arrays = read_arrays(path, {"frames": "uint8"}, optional=optional)
+    motions = None
+    if "motions" in arrays:
+        numbers = arrays.pop("motion_ids", np.zeros(0, np.int32)).tolist()
+        motions = arrays.pop("motions")
+        if len(set(numbers)) != len(motions):
+            raise InputError(f"{quote_path(path)}: motion_ids must name each of the motions once.")
+        motions = dict(zip(numbers, motions, strict=True))
+    arrays.pop("motion_ids", None)
+    with _named(path.parent.name):
+        return GroundTruth(motions=motions, target_id=target_id, **arrays)
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Put a name before the message of an `InputError`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error

@@ -1,0 +1,195 @@
+"""Episodes: files, bytes and refusals."""
+
+import io
+import json
+import zipfile
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.episode import ORDERS, Episode
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_episode
+
+SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
+
+
+@pytest.fixture(scope="module", params=["human", "robot"])
+def episode(request):
+    return to_episode(list(make_sequence(3, spec=SPEC, clips=2, kind=request.param)), fps=8)
+
+
+@pytest.fixture(scope="module")
+def hands():
+    return to_episode(list(make_sequence(3, spec=SPEC, clips=2)), fps=8)
+
+
+def test_a_folder_and_bytes_give_the_same_episode(episode, tmp_path):
+    episode.save(tmp_path / "episode")
+    episode.save(tmp_path / "episode.zip")
+    for path in ("episode", "episode.zip"):
+        assert fingerprint(Episode.load(tmp_path / path)) == fingerprint(episode)
+    assert Episode.load(tmp_path / "episode").to_bytes() == episode.to_bytes()
+
+
+def test_everything_optional_may_be_missing(hands, tmp_path):
+    bare = replace(hands, first_frame=None, ground_truth=())
+    bare.save(tmp_path / "bare")
+    loaded = Episode.load(tmp_path / "bare")
+    assert fingerprint(loaded) == fingerprint(bare)
+    assert loaded.observations() is None
+
+
+def test_ground_truth_may_be_frames_alone(hands, tmp_path):
+    frames = tuple(
+        replace(known, depth_m=None, object_ids=None, motions=None, target_id=None)
+        for known in hands.ground_truth
+    )
+    video = replace(hands, ground_truth=frames)
+    video.save(tmp_path / "video")
+    assert fingerprint(Episode.load(tmp_path / "video")) == fingerprint(video)
+    assert video.observations() is None
+    assert sorted(hands.observations()) == [0, 1]
+
+
+def with_joints(episode, change):
+    action = episode.actions[1]
+    return replace(episode, actions=(episode.actions[0], replace(action, joints_m=change(action))))
+
+
+def with_cameras(episode, **changes):
+    first, second = episode.actions
+    changed = replace(second, cameras=replace(second.cameras, **changes))
+    return replace(episode, actions=(first, changed))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_another_order_of_the_joints_is_named(hands, order):
+    undo = np.argsort(ORDERS[order])
+    with pytest.raises(InputError, match=r"clip 2: .* seem to be in the order") as caught:
+        with_joints(hands, lambda action: action.joints_m[:, :, undo])
+    assert order in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hands_of_any_closure_are_in_order(seed):
+    to_episode(list(make_sequence(seed, spec=SPEC, clips=3)), fps=8)
+
+
+def test_a_gripper_with_the_wrist_last_is_refused():
+    robot = to_episode(list(make_sequence(3, spec=SPEC, clips=2, kind="robot")), fps=8)
+    with pytest.raises(InputError, match="wrist, thumb tip, index tip"):
+        with_joints(robot, lambda action: np.roll(action.joints_m, -1, axis=2))
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda e: with_joints(e, lambda a: 1000 * a.joints_m), "must be in meters"),
+        (lambda e: with_joints(e, lambda a: a.joints_m + 9), "comes near the view"),
+        (lambda e: with_joints(e, lambda a: a.joints_m[:, :, :20]), "21, 3"),
+        (lambda e: with_joints(e, lambda a: a.joints_m[:4]), "path of 5 cameras"),
+        (lambda e: with_cameras(e, height=64), "clip 2: .*all clips must agree"),
+        (lambda e: replace(e, actions=()), "at least one action"),
+        (lambda e: replace(e, fps=0), "fps must be at least 1"),
+        (lambda e: replace(e, ground_truth=e.ground_truth[:1]), "one per action, or none"),
+        (lambda e: replace(e, first_frame=e.first_frame[1:]), "as large as the cameras"),
+        (
+            lambda e: replace(e, state=replace(e.state, points_m=e.state.points_m + 90)),
+            "sees none of the",
+        ),
+        (lambda e: in_millimeters(e), "Convert the state to meters"),
+        (lambda e: jumping(e), "world_from_camera must be in meters"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_the_rule(hands, break_it, message):
+    with pytest.raises(InputError, match=message):
+        break_it(hands)
+
+
+def in_millimeters(episode):
+    """The state alone in millimeters, around the first camera."""
+    eye = episode.actions[0].cameras.world_from_camera[0, :3, 3].astype(np.float32)
+    points = eye + 1000 * (episode.state.points_m - eye)
+    return replace(episode, state=replace(episode.state, points_m=points))
+
+
+def jumping(episode):
+    first, second = episode.actions
+    poses = second.cameras.world_from_camera.copy()
+    poses[2, 0, 3] += 50
+    changed = replace(second, cameras=replace(second.cameras, world_from_camera=poses))
+    return replace(episode, actions=(first, changed))
+
+
+def test_any_changed_byte_of_a_file_is_noticed(hands, tmp_path):
+    hands.save(tmp_path / "episode")
+    for file in sorted((tmp_path / "episode").rglob("*.*")):
+        data = file.read_bytes()
+        for place in (0, len(data) // 2, len(data) - 3):
+            changed = bytearray(data)
+            changed[place] ^= 1
+            file.write_bytes(bytes(changed))
+            if file.name == "episode.json":
+                with suppress(InputError):
+                    Episode.load(tmp_path / "episode")
+            else:
+                with pytest.raises(InputError, match=r"episode: .*damaged or was changed"):
+                    Episode.load(tmp_path / "episode")
+        file.write_bytes(data)
+
+
+def test_a_missing_file_is_named(hands, tmp_path):
+    hands.save(tmp_path / "episode")
+    (tmp_path / "episode" / "clip_2" / "action.npz").unlink()
+    with pytest.raises(InputError, match=r"clip_2/action\.npz"):
+        Episode.load(tmp_path / "episode")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("format", "zip", "does not describe an episode"),
+        ("version", 2, "this program reads version 1"),
+        ("prompts", "one", "prompts is 'one', not list"),
+        ("prompts", [1, 2], "every prompt must be text"),
+        ("prompts", ["one"], "unknown: 'clip_2/action.npz'"),
+        ("target_ids", ["a", "b"], "object ids or null"),
+        ("kind", "robot", "robot hands of a path"),
+        ("height", True, "height is True, not int"),
+    ],
+)
+def test_a_description_that_is_not_valid_is_refused(hands, tmp_path, field, value, message):
+    hands.save(tmp_path / "episode")
+    path = tmp_path / "episode" / "episode.json"
+    written = json.loads(path.read_text("utf-8"))
+    path.write_text(json.dumps({**written, field: value}))
+    with pytest.raises(InputError, match=message):
+        Episode.load(tmp_path / "episode")
+
+
+def archive(entries, compression=zipfile.ZIP_STORED):
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", compression) as file:
+        for name, content in entries:
+            file.writestr(name, content)
+    return data.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"not a zip", "not a readable zip archive"),
+        (archive([("../../evil", b"x")]), "not part of an episode"),
+        (archive([("/etc/passwd", b"x")]), "not part of an episode"),
+        (archive([("episode.json", b"0" * 99999)], zipfile.ZIP_DEFLATED), "compressed"),
+        (archive([("episode.json", b"{}")]), "does not describe an episode"),
+        (archive([]), r"episode\.json"),
+    ],
+)
+def test_bytes_that_are_no_episode_are_refused(data, message):
+    with pytest.raises(InputError, match=message):
+        Episode.from_bytes(data)
