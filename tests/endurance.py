@@ -35,7 +35,7 @@ class Moment:
         self.later = draw.uniform(0, 0.03)
 
     def is_there(self) -> bool:
-        """Whether it has come, some milliseconds after the update or the save began."""
+        """Return True some milliseconds after the update or the save began."""
         if len(self.run.lines()) < self.step or (self.saving and not self.run.is_saving()):
             return False
         time.sleep(self.later)

@@ -1,8 +1,8 @@
-"""61 frames of 832 x 480 fused at 3 mm and looked at from their cameras, beside plain Open3D.
+"""61 frames of 832 x 480 fused at 3 mm and rendered from their cameras, versus plain Open3D.
 
     python -m tests.benchmarks.bench_fusion
 
-Each program runs in a process of its own, which says how long it took, how much memory it held at
+Each program runs in its own process, which reports how long it took, how much memory it held at
 most beyond its input, and how long each of the 61 pictures takes. Plain Open3D: its own choice of
 blocks, integration and extraction, and `project_to_rgbd_image`, one pixel a point; ours draws two.
 """
@@ -31,7 +31,7 @@ Program = Literal["ours", "Open3D"]
 
 @dataclass(frozen=True)
 class Frames:
-    """What is fused: depth without hands, colors, cameras."""
+    """Inputs of fusion: depth without hands, colors, cameras."""
 
     depth_m: np.ndarray
     colors: np.ndarray
@@ -40,7 +40,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class Figures:
-    """What a program took and made."""
+    """Time, memory and result of a program."""
 
     fuse_s: float
     memory_mb: float
@@ -92,7 +92,7 @@ def measure(program: Program, frames: Frames) -> Figures:
 
 
 def _memory_mb(name: Literal["VmHWM", "VmRSS"]) -> float:
-    """The process's memory: the most it held since it was told to forget, or what it holds."""
+    """Return the process's memory: its peak since the last reset, or now."""
     for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
         if line.startswith(name):
             return int(line.split()[1]) / 1024

@@ -7,7 +7,7 @@
 
 All of it at full width and with 24,960 tokens, on random weights. TFLOP/s and MFU count what the
 model needs (`forward_flops` of its config), not what is computed again. `--profile` says where the
-time of the last case went, kernel by kernel. Beside the memory that was taken stands what the
+time of the last case went, kernel by kernel. The memory that was taken is compared with what the
 program was compiled to take.
 """
 
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--profile", action="store_true")
-    parser.add_argument("--target", help="only compile, for this: what the preflight foretells")
+    parser.add_argument("--target", help="only compile, for this: what the preflight predicts")
     options = parser.parse_args()
     if options.target is None:
         device = jax.devices()[0]
@@ -264,7 +264,7 @@ def _measure(
         with _profile() as kernels:
             jax.block_until_ready(call())
         yield from kernels
-    # What is left would lie there in the next case.
+    # Leftovers would take memory in the next case.
     if make is not None:
         jax.tree.map(lambda leaf: leaf.delete(), state[0])
 
@@ -286,7 +286,7 @@ def _stage(model: ModelConfig, clips: int) -> Stage:
 
 
 def _forward_flops(config: ModelConfig) -> float:
-    """Those of one clip."""
+    """Return the inputs of one clip."""
     text, latents = config.tokenizer.max_tokens, config.latent_shape
     return config.dit.forward_flops(latents=latents, text=text, image=IMAGE).total
 

@@ -1,8 +1,8 @@
-"""Our loader beside torch's, over the same shards, and how long training waits for it.
+"""Our loader versus torch's, over the same shards, and how long training waits for it.
 
 Samples a second, in batches of 8, of two kinds of shards:
 
-    videos    files as mp4, of which a window of 17 frames of 160 x 96 is decoded: truth, prior,
+    videos    files as mp4, of which a window of 17 frames of 160 x 96 is decoded: target, prior,
               hands, mask, and the first frame
     latents   arrays that are read as they are, a training step's input
 

@@ -1,4 +1,4 @@
-"""A training step of the `tabletop` denoiser, ours jitted, beside torch's eager, in float32.
+"""A training step of the `tabletop` denoiser, ours jitted, versus torch's eager, in float32.
 
 Forward, backward and update of the video transformer with its text and image encoders, on a batch
 of 8 clips of 5 x 12 x 20 latents. Theirs are the same networks in diffusers and transformers, and
@@ -40,8 +40,10 @@ GOAL, BAR = 1.0, 1.25
 BATCH = 8
 LEARNING_RATE = 2e-3
 LOSS, LATER = 1e-4, 1e-2
-"""Relative tolerances of the first loss and gradient, in float32, and of the loss after a step,
-whose matrices torch orthogonalised in bfloat16."""
+"""Relative tolerances of the first loss and gradient, and of the loss after a step.
+
+The first are in float32; for the second, torch orthogonalizes matrices in bfloat16.
+"""
 
 Batch = Mapping[str, np.ndarray]
 Step = Callable[[], tuple[float, float]]
@@ -174,7 +176,7 @@ class Theirs:
     inputs: Mapping[str, torch.Tensor]
     """The batch, channels first."""
     matrices: list[tuple[torch.nn.Parameter, torch.Tensor]] = field(init=False)
-    """What Muon trains: the parameter, and a matrix in the same memory."""
+    """Yield what Muon trains: the parameter, and a matrix in the same memory."""
     rules: tuple[torch.optim.Optimizer, ...] = field(init=False)
     """Muon and AdamW."""
     updating: list[float] = field(default_factory=list)
@@ -206,7 +208,7 @@ class Theirs:
                     feed_forward_proj="gated-gelu",
                 )
             ),
-            # Without the last block, whose answer the denoiser does not read.
+            # Without the last block, whose output the denoiser does not read.
             "image": CLIPVisionModel(
                 CLIPVisionConfig(
                     hidden_size=image.dim, intermediate_size=image.ffn_dim,

@@ -27,7 +27,7 @@ import tyro
 
 Command = Literal["simulate", "generate", "convert"]
 SAMPLES = 10_000
-"""Of the bootstrap."""
+"""Resamples of the bootstrap."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +41,11 @@ class Versions:
     pairs: int = 10
     """Timed runs of each version."""
     commands: tuple[Command, ...] = ("simulate", "generate", "convert")
-    """What to time."""
+    """Names of the cases to time."""
     folder: Path = Path(tempfile.gettempdir())
-    """Where inputs and outputs are written; what is made is removed again."""
+    """Folder of inputs and outputs, which are removed again."""
     target: Path = Path("/dev/shm")  # noqa: S108
-    """Where conversion writes to."""
+    """Folder of converted weights."""
 
     def run(self) -> None:
         """Run the pairs, print ratios."""

@@ -3,7 +3,7 @@
 A text-to-video network of 2 layers (width 1536, 12 heads, MLP 8960) on latents of 6 x 32 x 32 and
 512 text tokens; both hold the same weights and are checked to agree. Calls alternate, so that a
 busy neighbor slows both, and each pair gives one ratio of times, ours to theirs: reported is the
-median with an interval of at least 95 % by order statistics, and beside it the median ratio of
+median with an interval of at least 95 % by order statistics, and the median ratio of
 processor seconds, which neighbors touch less.
 
     python -m tests.benchmarks.bench_wan_dit [--pairs 11]
@@ -26,7 +26,7 @@ GOALS = {"forward": 1.02, "forward and backward": 1.25}
 
 
 class Seconds(NamedTuple):
-    """What one call took."""
+    """Seconds of one call."""
 
     wall: float
     processor: float

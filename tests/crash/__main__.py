@@ -1,4 +1,4 @@
-"""What is written, and killed while it is written: at every change, or (`kills`) at random times.
+"""Kill writers at each change that they make, or (`kills`) commands at random times.
 
 python -m tests.crash [--writer NAME ...] [--most N] [--seed S]
 python -m tests.crash kills [--commands NAME ...] [--kills N] [--seed S]

@@ -1,7 +1,7 @@
 """Commands that are killed at random times and run again, until what they write is complete.
 
 What is written is then compared, byte for byte, with what one run without a kill writes. Only what
-says when, or by which process, something was written is left out: `IGNORED` and `TOLD`.
+says when, or by which process, something was written is skipped: `IGNORED` and `TIMED`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ IGNORED = {
     "the log and the weights, is compared",
 }
 """Files, and folders with all that is in them, that two runs without a kill do not share."""
-TOLD = ("step_time_s", "chain", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min")
-"""Fields of a log's lines that a clock tells, or that are a hash over such fields."""
+TIMED = ("step_time_s", "chain", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min")
+"""Fields of a log's lines that depend on the clock, or are a hash over such fields."""
 MODEL = "--config debug --weights ../weights"
 OF_A_CLIP = "--frames 9 --height 64 --width 96 --fps 16 --workers 1"
 MAKE = f"egosim_jax.cli data make tabletop --scenes 3 {OF_A_CLIP}"
@@ -44,7 +44,7 @@ COMMANDS = {
     "--training.batch-size 2 --training.log-every 1 --training.save-every 2",
     "convert": "egosim_jax.convert weights ../torch --config debug",
 }
-"""Each without its `--out out`; run in a folder beside those of `INPUTS`."""
+"""Each without its `--out out`; run in a folder next to those of `INPUTS`."""
 WEIGHTS = "from egosim_jax import configs, testing; from pathlib import Path; "
 WEIGHTS += "testing.write_weights(Path('weights'), configs.get('debug'))"
 INPUTS = {
@@ -63,12 +63,12 @@ INPUTS = {
     "frames": f"-m {MAKE} --out frames".split(),
     "latents": f"-m {ENCODE} --out latents".replace("../", "").split(),
 }
-"""What makes what the commands are given; they are made in this order."""
+"""Commands that make the inputs of the others, in their order."""
 
 
 @dataclass
 class Tally:
-    """What came of the kills of a command."""
+    """Results of the kills of a command."""
 
     name: str
     seconds: float
@@ -108,7 +108,7 @@ def kill_often(name: str, folder: Path, *, kills: int, seed: int) -> Tally:
             tally.kills += 1
         else:
             tally.reruns += 1
-        for line in _differences(wanted, _finish(arguments, place, anew=False)):
+        for line in _differences(wanted, _finish(arguments, place, restart=False)):
             tally.differences += 1
             print(f"{place}: {line}", flush=True)
         tally.trials += 1
@@ -147,7 +147,7 @@ def _content(path: Path) -> bytes:
     if path.name == "results.jsonl":  # the last line of a clip counts
         lines = sorted({line["video_id"]: line for line in lines}.items())
         lines = [line for _, line in lines]
-    return repr([{k: v for k, v in line.items() if k not in TOLD} for line in lines]).encode()
+    return repr([{k: v for k, v in line.items() if k not in TIMED} for line in lines]).encode()
 
 
 def _differences(wanted: dict[str, str], have: dict[str, str]) -> list[str]:
@@ -161,8 +161,8 @@ def _emptied(place: Path) -> Path:
     return place
 
 
-def _finish(arguments: Sequence[str], place: Path, *, anew: bool = True) -> dict[str, str]:
-    _python(arguments, _emptied(place) if anew else place)
+def _finish(arguments: Sequence[str], place: Path, *, restart: bool = True) -> dict[str, str]:
+    _python(arguments, _emptied(place) if restart else place)
     return artifacts(place / "out")
 
 

@@ -1,4 +1,4 @@
-"""What has to hold wherever a writer is killed.
+"""Conditions that hold wherever a writer is killed.
 
 What was complete before is still there complete, in its old or its new version; and the same
 writer, run again, leaves what it leaves if it is never killed, with no temporary name.
@@ -21,18 +21,18 @@ from tests.crash.points import watch
 from tests.crash.writers import WRITERS, Writer, inputs
 
 MANY, SAMPLE = 200, 60
-"""Of more changes than that, so many points are tried, drawn by the seed."""
+"""Maximum number of points tried for one writer, drawn by the seed."""
 
 
 @dataclass
 class Report:
-    """What came of the crash points of a writer."""
+    """Results of the crash points of a writer."""
 
     name: str
     changes: int
     points: int = 0
     torn: int = 0
-    """Of the points, those with a write half made."""
+    """Number of the points at which a write was half done."""
     failures: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
@@ -116,7 +116,7 @@ def _digest(path: Path) -> str:
 
 
 def forked(function: Callable[[], Any], work: Path) -> Any:
-    """What a function gives, run in a fork, as JSON."""
+    """Run a function in a fork and return its result, by JSON."""
     result = work.parent / f"{work.name}.json"
     result.parent.mkdir(parents=True, exist_ok=True)
     outcome = watch(lambda: result.write_text(json.dumps(function()), "utf-8"), work / "nowhere")

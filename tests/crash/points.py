@@ -1,7 +1,7 @@
 """Processes that the kernel kills right before, or halfway through, their n-th change to a folder.
 
-A filter of system calls (seccomp) hands every call that changes files to `watch`, which lets it go
-on or kills the process. So calls are seen whoever makes them: Python, C, C++ or Rust, in any thread
+A filter of system calls (seccomp) hands every call that changes files to `watch`, which lets it run
+or kills the process. So calls are seen whoever makes them: Python, C, C++ or Rust, in any thread
 and child. Writing through shared maps of memory is not a call, and is not seen. x86-64 Linux alone.
 """
 
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 AVAILABLE = sys.platform == "linux" and platform.machine() == "x86_64"
-"""Whether this machine's calls have the numbers below."""
+"""True if this machine's calls have the numbers below."""
 
 # name: number, arguments that are descriptors, and those that are paths after their folders.
 _NOWHERE = -1
@@ -60,7 +60,7 @@ CALLS: dict[int, tuple[str, tuple[int, ...], tuple[tuple[int, int], ...]]] = {
     268: ("fchmodat", (), ((0, 1),)),
 }
 _FLAGS = {2: 1, 257: 2}
-"""Which argument of a call that opens says how."""
+"""Index of the argument with the flags, for calls that open a file."""
 _WRITES = {1: None, 18: 3}
 """Calls that can be torn, and which argument is their place in the file."""
 PATIENCE = 60
@@ -74,10 +74,10 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 @dataclass
 class Outcome:
-    """What became of a process that was watched."""
+    """End of a process that was watched."""
 
     changes: list[str]
-    """Those that it made, in order: the call and the path."""
+    """Changes that it made, in order: the call and the path."""
     killed: bool
     code: int
     """0 if it ended well."""
@@ -179,7 +179,7 @@ def _supervise(child: int, listener: int, root: str, last: int | None, torn: boo
 
 
 def _change(task: int, call: int, arguments: list[int], root: str) -> str | None:
-    """What a call would change below the root, if anything."""
+    """Return the path below the root that a call would change, or None."""
     name, descriptors, paths = CALLS[call]
     found = [_target(task, arguments[index]) for index in descriptors]
     for folder, path in paths:

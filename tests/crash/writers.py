@@ -1,7 +1,7 @@
 """Everything that writes: what it writes, and how that is read back.
 
-A writer is run in a folder of its own twice: for version 0, which makes what was complete before,
-and for version 1, which is killed. One that makes the same thing always starts from nothing.
+A writer is run twice, in its own folder: for version 0, which makes what was complete before,
+and for version 1, which is killed. One that always makes the same starts from nothing.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ from egosim_jax.worlds.tabletop import dataset
 
 SPEC = VideoSpec(frames=9, height=64, width=96)
 Read = Mapping[str, str]
-"""What is there, by name, as a digest; what is not there has no name."""
+"""Digests of the files that are there, by name."""
 
 
 @dataclass(frozen=True)
 class Writer:
-    """One kind of thing that is written, below a folder `place`."""
+    """A kind of file or folder that is written, below a folder `place`."""
 
     write: Callable[[Path, Path, int], object]
     """Given the place, the folder of inputs and the version."""
     read: Callable[[Path], Read]
     """Raises if what is there is neither complete nor absent."""
     before: bool = True
-    """Whether there is a version 0."""
+    """True if there is a version 0."""
     same_bytes: bool = True
-    """Whether two runs write the same files; else only what is read is compared."""
+    """True if two runs write the same files; else only what is read is compared."""
 
 
 def inputs(folder: Path) -> None:
@@ -234,7 +234,7 @@ def _read_checkpoints(place: Path) -> Read:
 
 
 def _encode(place: Path, inputs: Path, version: int) -> None:
-    """With a stand-in for the networks, which would only take time."""
+    """Write with placeholders for the networks, which would only take time."""
 
     class Encoding:
         config = configs.get("debug")

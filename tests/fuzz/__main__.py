@@ -25,9 +25,9 @@ class Fuzz:
     targets: tuple[str, ...] = ()
     """Names of formats; all if none is given."""
     cases: int = 1500
-    """Of each format."""
+    """Number of changed files of each format."""
     seed: int = 0
-    """Of the changes."""
+    """Seed of the changes."""
     seconds: float | None = None
     """Stop each format after so many."""
 

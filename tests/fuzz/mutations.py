@@ -23,7 +23,7 @@ def truncate(data: bytes, random: Random) -> bytes:
 
 
 def extend(data: bytes, random: Random) -> bytes:
-    """Append bytes."""
+    """Append random bytes."""
     return data + random.randbytes(random.choice((1, 16, 5000)))
 
 

@@ -21,7 +21,7 @@ HANGS = 60
 
 @dataclass
 class Counts:
-    """What came of the cases of a target."""
+    """Results of the cases of a target."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     kinds: Counter[str] = field(default_factory=Counter)
@@ -29,12 +29,12 @@ class Counts:
 
     @property
     def cases(self) -> int:
-        """How many there were."""
+        """Return the number of cases."""
         return sum(self.outcomes.values())
 
     @property
     def bad(self) -> int:
-        """Those that did not pass."""
+        """Return the cases that did not pass."""
         return sum(count for outcome, count in self.outcomes.items() if outcome not in GOOD)
 
 

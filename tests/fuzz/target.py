@@ -1,4 +1,4 @@
-"""What a fuzzer needs to know of a format: a valid sample, our reader and, if any, another one."""
+"""Targets of the fuzzer: a valid sample of a format, our reader and, if any, another one."""
 
 from __future__ import annotations
 
@@ -33,9 +33,11 @@ class Target:
     sealed: bool = False
     """The format carries our checksum: every change that alters the result must be refused."""
     reference: Callable[[Path], Any] | None = None
-    """An independent reader, whose result of a changed file ours must equal; None: then a changed
-    file that is read must give the sample's result, unless `lossy`."""
+    """Independent reader, whose result of a changed file ours must equal.
+
+    Without one, a changed file that is read must give the sample's result, unless `lossy`.
+    """
     lossy: str = ""
-    """Why a changed file may be read with another result though nobody can notice; else empty."""
+    """Reason that a changed file may be read with another result unnoticed; else empty."""
     mutations: tuple[Mutate, ...] = ()
     """Changes that know the format, besides those of bytes."""

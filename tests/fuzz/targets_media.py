@@ -1,4 +1,4 @@
-"""What a fuzzer needs to know of videos, images, point clouds, metadata and shards."""
+"""Fuzzing targets: videos, images, point clouds, metadata and shards."""
 
 from __future__ import annotations
 
@@ -470,7 +470,7 @@ TARGETS: list[Target] = [
         read=read_mp4,
         files=("*.mp4",),
         lossy="H.264 and MP4 have no checksum: a bit that leaves a stream or a table valid gives "
-        "other pixels, another rate, matrix or edit list, and no decoder can tell.",
+        "other pixels, another rate, matrix or edit list, and no decoder notices.",
         mutations=(change_box, move_box),
     ),
     Target(
@@ -478,7 +478,7 @@ TARGETS: list[Target] = [
         make=make_png,
         read=read_png,
         files=("*.png",),
-        lossy="A chunk whose CRC was computed anew is as good as any other.",
+        lossy="A chunk whose CRC was computed again is as good as any other.",
         mutations=(change_chunk,),
     ),
     Target(

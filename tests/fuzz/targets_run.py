@@ -1,4 +1,4 @@
-"""What runs write and read again: states, journals, configs, checkpoints, compiled programs."""
+"""Fuzzing targets: states, journals, configs, checkpoints, compiled programs."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _load_number(path: Path) -> int:
 
 
 def _read_journal(folder: Path) -> Any:
-    """Go on with the run; its phases that are done are read, the others made: 7 in any case."""
+    """Continue the run; its phases that are done are read, the others made: 7 in any case."""
     journal = Journal(folder, outputs=("clip_*",))
     journal.require("run", {"state": "3f" * 32, "seed": "0"})
     return [
@@ -110,7 +110,7 @@ def _make_config(folder: Path) -> None:
 
 
 def _read_config(folder: Path) -> Any:
-    """Go on with the run of that config: another one is refused."""
+    """Continue the run of that config: another one is refused."""
     run.open_folder(folder, CONFIG)
     return json.loads((folder / run.CONFIG).read_text("utf-8"))
 
@@ -191,7 +191,7 @@ def json_value(data: bytes, random: Random) -> bytes:
 
 
 def json_line(data: bytes, random: Random) -> bytes:
-    """Leave out, repeat or exchange lines."""
+    """Drop, repeat or exchange lines."""
     lines = data.splitlines(keepends=True)
     if not lines:
         return data

@@ -1,4 +1,4 @@
-"""What every command can start from."""
+"""Inputs that every command can start from."""
 
 from pathlib import Path
 
