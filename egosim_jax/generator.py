@@ -35,7 +35,7 @@ from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import Denoiser
 from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.program import Program, gathered, place
+from egosim_jax.program import CompiledFn, replicate_params, shard_params
 from egosim_jax.rendering import Renderer, jitted
 from egosim_jax.types import (
     Action,
@@ -110,10 +110,10 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
         mask=None if inputs.mask is None else inputs.mask.astype(jnp.float32),
         prior=encode(inputs.prior),
         hands=encode(inputs.hands),
-        text=gathered(networks.text)(inputs.ids, inputs.ids_mask),
+        text=replicate_params(networks.text)(inputs.ids, inputs.ids_mask),
         image=None
         if networks.image is None or inputs.pixels is None
-        else gathered(networks.image)(inputs.pixels),
+        else replicate_params(networks.image)(inputs.pixels),
     )
 
 
@@ -161,34 +161,36 @@ class Generator:
     ):
         self.config = config
         self.renderer = renderer
-        self.networks = networks = place(networks, mesh)
-        self._encode = Program(encode_condition, networks, mesh=mesh, about=("encode", config))
-        self._latents = Program(
+        self.networks = networks = shard_params(networks, mesh)
+        self._encode = CompiledFn(
+            encode_condition, networks, mesh=mesh, cache_key=("encode", config)
+        )
+        self._latents = CompiledFn(
             lambda vae, video: vae.encode(to_model(video)), networks.vae, mesh=mesh
         )
         shape = (*config.latent_shape, config.vae.latent_channels)
-        self._noise = Program(
+        self._noise = CompiledFn(
             lambda _, seeds: jax.vmap(lambda seed: jax.random.normal(jax.random.key(seed), shape))(
                 seeds
             ),
             nnx.Module(),
             mesh=mesh,
-            about=("noise", shape),
+            cache_key=("noise", shape),
         )
-        self._denoise = Program(
+        self._denoise = CompiledFn(
             lambda dit, condition, noise, *seeds: denoise(
                 dit, condition, noise, config, *map(_step_keys, seeds)
             ),
             networks.dit,
             mesh=mesh,
-            about=("denoise", config),
+            cache_key=("denoise", config),
             donate_argnums=2,
         )
-        self._decode = Program(
+        self._decode = CompiledFn(
             lambda vae, x: to_uint8(vae.decode(x)),
             networks.vae,
             mesh=mesh,
-            about=("decode", config),
+            cache_key=("decode", config),
         )
 
     @classmethod
@@ -220,7 +222,7 @@ class Generator:
             apply(networks.dit, read_lora(lora, config.dit), scale=lora_scale)
         return cls(config.at(folder), networks, mesh, renderer=renderer)
 
-    def programs(self, batch: int) -> Iterator[tuple[str, Program, tuple]]:
+    def programs(self, batch: int) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """What `generate` runs for a batch of this size, by name, and the shapes it is given."""
         inputs = Inputs.shapes(batch, self.config)
         yield "encode", self._encode, (inputs,)

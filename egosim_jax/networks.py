@@ -67,7 +67,7 @@ class ModelConfig:
     process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
     """Path from data to noise, and the quantity that the denoiser predicts."""
     solver: Euler | DDIM | UniPC | DPMSolver = field(default_factory=Euler)
-    """Sampler."""
+    """Sampler of the denoising steps."""
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
     steps: int | tuple[int | float, ...] = 50

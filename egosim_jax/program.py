@@ -1,4 +1,4 @@
-"""A function of networks, compiled, and where their weights lie: only here inference is jitted."""
+"""Compiled functions of networks, and the placement of their weights; inference is jitted here."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from egosim_jax.sharding import batch_sharding, check_batch, several_devices, st
 Module = TypeVar("Module")
 
 
-class Program:
-    """A function of the networks and arrays, compiled once for each shape of its arguments.
+class CompiledFn:
+    """A function of networks and arrays, compiled once for each shape of its arguments.
 
-    On a mesh, on which `place` has put the networks, all arrays have a leading batch axis. Raises
-    `InputError` before compiling for a batch that the mesh does not divide. What is `about` tells
-    the function from others; a program that has it is kept between starts (`io/executables.py`).
+    On a mesh, on which `shard_params` has placed the networks, all arrays have a leading batch
+    axis. Raises `InputError` before compiling for a batch that the mesh does not divide. With a
+    `cache_key`, which identifies function and config, what is compiled is cached between starts
+    (`io/executables.py`).
     """
 
     def __init__(
@@ -31,45 +32,45 @@ class Program:
         networks: Any,
         *,
         mesh: Mesh | None = None,
-        about: Any = None,
+        cache_key: Any = None,
         **options: Any,
     ):
         share_with_jax()
         graph, self._params = nnx.split(networks, nnx.Param)
-        self._mesh, self._about = mesh, about
+        self._mesh, self._cache_key = mesh, cache_key
         if mesh is not None:
             options["out_shardings"] = batch_sharding(mesh)
         self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
         self._compiled: dict[Any, Any] = {}
 
     def trace(self, *args: Any) -> Any:
-        """The program for these arguments, arrays or shapes, as `jax.jit` traces it."""
+        """Return the trace of `jax.jit` for these arguments, arrays or shapes."""
         with self._on_mesh():
             return self._jit.trace(self._params, *self._placed(args))
 
     def compile(self, *args: Any) -> Any:
-        """Compile for these arguments, arrays or shapes, or find what was compiled before."""
-        given = self._placed(args)
+        """Compile for these arguments, arrays or shapes, or load it from the cache."""
+        placed = self._placed(args)
 
         def compile() -> Any:
-            return self._jit.lower(self._params, *given).compile()
+            return self._jit.lower(self._params, *placed).compile()
 
         with self._on_mesh():
             compiled = (
                 compile()
-                if self._about is None
-                else cached_compile(self._about, (self._params, given), compile)
+                if self._cache_key is None
+                else cached_compile(self._cache_key, (self._params, placed), compile)
             )
         self._compiled[_signature(args)] = compiled
         return compiled
 
     def shapes(self, *args: Any) -> Any:
-        """The shapes of the answer."""
+        """Return the shapes and dtypes of the results."""
         compiled = self._compiled.get(_signature(args))
         return (compiled or self.trace(*args)).out_info
 
     def _placed(self, args: tuple) -> tuple:
-        """The shapes of arguments, on their devices."""
+        """Return the shapes of arguments with their shardings."""
         placed = None
         if self._mesh is not None:
             check_batch(jax.tree.leaves(args)[0].shape[0], self._mesh)
@@ -79,7 +80,7 @@ class Program:
         )
 
     def __call__(self, *args: Any) -> Any:
-        """Run, compiling first if nobody has."""
+        """Run the function; compile it first if necessary."""
         if (signature := _signature(args)) not in self._compiled:
             self.compile(*args)
         if self._mesh is not None:
@@ -94,27 +95,26 @@ def _signature(args: Any) -> Any:
     return tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(args))
 
 
-def place(networks: Module, mesh: Mesh | None) -> Module:
-    """Networks whose weights lie on a mesh as the rules say; the same ones without a mesh.
+def shard_params(networks: Module, mesh: Mesh | None) -> Module:
+    """Return networks with their weights sharded over a mesh; unchanged without one.
 
-    The weights may be shapes: then they are those of weights that would lie there.
+    The weights may be shapes, which then get the shardings.
     """
     if mesh is None:
         return networks
     graph, params = nnx.split(networks, nnx.Param)
-    placed = jax.tree.map(_put, params, state_sharding(mesh, params))
-    return nnx.merge(graph, placed)
+    return nnx.merge(graph, jax.tree.map(_put, params, state_sharding(mesh, params)))
 
 
 def _put(leaf: Any, sharding: Any) -> Any:
-    """An array on its devices; a shape, of an array that would lie there."""
+    """Return an array placed by a sharding; of a shape, the shape with that sharding."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
     return jax.device_put(leaf, sharding)
 
 
-def gathered(network: Module) -> Module:
-    """The network, its weights fetched whole to every device, which then works by itself."""
+def replicate_params(network: Module) -> Module:
+    """Return a network with its weights replicated on every device of the current mesh."""
     if not several_devices():
         return network
     graph, params = nnx.split(network)

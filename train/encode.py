@@ -30,12 +30,13 @@ from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.transforms import decode_record, record_length
-from egosim_jax.generator import Inputs, Program, batches, place, truths
+from egosim_jax.generator import Inputs, batches, truths
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote
 from egosim_jax.io.video import Decoding
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.program import CompiledFn, shard_params
 from egosim_jax.progress import track
 from egosim_jax.sharding import check_batch
 from egosim_jax.types import InputError, Triplet, check_counts
@@ -54,7 +55,7 @@ class Encoding:
 
     def __init__(self, config: ModelConfig, encoders: Networks, mesh: Mesh | None = None):
         self.config = config
-        self._encode = Program(_encode, place(encoders, mesh), mesh=mesh)
+        self._encode = CompiledFn(_encode, shard_params(encoders, mesh), mesh=mesh)
 
     def __call__(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
         """Return the arrays of each triplet's record.

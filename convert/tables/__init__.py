@@ -65,9 +65,11 @@ class Comparison:
 
     def output(self, *inputs: Any, call: Callable[..., Any] | None = None) -> np.ndarray:
         """Return the output of the network, or of `call(network, *inputs)`."""
-        from egosim_jax.program import Program
+        from egosim_jax.program import CompiledFn
 
-        return np.asarray(Program(call or (lambda network, *x: network(*x)), self.network)(*inputs))
+        return np.asarray(
+            CompiledFn(call or (lambda network, *x: network(*x)), self.network)(*inputs)
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,7 @@ from egosim_jax import configs
 from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
 from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
 from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.program import Program
+from egosim_jax.program import CompiledFn
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
@@ -43,8 +43,8 @@ def triplets() -> list[Triplet]:
 def test_a_batch_of_four_equals_four_batches_of_one(networks, triplets):
     """Relative L2 of the latents in float32: the sums of a batch run in another order."""
 
-    encode = Program(encode_condition, networks)
-    walk = Program(lambda dit, *args: denoise(dit, *args, CONFIG), networks.dit)
+    encode = CompiledFn(encode_condition, networks)
+    walk = CompiledFn(lambda dit, *args: denoise(dit, *args, CONFIG), networks.dit)
 
     def latents(batch: list[Triplet], seeds: list[int]) -> np.ndarray:
         noise = Generator(CONFIG, networks).noise(seeds)
@@ -100,7 +100,7 @@ def test_a_solver_that_does_not_fit_the_process_is_refused():
 
 def test_each_condition_changes_the_latents(networks, triplets):
     """Text, image, prior, hands and mask all reach the denoiser."""
-    condition = Program(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
+    condition = CompiledFn(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
     noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.latent_shape, 16))
     run = jax.jit(lambda condition: denoise(networks.dit, condition, noise, CONFIG))
     full = run(condition)
@@ -110,7 +110,7 @@ def test_each_condition_changes_the_latents(networks, triplets):
 
 
 def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, triplets):
-    condition = Program(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
+    condition = CompiledFn(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
     noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.latent_shape, 16))
     one_step = dataclasses.replace(CONFIG, steps=1)
 
