@@ -79,7 +79,7 @@ class Inspect:
             for source in (*(f.source for f in folder.found), *folder.unknown):
                 for name, tensor in source.tensors.items():
                     print(f"{name}  {list(tensor.shape)}  {tensor.dtype.name}")
-        return command.DONE
+        return command.ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +137,7 @@ class Weights:
                 with atomic_folder(self.out / config.tokenizer.kind) as temporary:
                     for name, data in kept.items():
                         (temporary / name).write_bytes(data)
-        return command.DONE
+        return command.ExitCode.DONE
 
 
 LARGEST = 5_000_000_000
@@ -189,7 +189,7 @@ class ToTorch:
                 files = pipeline_files(config, [name for name, *_ in planned])
                 for path, content in files.items():
                     write_json(self.out / path, content)
-        return command.DONE
+        return command.ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,14 +250,14 @@ class Lora:
             ]
             with lock_folder(self.out.parent):
                 _write(self.out, weights, origin=origin, metadata=metadata)
-            return command.DONE
+            return command.ExitCode.DONE
         file = self.merge / "dit.safetensors"
         weights = merged(read_safetensors(file), changes, config, scale=self.scale)
         metadata = {"format": OURS, "config": self.config, "lora": quote_path(self.source.name)}
         with lock_folder(self.out):
             _write(self.out / file.name, weights, origin=[file, *origin], metadata=metadata)
             link_others(self.out, self.merge)
-        return command.DONE
+        return command.ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -326,7 +326,7 @@ class Verify:
         if not reference.possible():
             print(f"no forward compared: that needs {', '.join(reference.MODULES)}")
         print("\n".join(wrong), end="\n" if wrong else "")
-        return command.FAILED if wrong else command.DONE
+        return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
 
 
 def apart(out: Path, source: Path) -> None:

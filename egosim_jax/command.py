@@ -33,9 +33,6 @@ class ExitCode(IntEnum):
     """Training was interrupted and saved: run the same command again."""
 
 
-DONE, FAILED, USAGE, PARTIAL, HUNG, RESUBMIT = ExitCode
-
-
 class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
     """Early end of a command, with the message to print and the exit code."""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from egosim_jax.command import DONE
+from egosim_jax.command import ExitCode
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.models.wan.config import Remat
@@ -88,7 +88,7 @@ class FineTuning(Recipe):
             and Samples(model=model, latents=self.validation, vae=weights, count=self.samples),
         )
         print(write_trained(trained, out, model=model, start=weights))
-        return DONE
+        return ExitCode.DONE
 
     def model(self) -> ModelConfig:
         """Return the model's config with the options of this recipe.

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax import configs
-from egosim_jax.command import DONE
+from egosim_jax.command import ExitCode
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.progress import track
 from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
@@ -107,7 +107,7 @@ class FromScratch(Recipe):
         networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
         networks.save(out / "weights", dtype=self.weights_dtype)
         print(out / "weights")
-        return DONE
+        return ExitCode.DONE
 
     def _autoencoder(self, frames: Mapping[str, Path], out: Path) -> WanVAE:
         """Return the trained VAE, with latents of mean 0 and standard deviation 1."""

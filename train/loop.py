@@ -25,7 +25,7 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import RESUBMIT, CommandExit
+from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
@@ -176,7 +176,8 @@ class Run:
             if preempted and not last:
                 log0(f"time spent:\n{self.clock.table()}")
                 raise CommandExit(
-                    f"{self.out}: stopped and saved after step {step}; run it again", RESUBMIT
+                    f"{self.out}: stopped and saved after step {step}; run it again",
+                    ExitCode.RESUBMIT,
                 )
         return state
 

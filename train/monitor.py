@@ -23,7 +23,7 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import FAILED, HUNG, CommandExit
+from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.conditioning.video import to_uint8
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader
@@ -159,7 +159,7 @@ class Watchdog:
                     file=sys.stderr,
                 )
                 faulthandler.dump_traceback(all_threads=True)
-                os._exit(HUNG)
+                os._exit(ExitCode.HUNG)
 
 
 MAX_CONSECUTIVE_SKIPS = 3
@@ -200,7 +200,7 @@ class SkipMonitor:
             raise CommandExit(
                 f"{count} updates in a row were skipped, so the run stops. The weights are those "
                 "before them: inspect the records above, or lower the learning rate.",
-                FAILED,
+                ExitCode.FAILED,
             )
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 
-from egosim_jax.command import DONE, FAILED
+from egosim_jax.command import ExitCode
 from egosim_jax.preflight.report import OutOfMemory, Report, compile_for, plain, size, text
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.progress import track
@@ -67,7 +67,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
                 print(_table(others, stage.training.batch_size))
     if as_json:
         print(json.dumps(found, indent=2))
-    return DONE if fit else FAILED
+    return ExitCode.DONE if fit else ExitCode.FAILED
 
 
 def compile_step(stage: Stage, target: Target) -> Report | OutOfMemory:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
 from egosim_jax.types import WAN_GRID, VideoSpec, check_counts
 
@@ -67,7 +67,7 @@ class Pack:
         for problem in problems:
             print(f"skipped: {problem}", file=sys.stderr)
         print(self.out)
-        return PARTIAL if problems else DONE
+        return ExitCode.PARTIAL if problems else ExitCode.DONE
 
     def _spec(self) -> VideoSpec | None:
         if self.size is None:
@@ -130,7 +130,7 @@ class Encode:
                 decoding=self.decoding,
             )
         print(self.out)
-        return DONE
+        return ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +180,7 @@ class Make:
         for _ in track(progress, "making", total=self.scenes):
             pass
         print(self.out)
-        return DONE
+        return ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +206,7 @@ class Check:
             found += len(problems)
         summary = f"{manifest.records} records in {len(manifest.shards)} shards"
         print(f"{summary}: {found or 'no'} problems", file=sys.stderr)
-        return PARTIAL if found else DONE
+        return ExitCode.PARTIAL if found else ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +243,7 @@ class Look:
         moments = np.linspace(0, last, self.moments).round().astype(int).tolist()
         draw_sheet(clips, self.out, moments=moments, width=self.width)
         print(self.out)
-        return DONE
+        return ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,7 +284,7 @@ class Stats:
         console = Console()
         console.print(table)
         console.print(splits)
-        return DONE
+        return ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.command import DONE, FAILED
+from egosim_jax.command import ExitCode
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -60,7 +60,7 @@ class Doctor:
         for line in broken:
             console.print(line)
         _print_models(console, self._folders())
-        return FAILED if broken else DONE
+        return ExitCode.FAILED if broken else ExitCode.DONE
 
     def _folders(self) -> list[Path]:
         from egosim_jax import configs

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from egosim_jax.command import DONE
+from egosim_jax.command import ExitCode
 from egosim_jax.rendering import RendererName
 from egosim_jax.types import InputError, check_counts, check_seed
 
@@ -64,7 +64,7 @@ class MakeEpisode:
         episode = self._own() if self.actions else self._tabletop()
         episode.save(self.out)
         print(f"{self.out}: {summary(episode)}")
-        return DONE
+        return ExitCode.DONE
 
     def _tabletop(self) -> episodes.Episode:
         from egosim_jax import configs
@@ -155,7 +155,7 @@ class CheckEpisode:
         if self.config is not None:
             check_fits(episode, configs.get(self.config).video, self.config)
         print(f"{self.path}: {summary(episode)}")
-        return DONE
+        return ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +194,7 @@ class ShowEpisode:
         out = self.out or Path(f"{self.path.stem}.png")
         draw_sheet(sheet, out, moments=moments)
         print(out)
-        return DONE
+        return ExitCode.DONE
 
     def _overlay(self, state: SceneState, action: Action) -> np.ndarray:
         import numpy as np

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.command import ExitCode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,4 +43,4 @@ class Evaluate:
         clips = select(read_metadata(self.metadata), where=self.where)
         evaluation = evaluate(self.generated, clips, size=self.size, out=self.out)
         evaluation.print()
-        return PARTIAL if evaluation.skipped else DONE
+        return ExitCode.PARTIAL if evaluation.skipped else ExitCode.DONE

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from egosim_jax.command import DONE
+from egosim_jax.command import ExitCode
 from egosim_jax.experiments.config import (
     Continuous,
     Debug,
@@ -46,4 +46,4 @@ class Experiment:
         """Run the chosen experiment."""
         name = MODULES[type(self.command)]
         import_module(f"egosim_jax.experiments.{name}").run(self.command)
-        return DONE
+        return ExitCode.DONE

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from egosim_jax.command import DONE, PARTIAL, USAGE
+from egosim_jax.command import ExitCode
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -111,8 +111,8 @@ class Generate:
             windows = self._windows(scenes)
         outcome = job.generate(windows)
         if outcome.rejected == len(windows):
-            return USAGE
-        return PARTIAL if outcome.rejected or outcome.failed else DONE
+            return ExitCode.USAGE
+        return ExitCode.PARTIAL if outcome.rejected or outcome.failed else ExitCode.DONE
 
     def _check(self) -> None:
         check_counts(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from math import prod
 from typing import TYPE_CHECKING, Any
 
-from egosim_jax.command import DONE, FAILED
+from egosim_jax.command import ExitCode
 from egosim_jax.types import MeshConfig, check_counts
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class Preflight:
             print(json.dumps(values, indent=2))
         else:
             print(_summary(found, size))
-        return DONE if all(report.fits for report in found.values()) else FAILED
+        return ExitCode.DONE if all(report.fits for report in found.values()) else ExitCode.FAILED
 
 
 def compile_generation(

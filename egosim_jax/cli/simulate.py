@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from egosim_jax.command import DONE
+from egosim_jax.command import ExitCode
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import up_of, write_portrait
@@ -104,7 +104,7 @@ class Simulate:
         if episode.ground_truth:
             _print(report)
         print(folder / "contact_sheet.png")
-        return DONE
+        return ExitCode.DONE
 
     def _episode(self, video: VideoSpec) -> Episode:
         """Return the episode to simulate, with the chosen clips and first frame."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.command import DONE
+from egosim_jax.command import ExitCode
 from egosim_jax.rendering.portrait import Up, up_of, write_portrait
 from egosim_jax.rendering.recording import RECORDING
 from egosim_jax.types import InputError
@@ -56,7 +56,7 @@ class View:
         objects = ", ".join(state.names.values()) or "no named objects"
         print(f"{len(state.points_m)} points, {size} m, {objects}")
         print(out)
-        return DONE
+        return ExitCode.DONE
 
     def _state(self) -> SceneState:
         from egosim_jax.state.snapshot import load, read_ply

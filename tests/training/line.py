@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from egosim_jax.command import DONE, run_with_exit_codes
+from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
 from egosim_jax.sharding import MeshConfig
@@ -100,7 +100,7 @@ def main(out: str, data: str, changes: str) -> int:
     def run() -> int:
         with distributed_context():
             train(task, training(**settings), data=Path(data), validation=None, out=Path(out))
-        return DONE
+        return ExitCode.DONE
 
     return run_with_exit_codes(run)
 

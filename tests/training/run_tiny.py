@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from egosim_jax.command import DONE, run_with_exit_codes
+from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.io import weights
 from egosim_jax.testing import tiny_model
@@ -42,7 +42,7 @@ def main(data: str, out: str, steps: str, save_every: str) -> int:
             schedule = training(int(steps), int(save_every))
             networks = train(TASK, schedule, data=Path(data), validation=None, out=Path(out))
             weights.save(Path(out) / "dit.safetensors", networks.dit)
-        return DONE
+        return ExitCode.DONE
 
     return run_with_exit_codes(run)
 

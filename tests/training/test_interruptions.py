@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egosim_jax.command import DONE, HUNG, RESUBMIT
+from egosim_jax.command import ExitCode
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.train.distributed import free_local_address
@@ -44,7 +44,7 @@ def start(out: Path, data: Path, *, devices: int = 1, env: dict[str, str] | None
 def run(out: Path, data: Path, **settings) -> str:
     process = start(out, data, **settings)
     said = process.communicate(timeout=300)[1]
-    assert process.returncode == DONE, said
+    assert process.returncode == ExitCode.DONE, said
     return said
 
 
@@ -72,7 +72,7 @@ def test_sigterm_saves_the_step_and_ends_with_75_and_the_rest_is_the_same(
     wait_for(out, 9, process)
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=120)[1]
-    assert process.returncode == RESUBMIT, said
+    assert process.returncode == ExitCode.RESUBMIT, said
     done = len(logged(out))
     assert f"saved after step {done}" in said
     assert done < LONG["steps"]
@@ -85,7 +85,7 @@ def test_a_run_that_hangs_prints_its_stacks_and_ends_with_70(points, tmp_path):
     late = [next(batches)["record"] for _ in range(5)][-1]
     process = start(tmp_path / "run", points, hang=int(late[0]), hang_timeout_s=1.0)
     said = process.communicate(timeout=300)[1]
-    assert process.returncode == HUNG, said
+    assert process.returncode == ExitCode.HUNG, said
     assert "no update finished" in said
     assert "train/loop.py" in said
 
@@ -120,24 +120,24 @@ def pair(out: Path, data: Path, **settings) -> list[subprocess.Popen]:
 def finish(processes: list[subprocess.Popen]) -> list[int]:
     said = [process.communicate(timeout=300)[1] for process in processes]
     codes = [process.returncode for process in processes]
-    assert set(codes) <= {DONE, RESUBMIT}, said
+    assert set(codes) <= {ExitCode.DONE, ExitCode.RESUBMIT}, said
     return codes
 
 
 def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
     schedule = LONG | {"pause": 0.06}
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert finish(pair(whole, points, **schedule)) == [DONE, DONE]
+    assert finish(pair(whole, points, **schedule)) == [ExitCode.DONE, ExitCode.DONE]
     processes = pair(stopped, points, **schedule)
     wait_for(stopped, 9, *processes)
     processes[1].send_signal(signal.SIGTERM)
-    assert finish(processes) == [RESUBMIT, RESUBMIT]
+    assert finish(processes) == [ExitCode.RESUBMIT, ExitCode.RESUBMIT]
     processes = pair(stopped, points, **schedule)
     wait_for(stopped, len(logged(stopped)) + 9, *processes)
     for process in processes:
         process.kill()
         process.communicate()
-    assert finish(pair(stopped, points, **schedule)) == [DONE, DONE]
+    assert finish(pair(stopped, points, **schedule)) == [ExitCode.DONE, ExitCode.DONE]
     assert logged(stopped) == logged(whole)
     assert [line["step"] for line in logged(whole)] == list(range(1, schedule["steps"] + 1))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from egosim_jax.command import FAILED, CommandExit
+from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.loop import train
@@ -73,7 +73,7 @@ def test_three_skips_in_a_row_stop_the_run_with_the_names(tmp_path, capsys):
     data = write_points(tmp_path / "points", huge=tuple(range(POINTS)))
     with pytest.raises(CommandExit, match="3 updates in a row") as stopped:
         fit(tmp_path / "run", data)
-    assert stopped.value.code == FAILED
+    assert stopped.value.code == ExitCode.FAILED
     said = capsys.readouterr().err
     assert [f"step {n} skipped" in said for n in (1, 2, 3, 4)] == [True, True, True, False]
 

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
     ("program", "name"), [(egosim, "egosim"), (train, "egosim-train"), (convert, "egosim-convert")]
 )
 def test_every_program_says_its_version(program, name, capsys):
-    assert program(["--version"]) == command.DONE
+    assert program(["--version"]) == command.ExitCode.DONE
     assert capsys.readouterr().out == f"{name} {egosim_jax.__version__}\n"
 
 
@@ -34,7 +34,7 @@ def test_python_dash_m_egosim_jax_is_egosim(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["egosim_jax", "--version"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_module("egosim_jax", run_name="__main__")
-    assert ended.value.code == command.DONE
+    assert ended.value.code == command.ExitCode.DONE
     assert capsys.readouterr().out.startswith("egosim ")
 
 
@@ -50,14 +50,16 @@ def test_python_dash_m_egosim_jax_is_egosim(monkeypatch, capsys):
     ],
 )
 def test_a_mistyped_command_gets_a_suggestion_in_one_line(program, args, meant, capsys):
-    assert program(args) == command.USAGE
+    assert program(args) == command.ExitCode.USAGE
     said = capsys.readouterr().err
     assert meant in said
     assert said.count("\n") == 1
 
 
 def test_a_mistyped_config_gets_a_suggestion(capsys, tmp_path):
-    assert egosim(["generate", "--config", "debugg", "--out", str(tmp_path)]) == command.USAGE
+    assert (
+        egosim(["generate", "--config", "debugg", "--out", str(tmp_path)]) == command.ExitCode.USAGE
+    )
     assert "Nearest: debug." in capsys.readouterr().err
 
 
@@ -66,7 +68,7 @@ def test_seeds_out_of_range_are_refused(seed, tmp_path, capsys):
     with pytest.raises(InputError, match="--seed must be a whole number"):
         TrainConfig(steps=1, seed=seed)
     args = ["simulate", "--seed", str(seed), "--out", str(tmp_path)]
-    assert egosim(args) == command.USAGE
+    assert egosim(args) == command.ExitCode.USAGE
     assert "--seed must be a whole number" in capsys.readouterr().err
 
 
@@ -75,7 +77,7 @@ def test_a_missing_extra_is_found_before_anything_starts(extra, tmp_path, monkey
     monkeypatch.setattr("egosim_jax.metric_writers.find_spec", lambda name: None)
     monkeypatch.delitem(sys.modules, "tensorboardX", raising=False)
     option = [f"--denoiser.{extra}", *(["clips"] if extra == "wandb" else [])]
-    assert train(["debug", "--out", str(tmp_path / "run"), *option]) == command.USAGE
+    assert train(["debug", "--out", str(tmp_path / "run"), *option]) == command.ExitCode.USAGE
     assert f"pip install 'egosim-jax[{extra}]'" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
@@ -90,10 +92,10 @@ def test_the_preflights_search_is_announced_and_can_be_skipped(monkeypatch, caps
         monkeypatch.setattr(preflight, name, lambda *report: "")
     monkeypatch.setattr(preflight.math, "isnan", lambda value: False)
     options = ["debug", "--preflight", "cpu:1"]
-    assert train([*options, "--no-search"]) == command.DONE
+    assert train([*options, "--no-search"]) == command.ExitCode.DONE
     assert not searched
     assert "--no-search" not in capsys.readouterr().err
-    assert train(options) == command.DONE
+    assert train(options) == command.ExitCode.DONE
     assert len(searched) == 1
     assert "takes minutes; --no-search skips it" in capsys.readouterr().err
 
@@ -110,7 +112,7 @@ def test_an_error_of_the_system_is_one_line_with_a_fix(code, capsys):
     def run():
         raise OSError(code, command.os.strerror(code), "/some/where")
 
-    assert command.run_with_exit_codes(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.ExitCode.FAILED
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith("error: /some/where: ")
@@ -121,7 +123,7 @@ def test_a_library_that_hides_the_systems_reason_in_its_text_is_understood(capsy
     def run():
         raise RuntimeError(f"write failed\n{command.os.strerror(errno.ENOSPC)} [/x/y]")
 
-    assert command.run_with_exit_codes(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.ExitCode.FAILED
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "Free space" in said
@@ -131,7 +133,7 @@ def test_too_little_memory_is_one_line(capsys):
     def run():
         raise MemoryError
 
-    assert command.run_with_exit_codes(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.ExitCode.FAILED
     assert capsys.readouterr().err == (
         "error: not enough memory. Use smaller batches or a machine with more memory.\n"
     )
@@ -142,7 +144,7 @@ def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "argv", ["egosim", "data", "make", "--out", "a folder"])
-    assert command.run_with_exit_codes(run) == command.FAILED
+    assert command.run_with_exit_codes(run) == command.ExitCode.FAILED
     said = "interrupted; to continue: egosim data make --out 'a folder'\n"
     assert capsys.readouterr().err == said
 

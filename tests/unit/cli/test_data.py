@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from egosim_jax.cli.data import Check, Look, Pack, Stats
-from egosim_jax.command import DONE, FAILED, PARTIAL, USAGE, run_with_exit_codes
+from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.atomic import LOCK, hold_folder
 from egosim_jax.io.video import read_video
@@ -23,7 +23,7 @@ def out(tmp_path):
 
 
 def test_pack_stores_each_clip_and_prints_the_folder(clips, out, capsys):
-    assert Pack(metadata=clips, out=out).run() == DONE
+    assert Pack(metadata=clips, out=out).run() == ExitCode.DONE
     assert capsys.readouterr().out.strip() == str(out)
     reader = ShardReader(out)
     assert reader.manifest.kind == "videos"
@@ -52,7 +52,7 @@ def test_pack_takes_the_selected_rows(clips, out):
 
 def test_pack_skips_and_reports_a_bad_clip(clips, out, capsys):
     (clips.parent / "clip0" / "pc_mask_video.mp4").unlink()
-    assert Pack(metadata=clips, out=out).run() == PARTIAL
+    assert Pack(metadata=clips, out=out).run() == ExitCode.PARTIAL
     assert (
         f"skipped: metadata.csv line 2 (clip0): {clips.parent}/clip0/pc_mask_video.mp4 cannot"
         in capsys.readouterr().err
@@ -77,7 +77,7 @@ def test_pack_refuses_to_replace_shards_unasked(clips, out):
 def test_check_of_valid_shards_prints_nothing(clips, out, capsys):
     Pack(metadata=clips, out=out).run()
     capsys.readouterr()
-    assert Check(shards=out).run() == DONE
+    assert Check(shards=out).run() == ExitCode.DONE
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "2 records in 1 shards: no problems" in captured.err
@@ -88,14 +88,14 @@ def test_check_prints_each_problem(clips, out, capsys):
     capsys.readouterr()
     shard = out / "shard-00000.array_record"
     shard.write_bytes(shard.read_bytes()[:-1])
-    assert Check(shards=out).run() == PARTIAL
+    assert Check(shards=out).run() == ExitCode.PARTIAL
     assert str(shard) in capsys.readouterr().out
 
 
 def test_stats_name_kind_arrays_and_splits(clips, out, capsys):
     Pack(metadata=clips, out=out, size=(16, 32), num_frames=5).run()
     capsys.readouterr()
-    assert Stats(shards=out).run() == DONE
+    assert Stats(shards=out).run() == ExitCode.DONE
     printed = capsys.readouterr().out
     for words in ("frames", "2 in 1 shards", "uint8 [5 16 32 3]", "5 frames of 32x16", "train"):
         assert words in printed
@@ -115,7 +115,7 @@ def test_look_draws_the_first_clip_of_each_value_of_a_column(make_clips, out, tm
     Pack(metadata=make_clips(clips=5), out=out, size=(16, 32), num_frames=5).run()
     sheet = tmp_path / "sheet.png"
     look = Look(shards=out, out=sheet, by=("split",), streams=("target", "prior"), moments=3)
-    assert look.run() == DONE
+    assert look.run() == ExitCode.DONE
     with Image.open(sheet) as picture:
         assert picture.size == (3 * 240, 2 * (16 + 2 * 120))
     Look(shards=out, out=sheet, limit=4, streams=("hands",), moments=3, width=32).run()
@@ -152,7 +152,7 @@ BAD_CLIPS = {
 @pytest.mark.parametrize("how", BAD_CLIPS)
 def test_one_bad_clip_does_not_end_the_batch(clips, out, capsys, how):
     BAD_CLIPS[how](clips.parent / "clip0" / "hand_keypoint_video.mp4")
-    assert Pack(metadata=clips, out=out).run() == PARTIAL
+    assert Pack(metadata=clips, out=out).run() == ExitCode.PARTIAL
     assert "skipped: metadata.csv line 2 (clip0)" in capsys.readouterr().err
     assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
 
@@ -160,7 +160,7 @@ def test_one_bad_clip_does_not_end_the_batch(clips, out, capsys, how):
 def test_a_nul_in_a_path_does_not_end_the_batch(clips, out, capsys):
     text = clips.read_text().replace("clip0/ego_prior_video.mp4", "clip0/ego\0.mp4")
     clips.write_text(text)
-    assert Pack(metadata=clips, out=out).run() == PARTIAL
+    assert Pack(metadata=clips, out=out).run() == ExitCode.PARTIAL
     assert "null byte" in capsys.readouterr().err
     assert [record.metadata["video_id"] for record in ShardReader(out)] == ["clip1"]
 
@@ -193,20 +193,20 @@ def refused(command, capsys):
 def test_a_file_where_a_folder_has_to_be_is_one_line(clips, out, tmp_path, capsys):
     out.write_text("a file")
     code, line = refused(Pack(metadata=clips, out=out), capsys)
-    assert code == USAGE
+    assert code == ExitCode.USAGE
     assert "Not a directory" in line
     code, line = refused(Check(shards=out), capsys)
-    assert code == USAGE
+    assert code == ExitCode.USAGE
     assert "is not a dataset" in line
     for command in (Stats(shards=clips), Look(shards=clips, out=tmp_path / "a.png")):
-        assert refused(command, capsys)[0] == USAGE
+        assert refused(command, capsys)[0] == ExitCode.USAGE
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="nothing is read-only for root")
 def test_a_read_only_folder_is_one_line(clips, tmp_path, capsys):
     (tmp_path / "fixed").mkdir(mode=0o555)
     code, line = refused(Pack(metadata=clips, out=tmp_path / "fixed" / "shards"), capsys)
-    assert code == FAILED
+    assert code == ExitCode.FAILED
     assert "Permission denied" in line
 
 
@@ -219,7 +219,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_dataset(clips, out, capsys):
         code, line = refused(Pack(metadata=clips, out=out, overwrite=True), capsys)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert code == FAILED
+    assert code == ExitCode.FAILED
     assert "File too large" in line
     after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != LOCK}
     assert after == before
@@ -235,7 +235,7 @@ def test_a_second_process_on_the_same_folder_is_one_line(clips, out):
     )
     command = [sys.executable, "-c", program, str(clips), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == USAGE
+    assert done.returncode == ExitCode.USAGE
     assert f"in use by another process (PID {os.getpid()})" in done.stderr
     assert "Traceback" not in done.stderr
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.cli.evaluate import Evaluate
-from egosim_jax.command import DONE, PARTIAL
+from egosim_jax.command import ExitCode
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.metrics.image import psnr, ssim
 from egosim_jax.types import InputError
@@ -31,7 +31,7 @@ def metrics(folder):
 
 
 def test_a_clip_is_compared_with_its_ground_truth_from_frame_1_on(clips, run):
-    assert Evaluate(generated=run, metadata=clips).run() == DONE
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
     generated, reference = read_video(run / "clip1.mp4").frames, target_of(clips, "clip1")
     scores = metrics(run)["clip1"]
     assert scores["generated"]["psnr"] == pytest.approx(psnr(generated, reference)[1:].mean())
@@ -69,7 +69,7 @@ def test_results_name_the_windows(clips, run):
     write_video(run / "clip0_3.mp4", target_of(clips, "clip0")[3:8], 16)
     line = {"video_id": "clip0_3", "source_id": "clip0", "start": 3, "status": "done"}
     (run / "results.jsonl").write_text(json.dumps(line) + "\n")
-    assert Evaluate(generated=run, metadata=clips).run() == DONE
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
     assert list(metrics(run)) == ["clip0_3"]
     generated, reference = read_video(run / "clip0_3.mp4").frames, target_of(clips, "clip0")[3:8]
     expected = psnr(generated, reference)[1:].mean()
@@ -80,7 +80,7 @@ def test_the_last_line_of_a_clip_counts(clips, run):
     lines = [{"video_id": "clip0", "source_id": "clip0", "start": 0, "status": "failed"}]
     lines.append({**lines[0], "status": "done"})
     (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert Evaluate(generated=run, metadata=clips).run() == DONE
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
 
 
 def test_a_clip_that_failed_is_skipped_and_named(clips, run, capsys):
@@ -89,19 +89,19 @@ def test_a_clip_that_failed_is_skipped_and_named(clips, run, capsys):
         for name, status in (("clip0", "failed"), ("clip1", "done"))
     ]
     (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.PARTIAL
     assert "skipped: clip0: its generation failed" in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
 
 
 def test_a_missing_clip_is_skipped_and_named(clips, run, capsys):
     (run / "clip0.mp4").unlink()
-    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.PARTIAL
     assert f"skipped: clip0: {run / 'clip0.mp4'} cannot be read: No such" in capsys.readouterr().err
 
 
 def test_rows_are_selected_by_column(clips, run):
-    assert Evaluate(generated=run, metadata=clips, where="split=test").run() == DONE
+    assert Evaluate(generated=run, metadata=clips, where="split=test").run() == ExitCode.DONE
     assert list(metrics(run)) == ["clip1"]
 
 
@@ -137,7 +137,7 @@ def test_a_missing_folder_is_refused(clips, tmp_path):
 
 def test_a_clip_of_fewer_frames_is_skipped_and_named(clips, run, capsys):
     write_video(run / "clip0.mp4", target_of(clips, "clip0")[:5], 16)
-    assert Evaluate(generated=run, metadata=clips).run() == PARTIAL
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.PARTIAL
     assert "skipped: clip0: it has 5 frames, most clips 9." in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
 
