@@ -49,7 +49,7 @@ def theirs():
 @pytest.fixture(scope="module")
 def weights(theirs):
     state = {name: tensor.numpy() for name, tensor in theirs.state_dict().items()}
-    return translate(state, table.transformers(CONFIG), ignore=table.ignored(CONFIG))
+    return translate(state, table.transformers(CONFIG), ignore=table.TABLE.ignored(CONFIG))
 
 
 def test_tokens_before_the_last_block_are_those_of_transformers(theirs, weights):
@@ -80,7 +80,7 @@ def test_official_names_and_shapes_are_those_of_the_released_file():
     ignored = {
         name
         for name in released
-        if any(fnmatchcase(name, pattern) for pattern in table.ignored(config))
+        if any(fnmatchcase(name, pattern) for pattern in table.TABLE.ignored(config))
     }
     assert have == {name: shape for name, shape in released.items() if name not in ignored}
 
@@ -136,7 +136,7 @@ def test_the_last_block_the_head_and_the_text_half_of_a_file_are_ignored(weights
     }
     rest |= {name: np.zeros(1) for name in ("log_scale", "visual.head", "visual.post_norm.bias")}
     rest |= {"textual.blocks.1.norm1.weight": np.zeros(1)}
-    read = translate(official | rest, rules, ignore=table.ignored(CONFIG))
+    read = translate(official | rest, rules, ignore=table.TABLE.ignored(CONFIG))
     assert read["blocks.norm1.scale"].shape == (CONFIG.blocks, CONFIG.dim)
 
 

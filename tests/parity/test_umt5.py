@@ -50,7 +50,7 @@ def theirs():
 def ours(theirs):
     model = nnx.eval_shape(lambda: UMT5(CONFIG, rngs=nnx.Rngs(0)))
     state = {name: tensor.numpy() for name, tensor in theirs.state_dict().items()}
-    rules, ignored = table.transformers(CONFIG), table.ignored(CONFIG)
+    rules, ignored = table.transformers(CONFIG), table.TABLE.ignored(CONFIG)
     fill(model, translate(state, rules, ignore=ignored))
     return model
 

@@ -76,7 +76,7 @@ def pair(request):
     theirs, config = reference(request.param), config_of(request.param)
     state = {name: tensor.numpy() for name, tensor in theirs.state_dict().items()}
     ours = nnx.eval_shape(lambda: WanDiT(config, rngs=nnx.Rngs(0)))
-    fill(ours, translate(state, table.diffusers(config), ignore=table.ignored(config)))
+    fill(ours, translate(state, table.diffusers(config), ignore=table.TABLE.ignored(config)))
     theirs = theirs.double()
     theirs.condition_embedder.timesteps_proj = Float64Sinusoid()
     return ours, theirs

@@ -37,7 +37,7 @@ def theirs():
 def ours(theirs):
     model = nnx.eval_shape(lambda: WanVAE(CONFIG, rngs=nnx.Rngs(0)))
     state = {name: tensor.numpy() for name, tensor in theirs.state_dict().items()}
-    fill(model, translate(state, table.diffusers(CONFIG), ignore=table.ignored(CONFIG)))
+    fill(model, translate(state, table.diffusers(CONFIG), ignore=table.TABLE.ignored(CONFIG)))
     return model
 
 
