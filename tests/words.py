@@ -215,7 +215,7 @@ def python(path: Path) -> Iterator[tuple[int, str, str]]:
         if match := OPENINGS.match(doc.first):
             fix = "a verb phrase (function) or a noun phrase (class, field)"
             yield doc.line, f"docstring opens with {match[0]}", fix
-        elif len(doc.first.split()) < 3:
+        elif len(doc.first.split()) < 2:
             yield doc.line, f"docstring says only {doc.first}", "a line that makes sense alone"
         elif not doc.first.endswith((".", ":", "?")):
             yield (

@@ -54,8 +54,10 @@ class Fetch:
     name: Annotated[str, tyro.conf.Positional]
     """Name in `egosim models list`."""
     out: Path | None = None
-    """Folder of the converted weights; by default one in the user's cache, where `--config` and
-    `Generator.load` find it by name."""
+    """Folder of the converted weights, by default one in the user's cache.
+
+    There, `--config` and `Generator.load` find the weights by name.
+    """
     dry_run: bool = False
     """Print files, sizes and disk space, and download nothing."""
     keep_download: bool = False

@@ -1,6 +1,6 @@
 """The model that ships: small enough for a laptop, trained on the tabletop world alone.
 
-Trained from scratch by `egosim-train tabletop`; its weights lie beside this package and its card
+Trained from scratch by `egosim-train tabletop`; its weights are in the package and its card
 in `weights/tabletop/README.md`.
 """
 

@@ -116,7 +116,9 @@ def test_a_run_resumes_with_other_intervals_but_not_with_another_seed(points, tm
 
 
 def test_a_batch_that_devices_cannot_share_says_what_would_do(points, tmp_path):
-    with pytest.raises(InputError, match=r"A batch of 8 .* 3 parts.* multiple of their product, 3"):
+    with pytest.raises(
+        InputError, match=r"A batch of 8 .* 3 micro-batches.* multiple of their product, 3"
+    ):
         fit(tmp_path, points, grad_accum_steps=3)
 
 

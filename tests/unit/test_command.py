@@ -1,4 +1,4 @@
-"""What every command line does alike: version, suggestions, one line for what it refuses."""
+"""Behavior of every command line: version, suggestions, errors in one line."""
 
 import errno
 import runpy
