@@ -82,7 +82,7 @@ def distance_to_mesh(
 def nearest(
     points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance of each point from the nearest other; infinite if there are none."""
+    """Return the distance of each point to the nearest of others; infinite if there are none."""
     import open3d as o3d
 
     if not len(points_m) or not len(others_m):

@@ -24,7 +24,7 @@ _RENAMED = {"touched_ids": "interacted_ids", "touched_frames": "interacted_frame
 
 
 def save(path: Path, perceived: Perceived) -> None:
-    """Write a file that ends in .npz, atomically."""
+    """Write a `Perceived` to a file that ends in .npz, atomically."""
     tracked, interacted = sorted(perceived.world_from_object), sorted(perceived.interacted_frames)
     about = {
         "step": perceived.step,
@@ -46,7 +46,7 @@ def save(path: Path, perceived: Perceived) -> None:
 
 
 def load(path: Path) -> Perceived:
-    """Read a file that `save` wrote. Raises `InputError` if it is any other file, or damaged."""
+    """Read a `Perceived` that `save` wrote. Raises `InputError` for other or damaged files."""
     arrays = read_arrays(path, _DTYPES, renamed=_RENAMED)
     about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
     try:

@@ -50,7 +50,7 @@ class HandMasks:
     """Number of discs that a capsule is drawn with."""
 
     def __post_init__(self) -> None:
-        """Check that a capsule has discs."""
+        """Check that a capsule is drawn with at least one disc."""
         check_counts({"discs": self.discs})
 
     def __call__(
@@ -93,7 +93,7 @@ class RevealedSurfaces:
         motions: Mapping[int, Float[np.ndarray, "f 4 4"]],
         planes: Mapping[int, Float[np.ndarray, " 4"]],
     ) -> tuple[Float32[np.ndarray, "f h w"], Int32[np.ndarray, "f h w"]]:
-        """Return depth and ids of changed pixels; infinite and 0 elsewhere."""
+        """Return depth and object ids of changed pixels; infinite and 0 elsewhere."""
         view = render(state, cameras, point_px=self.point_px)
         others = ~np.isin(state.object_ids, list(motions))
         rest, _ = splat(state.points_m[others], cameras, point_px=self.point_px)
@@ -125,7 +125,7 @@ class ClassicalConfig:
     """Depth of moved objects and of the surfaces behind them."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
-        """Return the pipeline; the ground truth is not used."""
+        """Return the classical perception pipeline; the ground truth is not used."""
         return Pipeline(stages=(take_action, self.hands, self.motion, self.surfaces))
 
 

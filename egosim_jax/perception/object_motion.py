@@ -64,7 +64,7 @@ class TrackObjects:
     """Refinement of the object's last pose."""
 
     def __post_init__(self) -> None:
-        """Check the numbers of points and the blur."""
+        """Check that the numbers of points and the blur are positive."""
         check_counts({"min_points": self.min_points, "compared_points": self.compared_points})
         if self.blur_px <= 0:
             raise InputError(f"blur_px must be positive, not {self.blur_px}.")
@@ -125,7 +125,7 @@ def _best(
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
 ) -> ObjectMotion | None:
-    """Return the cheapest accepted candidate of one hand."""
+    """Return the accepted motion of least cost among the candidates of one hand."""
     best: ObjectMotion | None = None
     for number in _near_tips(joints_m, action.kind, state, config):
         model = _object_model(number, state, config)

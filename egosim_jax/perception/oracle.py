@@ -20,7 +20,7 @@ class OracleConfig:
     """Perception that returns the ground truth of each clip and ignores its frames."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
-        """Return the pipeline; raise `InputError` without ground truth."""
+        """Return the oracle's pipeline; raise `InputError` without ground truth."""
         if not ground_truth:
             raise InputError(
                 "Perception pipeline 'oracle' needs ground truth, and there is none here: use "

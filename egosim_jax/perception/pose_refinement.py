@@ -34,7 +34,7 @@ class ColorCost:
     def mean(
         self, shown: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
     ) -> float:
-        """Return the mean difference in 8-bit levels; an expected color of NaN is unknown."""
+        """Return the mean color difference in 8-bit levels; an expected color of NaN is unknown."""
         strength = np.maximum((expected**2).sum(axis=1), 1)
         light = np.clip((shown * expected).sum(axis=1) / strength, self.min_light, self.max_light)
         gaps = np.sqrt(np.square(shown - light[:, None] * expected).mean(axis=1))
@@ -170,7 +170,7 @@ class _Neighborhood:
         hidden: Bool[np.ndarray, "f h w"],
         config: Refinement,
     ) -> _Neighborhood:
-        """Return what is needed to compare poses near the path's."""
+        """Return the neighborhood of an object's end in some frames of the clip."""
         cameras = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
         others = state.object_ids != best.model.number
         depth, index = splat(state.points_m[others], cameras, point_px=config.point_px)

@@ -51,7 +51,7 @@ class RecordedConfig:
     """Method that aligns the recorded cameras with the action's."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
-        """Return the pipeline; the ground truth is not used."""
+        """Return the pipeline that reads the files; the ground truth is not used."""
         return Pipeline(stages=(ReadRecording(config=self), find_interactions))
 
 
@@ -103,7 +103,7 @@ class ReadRecording:
     def _object_ids(
         self, clip: Clip, phrases: Mapping[int, str], first_id: int
     ) -> Int32[np.ndarray, "f h w"]:
-        """Return the recorded ids in the state's numbering, those of hands and arms negative."""
+        """Return recorded object ids in the state's numbering, those of hands and arms negative."""
         recorded = self._images("mask", clip).astype(np.int32)
         ids = np.where(recorded > 0, recorded + first_id, 0)
         for number, phrase in phrases.items():

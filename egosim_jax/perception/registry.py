@@ -38,7 +38,7 @@ class PipelineConfig(Protocol):
     """Parameters of a perception pipeline: a frozen dataclass."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Perception:
-        """Return the pipeline; `ground_truth` holds that of each clip by the state's step.
+        """Return the perception pipeline; `ground_truth` has one observation per step of the state.
 
         Only `oracle` reads the ground truth.
         """
@@ -46,7 +46,7 @@ class PipelineConfig(Protocol):
 
 
 def register(name: str) -> Callable[[C], C]:
-    """Register a config class under a name, as a decorator; the last one registered wins."""
+    """Register a perception config class under a name, as a decorator; later ones replace it."""
 
     def add(config: C) -> C:
         _CONFIGS[name] = config
@@ -56,12 +56,12 @@ def register(name: str) -> Callable[[C], C]:
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all registered pipelines, sorted."""
+    """Return the names of all registered perception pipelines, sorted."""
     return tuple(sorted({*_MODULES, *_CONFIGS}))
 
 
 def get(name: str) -> type[PipelineConfig]:
-    """Return the config class of a pipeline.
+    """Return the config class of the perception pipeline with a name.
 
     `my_package.module:mine` imports the module first, for a pipeline that it registers as `mine`.
     Raises `InputError` naming the closest name if there is none.
@@ -85,7 +85,7 @@ def get(name: str) -> type[PipelineConfig]:
 
 
 def parse(text: str) -> PipelineConfig:
-    """Return the config that a command line gives: a name and options.
+    """Return the perception config that a command line specifies: a name and options.
 
     `classical` has the defaults; `classical --motion.reach-m 0.05` changes one; `NAME --help` lists
     all.

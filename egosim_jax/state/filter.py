@@ -90,7 +90,7 @@ def is_interacting(
 
 
 def fill_gaps(frames: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Return all frames from the first to the last of those set."""
+    """Return a mask of all frames from the first to the last one set in `frames`."""
     first, last = np.flatnonzero(frames)[[0, -1]]
     return (np.arange(len(frames)) >= first) & (np.arange(len(frames)) <= last)
 

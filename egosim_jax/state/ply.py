@@ -86,7 +86,7 @@ def write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def _header(file: io.BufferedReader) -> tuple[str, list[_Element]]:
-    """Return the byte order and the elements. Raises `ValueError`."""
+    """Return the byte order and the elements of a PLY header. Raises `ValueError`."""
     head = file.read(MAX_HEADER)
     lines = head.decode("latin-1").split("\n")
     if lines[0].rstrip("\r") != "ply":

@@ -100,7 +100,7 @@ def _sealed(description: Mapping[str, Any]) -> str:
 
 
 def _checked(written: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of the description, their types checked.
+    """Return the fields of a state's description, with checked types.
 
     Raises `ValueError`, `KeyError` or `TypeError`.
     """
@@ -158,7 +158,7 @@ def _description(state: SceneState) -> dict[str, Any]:
 
 
 def write_ply(path: Path, state: SceneState) -> None:
-    """Write the points as binary PLY: x y z, red green blue, object_ids, last_seen."""
+    """Write a state's points as binary PLY: x y z, red green blue, object_ids, last_seen."""
     places = dict(zip("xyz", state.points_m.T, strict=True))
     colors = dict(zip(CHANNELS, state.colors.T, strict=True))
     ids = {name: getattr(state, name) for name in ("object_ids", "last_seen")}

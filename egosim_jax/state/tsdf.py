@@ -129,7 +129,7 @@ def _blocks(
     focal_px: float,
     fusion: Fusion,
 ) -> Int32[np.ndarray, "n 3"]:
-    """Return the blocks that the rays pass through within the truncation of the surface.
+    """Return the voxel blocks that the rays pass through within the truncation of the surface.
 
     Open3D's function samples every fourth pixel only, and misses small objects.
     """
