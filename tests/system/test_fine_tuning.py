@@ -146,4 +146,4 @@ def test_latents_of_other_encoders_are_refused(folder, tmp_path, capsys):
 def test_a_lora_of_no_rank_is_refused(folder, capsys):
     more = ("--rank", "0", "--training.grad-accum-steps", "1")
     assert tune(folder, "egosim_14b_lora", "none", *more) == 2
-    assert "rank of at least 1" in capsys.readouterr().err
+    assert "rank of a LoRA must be at least 1" in capsys.readouterr().err

@@ -171,8 +171,8 @@ def test_where_nothing_fits_more_devices_share_a_clip(room, monkeypatch):
     ]
 
 
-def test_generation_is_planned_program_by_program(capsys):
-    assert egosim(["plan", "--config", "debug", "--target", "cpu:1", "--json"]) == 0
+def test_generation_is_compiled_program_by_program(capsys):
+    assert egosim(["preflight", "--config", "debug", "--target", "cpu:1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert list(report) == ["encode", "denoise", "decode"]
     weights = min(program["memory"]["arguments"] for program in report.values())
@@ -183,6 +183,6 @@ def test_generation_is_planned_program_by_program(capsys):
 
 
 @pytest.mark.usefixtures("small")
-def test_a_plan_that_does_not_fit_ends_with_1(capsys):
-    assert egosim(["plan", "--config", "debug", "--target", "cpu:1"]) == 1
+def test_a_generation_that_does_not_fit_ends_with_1(capsys):
+    assert egosim(["preflight", "--config", "debug", "--target", "cpu:1"]) == 1
     assert "does not fit" in capsys.readouterr().out
