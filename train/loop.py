@@ -33,7 +33,7 @@ from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
-from egosim_jax.models.layers import initialize
+from egosim_jax.models.layers import LowRankParam, initialize
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog, average, mean_metrics
@@ -148,10 +148,11 @@ class Run:
     def start(self, weights: Path | None) -> TrainState:
         """Return the state of the newest checkpoint, or the initial state."""
         with self.clock.phase("start"):
-            if weights is not None:
-                self.frozen = place(weights, self.frozen, self.programs.frozen_sharding)
+            loaded = None
+            if weights is not None and (self.frozen or not self.checkpoints.steps):
+                loaded = self._load(weights)
             if not self.checkpoints.steps:
-                return self._initial_state(weights)
+                return self._initial_state(loaded)
             state = _placed(self.programs.state, self.programs.state_sharding)
             return self.checkpoints.restore(state, self.batches, fallback=self.training.fallback)
 
@@ -241,15 +242,30 @@ class Run:
         """Return the networks with the weights of a state."""
         return nnx.merge(self.programs.graph, state.eval_params, self.frozen)
 
-    def _initial_state(self, weights: Path | None) -> TrainState:
-        sharding = self.programs.state_sharding
-        if weights is None or jax.tree.leaves(self.frozen):
-            return initialize(self.programs.create, out_shardings=sharding)
-        params = place(weights, self.programs.state.params, sharding.params)
+    def _load(self, weights: Path) -> nnx.State:
+        """Load the frozen weights; return those of a folder that are trained further."""
+        programs, start = self.programs, nnx.Not(LowRankParam)
+        trained, _ = nnx.split_state(programs.state.params, start, ...)
+        sharding, _ = nnx.split_state(programs.state_sharding.params, start, ...)
+        placed = place(
+            weights,
+            nnx.merge_state(self.frozen, trained),
+            nnx.merge_state(programs.frozen_sharding, sharding),
+        )
+        frozen = {path for path, _ in nnx.to_flat_state(self.frozen)}
+        self.frozen, loaded = nnx.split_state(placed, lambda path, _: path in frozen, ...)
+        return loaded
+
+    def _initial_state(self, loaded: nnx.State | None) -> TrainState:
+        """Return the state before the first update, of weights that were loaded or are random."""
+        sharding, params = self.programs.state_sharding, self.programs.state.params
+        if loaded is None or len(jax.tree.leaves(loaded)) < len(jax.tree.leaves(params)):
+            create = partial(self.programs.create, loaded)
+            return initialize(create, out_shardings=sharding)
         create = partial(
             TrainState.create, config=self.training.optimizer, steps=self.training.steps
         )
-        return jax.jit(create, out_shardings=sharding, donate_argnums=0)(params)
+        return jax.jit(create, out_shardings=sharding, donate_argnums=0)(loaded)
 
     def _batches(self, source: ShardReader, use: Use = "train") -> Loader:
         return make_batches(source, self.task, self.training, self.sharding, use)

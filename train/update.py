@@ -241,8 +241,8 @@ class Programs:
 
     graph: nnx.GraphDef
     """Graph of the task's networks."""
-    create: Callable[[], TrainState]
-    """Function that returns the initial state, from random weights."""
+    create: Callable[..., TrainState]
+    """Function that returns the initial state, of random weights where none were loaded."""
     state: TrainState
     """Shapes of the state."""
     state_sharding: Any
@@ -270,11 +270,11 @@ class Programs:
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape, task.frozen_dtype), frozen
         )
 
-        def create() -> TrainState:
-            networks = task.networks(nnx.Rngs(training.seed))
-            return TrainState.create(
-                nnx.state(networks, task.trained), training.optimizer, training.steps
-            )
+        def create(loaded: nnx.State | None = None) -> TrainState:
+            params = nnx.state(task.networks(nnx.Rngs(training.seed)), task.trained)
+            if loaded is not None:
+                params = nnx.merge_state(params, loaded)
+            return TrainState.create(params, training.optimizer, training.steps)
 
         state, placed = jax.eval_shape(create), batch_sharding(mesh)
         sharding, frozen_sharding = state_sharding(mesh, state), state_sharding(mesh, frozen)
