@@ -259,7 +259,7 @@ class SceneState:
             )
 
 
-JOINTS: Mapping[str, int] = {"human": 21, "robot": 3}
+JOINTS: Mapping[Kind, int] = {"human": 21, "robot": 3}
 """Number of keypoints of a hand, by kind."""
 HAND_SIZE_M = (0.01, 1.0)
 """Smallest and largest plausible extent of a hand, in meters."""

@@ -216,7 +216,7 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
     import numpy as np
 
     from egosim_jax.io.npz import read_arrays
-    from egosim_jax.types import JOINTS, Action, Cameras
+    from egosim_jax.types import JOINTS, Action, Cameras, Kind
 
     values: Mapping[str, Any]
     if path.suffix == ".json":
@@ -225,11 +225,11 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
         values = read_arrays(path, {}, others=ARRAYS, packed=True)
     else:
         raise InputError(f"{path}: actions are read from .npz and .json files. (--actions)")
-    prompt = prompt or values.get("prompt")
+    prompt = prompt or str(values.get("prompt") or "")
     if not prompt:
         raise InputError(f"{path} has no prompt: give one per clip. (--prompts)")
     joints = np.asarray(values["joints_m"])
-    kinds = {count: kind for kind, count in JOINTS.items()}
+    kinds: dict[int, Kind] = {count: kind for kind, count in JOINTS.items()}
     try:
         if joints.ndim != 4 or joints.shape[2] not in kinds:
             raise InputError(

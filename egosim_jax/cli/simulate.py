@@ -247,14 +247,12 @@ class _Outputs:
 
 
 def _print(report: Sequence[Mapping[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from egosim_jax.metrics.loop import MEASURES
+    from egosim_jax.metrics.report import print_table
 
     shown = {name: measure for name, measure in MEASURES.items() if name in report[0]}
-    table = Table("clip", "action", *(heading for heading, _ in shown.values()))
-    for line in report:
-        cells = [form.format(line[name]) for name, (_, form) in shown.items()]
-        table.add_row(str(line["clip"]), line["action"], *cells)
-    Console(width=160).print(table)
+    rows = {
+        f"{line['clip']}: {line['action']}": {name: {"mean": line[name]} for name in shown}
+        for line in report
+    }
+    print_table("clip", rows, shown)
