@@ -81,6 +81,9 @@ class Simulate:
         weights = configs.weights_of(self.config, self.weights)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
         episode = self._episode(config.video)
+        perception = None
+        if self.update == "full":
+            perception = registry.parse(self.perception).build(episode.observations())
         made_of = {
             "simulate": self,
             "model": config,
@@ -90,10 +93,9 @@ class Simulate:
         Journal(folder, outputs=OUTPUTS)  # a folder of an earlier version has another config, too
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
-        perception = registry.parse(self.perception).build(episode.observations())
         simulator = Simulator(
             generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
-            perception=None if self.update == "none" else perception,
+            perception=perception,
             fps=config.video.fps,
         )
         steps = Rollout(simulator, folder).run(

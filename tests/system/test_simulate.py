@@ -1,5 +1,6 @@
 """The closed loop by its commands: simulate, look, and compare with a world that forgets."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -85,6 +86,19 @@ def test_a_first_frame_that_does_not_fit_is_refused(weights, tmp_path, capsys, b
     given = ["--first-frame", str(tmp_path / bad)]
     assert simulate(weights, tmp_path / "run", *given) == 2
     assert bad in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [("clasical", "Did you mean 'classical'"), ("classical --hands.discs 0", "discs must be")],
+)
+def test_a_perception_that_cannot_be_is_refused_before_the_folder_is_made(
+    weights, tmp_path, capsys, bad, message
+):
+    with contextlib.suppress(SystemExit):
+        assert simulate(weights, tmp_path / "run", "--perception", bad) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_state_and_a_point_cloud_are_drawn_from_three_sides(simulated, tmp_path, capsys):
