@@ -38,7 +38,7 @@ from egosim_jax.models.layers import initialize
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.report import compile_for
-from egosim_jax.preflight.targets import GIB, find, peak
+from egosim_jax.preflight.targets import GIB, compile_offline, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train import recipes
 from egosim_jax.train.update import Programs, Stage
@@ -65,7 +65,9 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--target", help="only compile, for this: what the preflight predicts")
     options = parser.parse_args()
-    if options.target is None:
+    if options.target is not None:
+        compile_offline()
+    else:
         device = jax.devices()[0]
         print(f"{device.device_kind}, jax {jax.__version__}", flush=True)
     for line in {"parts": parts, "forward": forward, "step": step, "clip": clip}[options.what](

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from egosim_jax.preflight.targets import find
+from egosim_jax.preflight.targets import compile_offline, find
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train.preflight import compile_step
 from egosim_jax.train.recipes import TABLETOP
@@ -27,6 +27,7 @@ def resident(name: str) -> int:
 
 
 def main() -> None:
+    compile_offline()
     stage, target = TABLETOP.stages()["denoiser"], find("cpu:1")
     task, training = stage
     predicted = compile_step(stage, target).memory.peak
