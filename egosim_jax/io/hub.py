@@ -113,7 +113,7 @@ def list_files(release: Release) -> Listing:
         raise InputError(f"The hub names no commit of {release.repository}: {quote(info.sha)}.")
     files = []
     for pattern, pinned in release.files.items():
-        found = [s for s in info.siblings if fnmatch.fnmatchcase(s.rfilename, pattern)]
+        found = [s for s in info.siblings or () if fnmatch.fnmatchcase(s.rfilename, pattern)]
         if not found:
             raise InputError(
                 f"{release.repository} has no file {pattern} at commit {info.sha}. Download the "

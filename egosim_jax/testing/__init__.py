@@ -107,16 +107,20 @@ def write_dataset(
 def write_latents(folder: Path, model: ModelConfig, records: int = 7) -> Path:
     """Write shards of random latents, as encoded clips for training a model; return the folder."""
     rng = np.random.default_rng(0)
-    shape, dit = model.latent_shape, model.dit
+
+    def draw(*size: int) -> np.ndarray:
+        return rng.normal(size=size).astype(np.float32)
+
     with ShardWriter(folder, kind="latents", spec=model.video) as writer:
         for number in range(records):
-            arrays = {
-                "mask": rng.integers(0, 2, (*shape, 4)).astype(np.uint8),
-                "text": rng.normal(size=(7, dit.text_dim)).astype(np.float32),
-                "image": rng.normal(size=(5, dit.image_dim)).astype(np.float32),
-            }
-            for name in ("target", "prior", "hands"):
-                arrays[name] = rng.normal(size=(*shape, 16)).astype(np.float32)
+            arrays = {"text": draw(7, model.dit.text_dim)}
+            if model.dit.image_dim is not None:
+                arrays["image"] = draw(5, model.dit.image_dim)
+            for part, channels in model.layout.parts:
+                values = draw(*model.latent_shape, channels)
+                if part == "mask":
+                    values = (values > 0).astype(np.uint8)
+                arrays["target" if part == "noisy" else part] = values
             writer.add(arrays, {"video_id": f"clip_{number}", "prompt": ""})
     return folder
 
