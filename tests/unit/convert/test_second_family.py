@@ -14,10 +14,11 @@ from egosim_jax import configs
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
+from egosim_jax.convert.lora import read_lora
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import Naming, Table, weight_shapes
-from egosim_jax.io.weights import load
-from egosim_jax.models import abstract
+from egosim_jax.io import weights
+from egosim_jax.models import abstract, lora
 from egosim_jax.models.layers import Linear, stack
 from tests.translation import translate_back
 
@@ -92,11 +93,11 @@ def registered(monkeypatch):
 
 def foreign(config=CONFIG):
     rng = np.random.default_rng(0)
-    weights = {
+    values = {
         path: rng.normal(size=shape).astype(np.float32)
         for path, shape in weight_shapes(config).items()
     }
-    tensors = translate_back(weights, mixer_rules(config))
+    tensors = translate_back(values, mixer_rules(config))
     return {f"net.{name}": np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
 
 
@@ -133,7 +134,7 @@ def test_a_base_model_is_widened_by_the_two_layouts(tmp_path):
     args = ["weights", tmp_path / "base.safetensors", "--config", "mixer"]
     assert run(*args, "--out", tmp_path / "out", "--widen", "polarity") == 0
     network = abstract(CONFIG)
-    load(tmp_path / "out" / "dit.safetensors", network)
+    weights.load(tmp_path / "out" / "dit.safetensors", network)
     rng = np.random.default_rng(1)
     noisy, prior, hands = rng.normal(size=(3, 5, 16))
     generate = rng.integers(0, 2, (5, 1))
@@ -149,26 +150,44 @@ def test_a_base_model_is_widened_by_the_two_layouts(tmp_path):
 
 def test_a_lora_is_read_merged_and_written_in_the_naming_of_the_table(tmp_path):
     rng = np.random.default_rng(2)
-    lora = {
+    tensors = {
         "mixer.layers.1.mix.lora_A.weight": rng.normal(size=(3, 8)).astype(np.float32),
         "mixer.layers.1.mix.lora_B.weight": rng.normal(size=(8, 3)).astype(np.float32),
         "mixer.in_proj.diff": rng.normal(size=(8, 49)).astype(np.float32),
     }
     save_file(foreign(), tmp_path / "x.safetensors")
-    save_file(lora, tmp_path / "lora.safetensors")
+    save_file(tensors, tmp_path / "lora.safetensors")
     args = ["--config", "mixer", "--out"]
     assert run("weights", tmp_path / "x.safetensors", *args, tmp_path / "base") == 0
     read = ["lora", tmp_path / "lora.safetensors", *args]
     assert run(*read, tmp_path / "out" / "lora.safetensors") == 0
     written = load_file(tmp_path / "out" / "lora.safetensors")
-    assert all(np.array_equal(written[name], lora[name]) for name in lora)
+    assert all(np.array_equal(written[name], tensors[name]) for name in tensors)
     assert run(*read, tmp_path / "merged", "--merge", tmp_path / "base") == 0
     before, after = (
         load_file(tmp_path / folder / "dit.safetensors") for folder in ("base", "merged")
     )
-    down, up = (lora[f"mixer.layers.1.mix.lora_{end}.weight"] for end in "AB")
+    down, up = (tensors[f"mixer.layers.1.mix.lora_{end}.weight"] for end in "AB")
     expected = before["blocks.kernel"] + np.stack([np.zeros((8, 8)), (up @ down).T])
     np.testing.assert_allclose(after["blocks.kernel"], expected, atol=1e-5)
     np.testing.assert_allclose(
-        after["reader.kernel"], before["reader.kernel"] + lora["mixer.in_proj.diff"].T, atol=1e-6
+        after["reader.kernel"], before["reader.kernel"] + tensors["mixer.in_proj.diff"].T, atol=1e-6
     )
+
+
+def test_a_lora_with_weights_trained_in_full_is_exported(tmp_path):
+    rng = np.random.default_rng(3)
+    down, up = (rng.normal(size=shape).astype(np.float32) for shape in ((2, 8, 3), (2, 3, 8)))
+    changes = {
+        "blocks": lora.Delta(down=down, up=up),
+        "reader.kernel": rng.normal(size=(49, 8)).astype(np.float32),
+    }
+    metadata = lora.metadata("mixer", base="0")
+    weights.write(tmp_path / "ours.safetensors", lora.tensors(changes), metadata=metadata)
+    out = tmp_path / "out" / "lora.safetensors"
+    assert run("lora", tmp_path / "ours.safetensors", "--config", "mixer", "--out", out) == 0
+    written = load_file(out)
+    np.testing.assert_array_equal(written["mixer.in_proj.diff"], changes["reader.kernel"].T)
+    again = read_lora(out, CONFIG)
+    np.testing.assert_array_equal(again["blocks"].up, up)
+    np.testing.assert_array_equal(again["reader.kernel"], changes["reader.kernel"])
