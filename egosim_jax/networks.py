@@ -29,7 +29,7 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
 )
-from egosim_jax.models.layers import initialize
+from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
@@ -174,7 +174,7 @@ class Networks(nnx.Module):
     def random(cls, config: ModelConfig, *, seed: int) -> Networks:
         """Build untrained networks in one compiled program."""
         graph = nnx.graphdef(cls.abstract(config))
-        params = initialize(lambda: nnx.state(cls.build(config, rngs=nnx.Rngs(seed)), nnx.Param))
+        params = init_sharded(lambda: nnx.state(cls.build(config, rngs=nnx.Rngs(seed)), nnx.Param))
         return nnx.merge(graph, params)
 
     @classmethod

@@ -33,7 +33,7 @@ from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
-from egosim_jax.models.layers import LowRankParam, initialize
+from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog, average, mean_metrics
@@ -261,7 +261,7 @@ class Run:
         sharding, params = self.programs.state_sharding, self.programs.state.params
         if loaded is None or len(jax.tree.leaves(loaded)) < len(jax.tree.leaves(params)):
             create = partial(self.programs.create, loaded)
-            return initialize(create, out_shardings=sharding)
+            return init_sharded(create, out_shardings=sharding)
         create = partial(
             TrainState.create, config=self.training.optimizer, steps=self.training.steps
         )

@@ -1,7 +1,7 @@
-"""Layers that the networks share.
+"""Layers shared by the networks.
 
 Precision: parameters keep the dtype they were given (float32 by default); `Linear` and `Embed`
-compute in their `dtype`; norms compute and answer in float32, and the next `Linear` casts down.
+compute in their `dtype`; norms compute and return float32, and the next `Linear` casts down.
 
 Every parameter names its logical axes (`axes=`), which `sharding.py` maps to the mesh:
 `embed` the model width, `mlp` the hidden width, `heads` heads x head size, `vocab`, `layers` the
@@ -28,11 +28,11 @@ ones = nnx.initializers.ones_init()
 
 
 class LowRankParam(nnx.Param):
-    """A weight of a `LowRank`, for training those alone."""
+    """Weight of a LoRA, so that only those can be trained."""
 
 
 class LowRank(nnx.Module):
-    """`(x @ down) @ up`, a summand of a linear layer's output (`models/lora.py`)."""
+    """Low-rank summand `(x @ down) @ up` of a linear layer's output (`models/lora.py`)."""
 
     def __init__(self, down: jax.Array, up: jax.Array):
         axes = ("layers",) * (down.ndim - 2)
@@ -45,10 +45,10 @@ class LowRank(nnx.Module):
 
 
 class Linear(nnx.Module):
-    """`x @ kernel + bias`, kernel `[in, out]`, computed in `dtype`."""
+    """Linear layer `x @ kernel + bias`, kernel `[in, out]`, computed in `dtype`."""
 
     low_rank: LowRank | None
-    """What a LoRA adds."""
+    """Summand of a LoRA; None without."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Linear(nnx.Module):
 
 
 class Embed(nnx.Module):
-    """A table of token embeddings `[vocab, d]`, read in `dtype`."""
+    """Table of token embeddings `[vocab, d]`, read in `dtype`."""
 
     def __init__(self, vocab: int, dim: int, *, dtype: str = "float32", rngs: nnx.Rngs):
         self.dtype = jnp.dtype(dtype)
@@ -84,7 +84,7 @@ class Embed(nnx.Module):
         self.embedding = nnx.Param(table, axes=("vocab", "embed"))
 
     def __call__(self, ids: Int[Array, "*b"]) -> Float[Array, "*b d"]:
-        """Look the ids up."""
+        """Return the embeddings of ids."""
         return self.embedding[...].astype(self.dtype)[ids]
 
 
@@ -97,7 +97,7 @@ class LayerNorm(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(dim), axes=("embed",)) if affine else None
 
     def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
-        """Normalize; the answer is float32."""
+        """Normalize; the result is float32."""
         x = x.astype(jnp.float32)
         x = x - x.mean(-1, keepdims=True)
         x = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
@@ -114,7 +114,7 @@ class RMSNorm(nnx.Module):
         self.scale = nnx.Param(jnp.ones(dim), axes=axes)
 
     def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
-        """Normalize; the answer is float32."""
+        """Normalize; the result is float32."""
         x = x.astype(jnp.float32)
         inverse = jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + self.eps)
         # Behind the barrier is one number per row. Without it, a GPU's compiler makes the sum and
@@ -122,8 +122,8 @@ class RMSNorm(nnx.Module):
         return x * jax.lax.optimization_barrier(inverse) * self.scale[...].astype(jnp.float32)
 
 
-def initialize(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
-    """Run `make` as one program, straight into its shardings.
+def init_sharded(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
+    """Run an initializer as one compiled program, with sharded outputs.
 
     Drawing hundreds of random arrays is a long program that runs once, so that on a CPU, where
     optimizing it would take longer than training a tiny model, it is compiled as it is.
@@ -135,7 +135,7 @@ def initialize(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
 
 
 def stack(make: Callable[[nnx.Rngs], Block], layers: int, *, rngs: nnx.Rngs) -> Block:
-    """Build `layers` equal blocks as one whose parameters have a leading `layers` axis."""
+    """Build `layers` equal blocks as one module whose parameters have a leading `layers` axis."""
     split = nnx.split_rngs(splits=layers)
     blocks = split(nnx.vmap(make, in_axes=(0,), out_axes=0))(rngs)
     for _, parameter in nnx.to_flat_state(nnx.state(blocks, nnx.Param)):

@@ -34,7 +34,7 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.generator import Generator, Inputs
 from egosim_jax.models.attention import attention
-from egosim_jax.models.layers import initialize
+from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.report import compile_for
@@ -160,7 +160,7 @@ def step(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                     (programs.state, programs.frozen, batch),
                     stage.task.flops(options.clips),
                     {"kernel": kernel, "remat": remat, "layers": stage.task.model.dit.layers},
-                    make=lambda programs=programs: initialize(
+                    make=lambda programs=programs: init_sharded(
                         programs.create, out_shardings=programs.state_sharding
                     ),
                 )

@@ -9,7 +9,7 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
-from egosim_jax.models.layers import initialize
+from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.config import OptimizerConfig
@@ -65,7 +65,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
     graph = nnx.graphdef(nnx.eval_shape(lambda: TASK.networks(nnx.Rngs(0))))
     sharding = state_sharding(mesh, jax.eval_shape(create))
     placed = batch_sharding(mesh)
-    state = initialize(create, out_shardings=sharding)
+    state = init_sharded(create, out_shardings=sharding)
     keys = TASK.keys(jax.random.key(0), BATCH)
 
     def loss(params, batch):

@@ -62,7 +62,7 @@ class WanDiTConfig:
     attention: Kernel = "auto"
     """Attention kernel."""
     remat: Remat = "none"
-    """What the backward pass computes again: nothing; all but self-attention and products with
+    """Activations that the backward pass recomputes: none; all but self-attention and products with
     weights; all but self-attention and attention's linear layers (`PROJECTION`); all but
     self-attention; every block; or every block from its input, which waits in the host's memory."""
 

@@ -1,12 +1,12 @@
 """The video diffusion transformer of Wan 2.1, in all its published shapes, and EgoSim's.
 
 Noisy latents of 16 channels and a condition of 0 (text to video), 20 (image to video) or 36
-channels (EgoSim) are cut into patches of 1 x 2 x 2 cells, one token each, which pass through the
+channels (EgoSim) are split into patches of 1 x 2 x 2 cells, one token each, which pass through the
 blocks of `layers` and become the velocity of the noisy latents.
 
 Everything that does not depend on the step is computed once by `prepare`: the patch embedding is
-linear, so that the condition's summand stands alone; keys and values of the cross-attentions depend
-on text and image only. `denoise` is what a solver calls at each step.
+linear, so that the condition's contribution is separate; keys and values of the cross-attentions
+depend on text and image only. `denoise` is what a solver calls at each step.
 """
 
 from __future__ import annotations
@@ -65,18 +65,18 @@ offload_inputs = jax.checkpoint_policies.save_and_offload_only_these_names(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class DiTContext:
-    """All that is the same at every denoising step."""
+    """Context that all denoising steps share."""
 
     patches: Float[Array, "b n d"]
-    """The condition's share of the patch embedding, with its bias."""
+    """Contribution of the condition to the patch embedding, with the bias."""
     sources: tuple[KeysValues, ...]
     """Cross-attention keys and values of all layers: of the text, then of the image if any."""
     rotation: Float[Array, "n k 2"]
-    """Rotary table of the tokens."""
+    """Rotary embedding table of the tokens."""
 
 
 class WanDiT(nnx.Module):
-    """Velocity of noisy video latents, given time, condition, text and image."""
+    """Video diffusion transformer: velocity of noisy latents, given condition, text and image."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         self.config = config
@@ -95,7 +95,7 @@ class WanDiT(nnx.Module):
         text: Float[Array, "b n e"],
         image: Float[Array, "b m i"] | None = None,
     ) -> DiTContext:
-        """Compute what all steps share.
+        """Compute the context that all denoising steps share.
 
         `condition` holds the channels after the noisy ones (none for text to video), `text` the
         text encoder's tokens, `image` the image encoder's, for models with the image branch.
@@ -120,7 +120,7 @@ class WanDiT(nnx.Module):
     def denoise(
         self, noisy: Float[Array, "b f h w c"], t: Float[Array, " b"], context: DiTContext
     ) -> Float[Array, "b f h w c"]:
-        """Velocity, in float32, of noisy latents at times in [0, 1000]."""
+        """Return the velocity, in float32, of noisy latents at timesteps in [0, 1000]."""
         _, _, h, w, _ = noisy.shape
         time, modulation = (constrain(x, VECTORS) for x in self.time(t))
 
@@ -147,7 +147,7 @@ class WanDiT(nnx.Module):
         text: Float[Array, "b n e"],
         image: Float[Array, "b m i"] | None = None,
     ) -> Float[Array, "b f h w v"]:
-        """Velocity for noisy latents and condition in one array, as in training."""
+        """Return the velocity for noisy latents and condition in one array."""
         noisy, condition = jnp.split(latents, [self.config.out_channels], axis=-1)
         return self.denoise(noisy, t, self.prepare(condition, text, image))
 
@@ -169,7 +169,7 @@ class WanDiT(nnx.Module):
         if channels != config.condition_channels:
             raise InputError(
                 f"A condition of {channels} channels does not fit this model: it reads "
-                f"{config.condition_channels} beside the {config.out_channels} noisy ones "
+                f"{config.condition_channels} in addition to the {config.out_channels} noisy ones "
                 f"(in_channels {config.in_channels})."
             )
         if h % PATCH or w % PATCH:
@@ -178,7 +178,7 @@ class WanDiT(nnx.Module):
                 "sizes must be even (pixels in multiples of 16)."
             )
         if has_image != (config.image_dim is not None):
-            given, fix = ("were", "Leave them out") if has_image else ("were not", "Pass them")
+            given, fix = ("were", "Omit them") if has_image else ("were not", "Pass them")
             raise InputError(
                 f"Image tokens {given} given to a model with image_dim {config.image_dim}. {fix}."
             )

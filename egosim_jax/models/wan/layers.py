@@ -34,7 +34,7 @@ from egosim_jax.models.sinusoid import time_sinusoid
 from egosim_jax.models.wan.config import PATCH, WanDiTConfig
 
 PROJECTION = "projection"
-"""The name, for checkpoint policies, of what attention's linear layers answer."""
+"""Checkpoint name of the outputs of the attention projections."""
 IMAGE_NORM_EPS = 1e-5
 """Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
 
@@ -65,8 +65,8 @@ def linear(
     return Linear(*sizes, axes=axes, dtype=config.dtype, kernel_init=init, rngs=rngs)
 
 
-def kept(x: jax.Array) -> jax.Array:
-    """What a checkpointed block may keep under the name of `PROJECTION`."""
+def checkpoint_proj(x: jax.Array) -> jax.Array:
+    """Name an output of an attention projection for checkpoint policies (`PROJECTION`)."""
     return checkpoint_name(x, PROJECTION)
 
 
@@ -77,7 +77,7 @@ def modulation_table(rows: int, dim: int, rngs: nnx.Rngs) -> nnx.Param:
 
 
 class PatchEmbedding(nnx.Module):
-    """A linear map of each patch, with a kernel `[channel, row, column, out]`."""
+    """Linear embedding of each patch, with a kernel `[channel, row, column, out]`."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         shape = (config.in_channels, PATCH, PATCH, config.dim)
@@ -87,11 +87,11 @@ class PatchEmbedding(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(config.dim), axes=("embed",))
 
     def noisy(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
-        """The noisy channels' summand."""
+        """Return the contribution of the noisy channels."""
         return self._project(latents, self.kernel[...][: self.noisy_channels])
 
     def condition(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
-        """The condition's summand, which has the bias."""
+        """Return the contribution of the condition, with the bias."""
         share = self._project(latents, self.kernel[...][self.noisy_channels :])
         return share + self.bias[...].astype(self.dtype)
 
@@ -125,7 +125,7 @@ class MLP(nnx.Module):
 
 
 class TimeEmbedding(nnx.Module):
-    """Times to one vector for the head and six for the blocks, in float32."""
+    """Embedding of timesteps: one vector for the head and six for the blocks, in float32."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         sizes = (config.freq_dim, config.dim, config.dim)
@@ -136,14 +136,14 @@ class TimeEmbedding(nnx.Module):
     def __call__(
         self, t: Float[Array, " b"]
     ) -> tuple[Float[Array, "b 1 d"], Float[Array, "b 6 d"]]:
-        """Embed times in [0, 1000]."""
+        """Embed timesteps in [0, 1000]."""
         vector = self.mlp(time_sinusoid(t, self.freq_dim))
         modulation = rearrange(self.modulation(jax.nn.silu(vector)), "b (k d) -> b k d", k=6)
         return vector[:, None].astype(jnp.float32), modulation.astype(jnp.float32)
 
 
 class ImageEmbedding(nnx.Module):
-    """The image encoder's tokens to the model's width."""
+    """Projection of the image encoder's tokens to the model's width."""
 
     def __init__(self, config: WanDiTConfig, width: int, *, rngs: nnx.Rngs):
         self.norm_in = LayerNorm(width, eps=IMAGE_NORM_EPS)
@@ -151,12 +151,12 @@ class ImageEmbedding(nnx.Module):
         self.norm_out = LayerNorm(config.dim, eps=IMAGE_NORM_EPS)
 
     def __call__(self, image: Float[Array, "b m e"]) -> Float[Array, "b m d"]:
-        """Embed; the answer is float32."""
+        """Embed; the result is float32."""
         return self.norm_out(self.mlp(self.norm_in(image)))
 
 
 class KeyValue(nnx.Module):
-    """Keys, normalized over the full width, and values, by head."""
+    """Projections to keys, normalized over the full width, and to values, by head."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         sizes, axes = (config.dim, config.dim), ("embed", "heads")
@@ -166,15 +166,15 @@ class KeyValue(nnx.Module):
         self.norm_k = RMSNorm(config.dim, eps=config.eps, axes=("heads",))
 
     def keys(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
-        """Keys, in float32."""
-        return self._by_head(self.norm_k(kept(self.k(tokens))))
+        """Return the keys, in float32."""
+        return self._by_head(self.norm_k(checkpoint_proj(self.k(tokens))))
 
     def values(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
-        """Values, in the compute dtype."""
-        return self._by_head(kept(self.v(tokens)))
+        """Return the values, in the compute dtype."""
+        return self._by_head(checkpoint_proj(self.v(tokens)))
 
     def keys_values(self, tokens: Float[Array, "b m d"]) -> KeysValues:
-        """Keys and values, both in the compute dtype."""
+        """Return keys and values, both in the compute dtype."""
         return self.keys(tokens).astype(self.dtype), self.values(tokens)
 
     def _by_head(self, x: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
@@ -182,7 +182,7 @@ class KeyValue(nnx.Module):
 
 
 class Attention(KeyValue):
-    """What self- and cross-attention have in common."""
+    """Base of self- and cross-attention."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         super().__init__(config, rngs=rngs)
@@ -193,8 +193,8 @@ class Attention(KeyValue):
         self.o = linear(config, sizes, ("heads", "embed"), rngs)
 
     def queries(self, x: Float[Array, "b n d"]) -> Float[Array, "b n h k"]:
-        """Normalized queries, in float32."""
-        return self._by_head(self.norm_q(kept(self.q(x))))
+        """Return the normalized queries, in float32."""
+        return self._by_head(self.norm_q(checkpoint_proj(self.q(x))))
 
     def attend(
         self,
@@ -210,18 +210,18 @@ class Attention(KeyValue):
 
 
 class SelfAttention(Attention):
-    """Attention among the video's tokens, with rotary positions."""
+    """Self-attention of the video's tokens, with rotary positions."""
 
     def __call__(
         self, x: Float[Array, "b n d"], rotation: Float[Array, "n k 2"]
     ) -> Float[Array, "b n d"]:
         """Attend."""
         q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
-        return kept(self.o(self.attend(q, k, self.values(x), "heads")))
+        return checkpoint_proj(self.o(self.attend(q, k, self.values(x), "heads")))
 
 
 class CrossAttention(Attention):
-    """One query to the text and, in models that have the branch, to the image."""
+    """Cross-attention to the text and, in models that have the branch, to the image."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         super().__init__(config, rngs=rngs)
@@ -229,20 +229,20 @@ class CrossAttention(Attention):
 
     @property
     def branches(self) -> tuple[KeyValue, ...]:
-        """What makes the keys and values of the text and, if any, of the image."""
+        """Key-value projections of the text and, if any, of the image."""
         return (self,) if self.image is None else (self, self.image)
 
     def __call__(
         self, x: Float[Array, "b n d"], sources: tuple[KeysValues, ...]
     ) -> Float[Array, "b n d"]:
-        """Attend to each source by itself and add the results."""
+        """Attend to each source separately and add the results."""
         q = self.queries(x)
         attended = (self.attend(q, *keys_values, "queries") for keys_values in sources)
-        return kept(self.o(reduce(jnp.add, attended)))
+        return checkpoint_proj(self.o(reduce(jnp.add, attended)))
 
 
 class Block(nnx.Module):
-    """Self-attention, cross-attention and MLP, each on the residual stream."""
+    """Transformer block: self-attention, cross-attention and MLP on the residual stream."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         sizes = (config.dim, config.ffn_dim, config.dim)
@@ -271,7 +271,7 @@ class Block(nnx.Module):
 
 
 class Head(nnx.Module):
-    """Tokens to velocity patches, their values in the order (row, column, channel)."""
+    """Projection of tokens to velocity patches, in the order (row, column, channel)."""
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         sizes = (config.dim, config.out_channels * PATCH**2)

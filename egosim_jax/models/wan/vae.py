@@ -1,4 +1,4 @@
-"""The causal video VAE of Wan 2.1: 4 x 8 x 8 pixels to one latent cell of 16 channels.
+"""Causal video VAE of Wan 2.1: 4 x 8 x 8 pixels to one latent cell of 16 channels.
 
 A video of 4k+1 frames becomes k+1 latent frames: the first encodes one frame, every further one
 four. No layer looks ahead in time, so a clip can be coded in pieces of any length, as long as each
@@ -8,7 +8,7 @@ layer remembers the last frames of the piece before: that memory is its *cache*.
               (and, where `temporal_downsample` says so, a temporal one) -> middle -> conv_out
     decoder   the mirror image, with one more residual block a level
 
-Coding a whole clip with cache None (`encode_whole`, `decode_whole`, `moments`) and coding it
+Coding a whole clip with cache None (`moments`, `decode_whole`) and coding it
 frame group by frame group (`encode`, `decode`) are therefore the same function; the latter's
 memory does not grow with the length of the clip.
 """
@@ -37,17 +37,17 @@ from egosim_jax.models.wan.vae_layers import (
     ResidualBlock,
     SpatialAttention,
     Upsample,
-    causal,
-    copying,
+    causal_conv,
+    identity_init,
+    init_constant_channels,
     norm,
-    offset,
 )
 from egosim_jax.types import InputError, VideoGrid
 
 
 @dataclass(frozen=True, kw_only=True)
 class WanVAEConfig:
-    """Sizes of the video VAE; the defaults are the released one's."""
+    """Sizes of the video VAE; the defaults are those of the release."""
 
     table: ClassVar[str] = "egosim_jax.convert.tables.wan_vae"
     """Module of the conversion table."""
@@ -116,14 +116,14 @@ class WanVAEConfig:
 
 
 class Encoder(nnx.Module):
-    """Video to twice `z_dim` channels of latent moments, before the quantization convolution."""
+    """Encoder of videos to 2 `z_dim` channels of moments, before the quantization convolution."""
 
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
         dims = [config.dim * m for m in (1, *config.dim_mult)]
-        cube, now = (3, 3, 3), copying((2, 1, 1))
+        cube, now = (3, 3, 3), identity_init((2, 1, 1))
         self.conv_in = Conv(cube, 3, dims[0], dtype=dtype, kernel_init=now, rngs=rngs)
-        offset(self.conv_in)
+        init_constant_channels(self.conv_in)
         layers = []
         for level, (dim, out) in enumerate(pairwise(dims)):
             for block in range(config.res_blocks):
@@ -143,15 +143,15 @@ class Encoder(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Latents, after the quantization convolution, to video."""
+    """Decoder of latents, after the quantization convolution, to videos."""
 
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
         mults = config.dim_mult[::-1]
         layers, dim = [], config.dim * mults[0]
-        cube, now = (3, 3, 3), copying((2, 1, 1))
+        cube, now = (3, 3, 3), identity_init((2, 1, 1))
         self.conv_in = Conv(cube, config.z_dim, dim, dtype=dtype, kernel_init=now, rngs=rngs)
-        offset(self.conv_in)
+        init_constant_channels(self.conv_in)
         self.middle = nnx.List(_middle(dim, dtype=dtype, rngs=rngs))
         for level, mult in enumerate(mults):
             out = config.dim * mult
@@ -180,26 +180,26 @@ def _middle(dim: int, *, dtype: str, rngs: nnx.Rngs) -> list[nnx.Module]:
 
 
 def _run(net: Encoder | Decoder, layers: Sequence[Layer], x: Input, cache: Cache) -> Output:
-    """The way through both halves: convolution, layers, norm, convolution."""
+    """Run an encoder or decoder: convolution, layers, norm, convolution."""
     first, *inner, last = cache or (None,) * (len(layers) + 2)
-    x, first = causal(net.conv_in, x, first)
+    x, first = causal_conv(net.conv_in, x, first)
     after = []
     for layer, memory in zip(layers, inner, strict=True):
         x, memory = layer(x, memory)
         after.append(memory)
-    x, last = causal(net.conv_out, jax.nn.silu(net.norm_out(x)), last)
+    x, last = causal_conv(net.conv_out, jax.nn.silu(net.norm_out(x)), last)
     return x, (first, *after, last)
 
 
 class WanVAE(nnx.Module):
-    """The video VAE; RGB in [-1, 1], `f = 4 k + 1` frames, `f' = k + 1` latent frames."""
+    """Causal video VAE; RGB in [-1, 1], `f = 4 k + 1` frames, `f' = k + 1` latent frames."""
 
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         self.config = config
         z, dtype = config.z_dim, config.dtype
         axes = (None, "mlp")
         self.encoder = Encoder(config, rngs=rngs)
-        same = copying(())
+        same = identity_init(())
         self.to_moments = Linear(2 * z, 2 * z, axes=axes, dtype=dtype, kernel_init=same, rngs=rngs)
         # Untrained, the samples are close to their means: noise as strong as the signal would
         # first have to be unlearnt.
@@ -211,25 +211,21 @@ class WanVAE(nnx.Module):
     def moments(
         self, video: Float[Array, "b f h w 3"]
     ) -> tuple[Float[Array, "b f2 h2 w2 z"], Float[Array, "b f2 h2 w2 z"]]:
-        """Mean and log variance of the latents, not normalized, in one pass: for training."""
+        """Return mean and log variance of the latents, not normalized, in one pass."""
         self._check(video)
         hidden, _ = self.encoder(video, None)
         mean, logvar = jnp.split(self.to_moments(hidden).astype(jnp.float32), 2, axis=-1)
         return mean, jnp.clip(logvar, -30.0, 20.0)
 
-    def encode_whole(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
-        """`encode` in one pass; memory grows with the length."""
-        return self.normalize(self.moments(video)[0])
-
     def decode_whole(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
-        """The video of latents not normalized, in one pass and not clipped: for training."""
+        """Return the video of latents not normalized, in one pass, not clipped: for training."""
         video, _ = self.decoder(self.from_latents(latents), None)
         return video.astype(jnp.float32)
 
     def encode(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
-        """Normalized mean latents, float32; the frames are coded in groups of 1, 4, 4, ...
+        """Return normalized mean latents, float32; frames are coded in groups of 1, 4, 4, ...
 
-        Raises `InputError` unless the video is of floats (which should lie in [-1, 1]) and has 4k+1
+        Raises `InputError` unless the video is of floats (in [-1, 1]) and has 4k+1
         frames of a size in multiples of 8.
         """
         self._check(video)
@@ -248,7 +244,7 @@ class WanVAE(nnx.Module):
         return self.normalize(moments[..., : self.config.z_dim].astype(jnp.float32))
 
     def decode(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
-        """The video of normalized latents, float32 in [-1, 1], one latent frame at a time."""
+        """Return the video of normalized latents, float32 in [-1, 1], frame by latent frame."""
         hidden = self.from_latents(self.denormalize(latents.astype(jnp.float32)))
         first, cache = self.decoder(hidden[:, :1], None)
 
@@ -262,11 +258,11 @@ class WanVAE(nnx.Module):
         return jnp.clip(video, -1.0, 1.0)
 
     def normalize(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
-        """Latents with the configured mean and standard deviation taken out."""
+        """Normalize latents with the configured mean and standard deviation."""
         return (mean - jnp.array(self.config.latent_mean)) / jnp.array(self.config.latent_std)
 
     def denormalize(self, latents: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
-        """The inverse of `normalize`."""
+        """Undo `normalize`."""
         return latents * jnp.array(self.config.latent_std) + jnp.array(self.config.latent_mean)
 
     def _check(self, video: Array) -> None:

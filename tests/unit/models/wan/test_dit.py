@@ -191,5 +191,5 @@ def test_missing_and_needless_image_tokens_are_refused():
     latents, _, text, image = inputs(TINY)
     with pytest.raises(InputError, match="not given"):
         abstract(TINY).prepare(latents[..., 16:], text, None)
-    with pytest.raises(InputError, match="Leave them out"):
+    with pytest.raises(InputError, match="Omit them"):
         abstract(replace(TINY, image_dim=None)).prepare(latents[..., 16:], text, image)

@@ -39,13 +39,18 @@ def vae():
     return make()
 
 
+def run(vae, method, x):
+    """Call a method, or encode in one pass."""
+    if method == "encode_whole":
+        return vae.normalize(vae.moments(x)[0])
+    return getattr(vae, method)(x)
+
+
 @cache
 def compiled(method, dtype="float32"):
     """A method of `make()` as one program of weights and input."""
     graph, _ = nnx.split(make(dtype))
-    return jax.jit(
-        lambda state, x: getattr(nnx.merge(graph, state), method)(x), compiler_options=QUICK
-    )
+    return jax.jit(lambda state, x: run(nnx.merge(graph, state), method, x), compiler_options=QUICK)
 
 
 def call(vae, method, x):
