@@ -155,7 +155,7 @@ def test_weights_of_another_model_are_refused(networks, tmp_path: Path):
         Networks.load(wider, tmp_path)
 
 
-def test_the_tokenizer_of_the_release_lies_in_its_weights_folder():
+def test_the_tokenizer_of_the_release_is_in_its_weights_folder():
     config = configs.get("egosim_14b").at(Path("weights"))
     assert config.tokenizer.kind == Path("weights/google/umt5-xxl")
     assert DEBUG.at(Path("weights")) is DEBUG

@@ -1,4 +1,4 @@
-"""What enters the loop is checked where it is made."""
+"""Data types check their values when they are made."""
 
 from dataclasses import replace
 from functools import cache

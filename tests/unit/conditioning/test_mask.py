@@ -9,7 +9,7 @@ from egosim_jax.types import InputError, VideoGrid
 
 @pytest.fixture(scope="module")
 def frames():
-    """A gray video in which no two selected pixels are told apart by chance alone."""
+    """A gray video in which any two selected pixels differ, but for chance."""
     return np.random.default_rng(0).integers(0, 256, (13, 32, 48), np.uint8)
 
 

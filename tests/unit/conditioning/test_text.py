@@ -22,7 +22,7 @@ WORDS = ("▁a", "▁hand", "▁lifts", "▁the", "▁cup", "▁", "s")
         ("a\u200bcup", "a\u200bcup"),
         (" \n ", ""),
     ],
-    ids=["blanks", "entities", "entities beside tags", "mojibake", "control", "zero-width", "none"],
+    ids=["blanks", "entities", "entities and tags", "mojibake", "control", "zero-width", "none"],
 )
 def test_prompts_are_cleaned_as_for_the_released_models(dirty, clean):
     assert clean_prompt(dirty) == clean

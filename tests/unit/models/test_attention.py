@@ -33,7 +33,7 @@ def inputs(keys):
 
 @pytest.fixture(params=[1, 2, 3], ids="{} heads fit".format)
 def heads_at_once(request, monkeypatch):
-    """How many of the inputs' three heads' scores fit. Two do not divide three: then one by one."""
+    """Scores of so many of the three heads fit. Two do not divide three: then one by one."""
     monkeypatch.setattr(module, "SCORES", request.param * 4 * 2 * 5 * 7)
 
 
@@ -78,7 +78,7 @@ def test_a_bias_is_added_to_the_scores():
 
 
 def value_and_gradients(attend, q, k, v):
-    """Of a sum whose parts count differently."""
+    """Return a sum whose parts count differently."""
     weights = jnp.float32(draw(*q.shape, seed=3))
     return jax.value_and_grad(lambda *x: (weights * attend(*x)).sum(), argnums=(0, 1, 2))(q, k, v)
 

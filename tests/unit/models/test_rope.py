@@ -9,7 +9,7 @@ import pytest
 from egosim_jax.models import rope
 
 ROUNDING = 1e-6
-"""Of float32 cosines, sines and products of numbers near 1."""
+"""Tolerance of float32 cosines, sines and products of numbers near 1."""
 
 
 def test_a_head_of_128_has_22_21_and_21_pairs():

@@ -137,7 +137,7 @@ def test_gradients_do_not_depend_on_what_is_recomputed(remat):
 
 
 def kept_shapes(config):
-    """What the forward pass hands to the backward pass."""
+    """Return the residuals that the forward pass hands to the backward pass."""
     pull = jax.eval_shape(lambda state: jax.vjp(loss_of(config), state)[1], weights())
     return [leaf.shape for leaf in jax.tree.leaves(pull) if leaf.ndim]
 

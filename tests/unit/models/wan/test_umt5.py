@@ -48,7 +48,7 @@ def test_embeddings_after_the_end_of_a_prompt_are_zero(model):
     assert (jnp.abs(embeddings[mask]).sum(axis=-1) > 0).all()
 
 
-def test_what_stands_in_the_padding_does_not_matter(model):
+def test_the_padding_does_not_matter(model):
     ids, mask = prompts()
     other = jnp.where(mask, ids, 1)
     np.testing.assert_array_equal(encode(model, ids, mask), encode(model, other, mask))

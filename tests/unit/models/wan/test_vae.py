@@ -180,7 +180,7 @@ def test_sizes_that_do_not_fit_each_other_are_refused(change, words):
 
 
 @pytest.mark.slow
-def test_an_untrained_vae_already_tells_dark_from_bright_everywhere_in_the_clip():
+def test_an_untrained_vae_already_separates_dark_from_bright_everywhere_in_the_clip():
     config = WanVAEConfig(
         dim=8, z_dim=4, res_blocks=1, latent_mean=(0.0,) * 4, latent_std=(1.0,) * 4
     )
