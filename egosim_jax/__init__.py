@@ -1,7 +1,10 @@
 """An egocentric world simulator in JAX: the public names, each imported when it is first used.
 
 generator = egosim_jax.Generator.load("tabletop")
-clips = generator.generate(triplets, seeds=[0])
+episode = egosim_jax.Episode.load("my_episode")
+perception = egosim_jax.get_perception("classical")().build()
+simulator = egosim_jax.Simulator(generator=generator, perception=perception, fps=episode.fps)
+step = simulator.step(episode.state, episode.actions[0], seed=0)
 """
 
 from __future__ import annotations
@@ -13,35 +16,97 @@ if TYPE_CHECKING:
     __version__: str
 
     from egosim_jax.conditioning.condition import Condition
+    from egosim_jax.conditions import write_conditions
     from egosim_jax.configs import get as get_config
     from egosim_jax.data.clips import load_triplet
     from egosim_jax.data.metadata import read_metadata
+    from egosim_jax.episode import Episode
     from egosim_jax.generator import Generator
+    from egosim_jax.io.video import write_video
     from egosim_jax.networks import ModelConfig, Networks
-    from egosim_jax.types import Clip, InputError, Triplet, VideoSpec
+    from egosim_jax.perception.registry import get as get_perception
+    from egosim_jax.perception.registry import register as register_perception
+    from egosim_jax.rollout import Rollout
+    from egosim_jax.simulator import Simulator, Step
+    from egosim_jax.state.depth import state_from_depth
+    from egosim_jax.state.snapshot import load as load_state
+    from egosim_jax.state.snapshot import save as save_state
+    from egosim_jax.types import (
+        Action,
+        Cameras,
+        Clip,
+        GroundTruth,
+        InputError,
+        Perceived,
+        SceneState,
+        Triplet,
+        VideoSpec,
+        View,
+    )
 
 __all__ = [
+    "Action",
+    "Cameras",
     "Clip",
     "Condition",
+    "Episode",
     "Generator",
+    "GroundTruth",
     "InputError",
     "ModelConfig",
     "Networks",
+    "Perceived",
+    "Rollout",
+    "SceneState",
+    "Simulator",
+    "Step",
     "Triplet",
     "VideoSpec",
+    "View",
     "get_config",
+    "get_perception",
+    "load_state",
     "load_triplet",
     "read_metadata",
+    "register_perception",
+    "save_state",
+    "state_from_depth",
+    "write_conditions",
+    "write_video",
 ]
 
 _HOMES = {
     "Condition": ("conditioning.condition", "Condition"),
+    "Episode": ("episode", "Episode"),
+    "Generator": ("generator", "Generator"),
+    "Rollout": ("rollout", "Rollout"),
     "get_config": ("configs", "get"),
+    "get_perception": ("perception.registry", "get"),
+    "load_state": ("state.snapshot", "load"),
     "load_triplet": ("data.clips", "load_triplet"),
     "read_metadata": ("data.metadata", "read_metadata"),
-    "Generator": ("generator", "Generator"),
+    "register_perception": ("perception.registry", "register"),
+    "save_state": ("state.snapshot", "save"),
+    "state_from_depth": ("state.depth", "state_from_depth"),
+    "write_conditions": ("conditions", "write_conditions"),
+    "write_video": ("io.video", "write_video"),
     **{name: ("networks", name) for name in ("ModelConfig", "Networks")},
-    **{name: ("types", name) for name in ("Clip", "InputError", "Triplet", "VideoSpec")},
+    **{name: ("simulator", name) for name in ("Simulator", "Step")},
+    **{
+        name: ("types", name)
+        for name in (
+            "Action",
+            "Cameras",
+            "Clip",
+            "GroundTruth",
+            "InputError",
+            "Perceived",
+            "SceneState",
+            "Triplet",
+            "VideoSpec",
+            "View",
+        )
+    },
 }
 
 

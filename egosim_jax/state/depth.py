@@ -15,12 +15,12 @@ DEPTH_M = (0.05, 50.0)
 
 
 def state_from_depth(
-    image: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "_ _ 3"],
     depth_m: Float[np.ndarray, "h w"],
     intrinsics_px: Float[np.ndarray, "3 3"],
     world_from_camera: Float[np.ndarray, "4 4"],
     *,
-    object_ids: Int[np.ndarray, "h w"] | None = None,
+    object_ids: Int[np.ndarray, "_ _"] | None = None,
     names: Mapping[int, str] | None = None,
 ) -> SceneState:
     """Return the state of one RGB-D image without hands: one point per pixel with known depth.
@@ -30,7 +30,9 @@ def state_from_depth(
     if shapes differ, if no depth is known, and if depth does not look like meters.
     """
     height, width = depth_m.shape
-    shapes = {"image": image.shape[:2], "object_ids": np.shape(object_ids) or (height, width)}
+    shapes = {"image": image.shape[:2]}
+    if object_ids is not None:
+        shapes["object_ids"] = object_ids.shape
     for name, shape in shapes.items():
         if shape != (height, width):
             raise InputError(

@@ -1,0 +1,162 @@
+"""Episodes by their commands: make from a seed or from files, check, show, simulate."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egosim_jax.cli.__main__ import main
+from egosim_jax.episode import Episode
+from egosim_jax.io.video import probe_video
+from egosim_jax.rendering.skeleton import SKELETONS
+from egosim_jax.state.snapshot import save
+from egosim_jax.types import VideoSpec
+from egosim_jax.worlds.tabletop import make_sequence, to_episode
+
+SPEC = VideoSpec(frames=9, height=64, width=96, fps=16)
+"""Clips of the model `debug`."""
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return to_episode(list(make_sequence(3, spec=SPEC, clips=2)), fps=SPEC.fps)
+
+
+def simulate(weights, out, *more):
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
+    return main(["simulate", *fixed, *more])
+
+
+def test_the_tabletop_world_and_an_episode_of_it_give_the_same_clips(weights, tmp_path, capsys):
+    made = tmp_path / "episode.zip"
+    options = ["--seed", "3", "--clips", "2", "--config", "debug"]
+    assert main(["episode", "make", *options, "--out", str(made)]) == 0
+    assert main(["episode", "check", str(made), "--config", "debug"]) == 0
+    assert "2 clips of 9 frames of 96x64 at 16 fps, human hands" in capsys.readouterr().out
+    common = ["--seed", "3", "--perception", "oracle"]
+    assert simulate(weights, tmp_path / "world", *common, "--clips", "2") == 0
+    assert simulate(weights, tmp_path / "episode", *common, "--episode", str(made)) == 0
+    for name in ("clip_1/frames.npz", "clip_2/frames.npz", "report.json", "state_2.ply"):
+        assert (tmp_path / "world" / name).read_bytes() == (
+            tmp_path / "episode" / name
+        ).read_bytes()
+
+
+def test_an_episode_without_ground_truth_is_simulated_but_not_scored(weights, tmp_path, episode):
+    bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
+    bare.save(tmp_path / "bare")
+    given = ["--episode", str(tmp_path / "bare")]
+    assert simulate(weights, tmp_path / "run", *given, "--clips", "1") == 0
+    report = json.loads((tmp_path / "run" / "report.json").read_text("utf-8"))
+    assert report["clips"] == [{"clip": 1, "action": episode.actions[0].prompt}]
+    assert probe_video(tmp_path / "run" / "clip_1_cmp.mp4").width == 3 * 96
+    assert (tmp_path / "run" / "contact_sheet.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--perception", "oracle"], "needs ground truth"),
+        (["--config", "tabletop"], "they must be equal"),
+        (["--clips", "3"], "has 2 clips, not 3"),
+        (["--robot"], "an episode has its own hands"),
+    ],
+)
+def test_an_episode_that_does_not_fit_is_refused(weights, tmp_path, capsys, episode, more, message):
+    bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
+    bare.save(tmp_path / "bare")
+    assert simulate(weights, tmp_path / "run", "--episode", str(tmp_path / "bare"), *more) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_inputs_are_drawn_on_a_sheet(tmp_path, episode):
+    episode.save(tmp_path / "episode")
+    assert (
+        main(["episode", "show", str(tmp_path / "episode"), "--out", str(tmp_path / "a.png")]) == 0
+    )
+    with Image.open(tmp_path / "a.png") as sheet:
+        assert sheet.width == 6 * 96
+        colors = np.asarray(sheet.convert("RGB"))
+    drawn = (colors == color for color in SKELETONS["human"].colors)
+    assert sum(where.all(axis=-1).sum() for where in drawn) > 20
+
+
+def write_files(folder, episode):
+    """Write the first action as .npz, the second as .json, the scene as an RGB-D image."""
+    first, second = (
+        {
+            "world_from_camera": action.cameras.world_from_camera,
+            "intrinsics_px": action.cameras.intrinsics_px,
+            "joints_m": action.joints_m,
+        }
+        for action in episode.actions
+    )
+    np.savez(folder / "1.npz", **first)
+    joints = second["joints_m"].tolist()
+    joints[3][0] = None
+    text = {name: value.tolist() for name, value in second.items()}
+    text |= {"joints_m": joints, "prompt": "from the file"}
+    (folder / "2.json").write_text(json.dumps(text))
+    known = episode.ground_truth[0]
+    image = np.repeat(np.repeat(known.frames[0], 2, axis=0), 2, axis=1)
+    Image.fromarray(image).save(folder / "scene.png")
+    np.savez(folder / "depth.npz", depth_m=np.repeat(np.repeat(known.depth_m[0], 2, 0), 2, 1))
+    save(folder / "state", episode.state)
+
+
+def make(folder, *more):
+    files = ["--actions", str(folder / "1.npz"), str(folder / "2.json")]
+    prompts = ["--prompts", "one", "two"]
+    out = ["--config", "debug", "--out", str(folder / "out")]
+    return main(["episode", "make", *files, *prompts, *out, *more])
+
+
+def test_files_of_cameras_and_hands_become_an_episode(tmp_path, episode):
+    write_files(tmp_path, episode)
+    image = ["--image", str(tmp_path / "scene.png"), "--depth", str(tmp_path / "depth.npz")]
+    assert make(tmp_path, *image) == 0
+    made = Episode.load(tmp_path / "out")
+    assert [action.prompt for action in made.actions] == ["one", "two"]
+    assert np.isnan(made.actions[1].joints_m[3, 0]).all()
+    for a, b in zip(made.actions, episode.actions, strict=True):
+        np.testing.assert_array_equal(a.cameras.world_from_camera, b.cameras.world_from_camera)
+    assert made.first_frame is not None
+    assert made.first_frame.shape == (64, 96, 3)
+    assert len(made.state.points_m) == np.isfinite(episode.ground_truth[0].depth_m[0]).sum() * 4
+    assert make(tmp_path, "--state", str(tmp_path / "state")) == 0
+    assert len(Episode.load(tmp_path / "out").state.points_m) == len(episode.state.points_m)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ([], "The scene must be given once"),
+        (["--image", "scene.png"], "The scene must be given once"),
+        (["--state", "state", "--prompts", "one"], "1 prompts for 2 files"),
+        (["--state", "state", "--config", "tabletop"], "comes near the view|they must be equal"),
+    ],
+)
+def test_incomplete_files_are_refused(tmp_path, monkeypatch, capsys, episode, more, message):
+    monkeypatch.chdir(tmp_path)
+    write_files(tmp_path, episode)
+    assert make(tmp_path, *more) == 2
+    assert re.search(message, " ".join(capsys.readouterr().err.split()))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[]", "must be an object of world_from_camera"),
+        ('{"joints_m": [[["a"]]]}', "not an array of numbers"),
+        ('{"world_from_camera": 1, "intrinsics_px": 1, "joints_m": 1}', "joints_m has shape"),
+    ],
+)
+def test_a_json_file_that_is_no_action_is_named(tmp_path, capsys, episode, text, message):
+    write_files(tmp_path, episode)
+    (tmp_path / "2.json").write_text(text)
+    assert make(tmp_path, "--state", str(tmp_path / "state")) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "2.json" in error
+    assert message in error

@@ -1,0 +1,42 @@
+"""The README's Python is run."""
+
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from egosim_jax.io.video import probe_video
+from egosim_jax.state.snapshot import load
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"(?<=\n\n)(?: {4}(?:import|from) .*\n(?:(?: {4}.*)?\n)*)")
+
+
+def blocks():
+    """Return the indented blocks that begin with an import."""
+    return [
+        textwrap.dedent(block).strip() for block in BLOCK.findall((ROOT / "README.md").read_text())
+    ]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("readme")
+
+
+@pytest.mark.parametrize("code", blocks(), ids=lambda code: code.splitlines()[-1][:30])
+def test_a_block_runs(code, folder):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, check=True)
+
+
+def test_the_loop_in_twenty_lines_writes_videos_and_a_state(folder):
+    (code,) = (block for block in blocks() if "simulator.step" in block)
+    assert len([line for line in code.splitlines() if line.strip()]) <= 20
+    for number in (1, 2, 3):
+        assert probe_video(folder / "runs" / f"clip_{number}.mp4").frames == 17
+    assert load(folder / "runs" / "state").step == 3

@@ -1,0 +1,47 @@
+"""A state from one RGB-D image."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import look_at
+from egosim_jax.rendering.reference import render
+from egosim_jax.state.depth import state_from_depth
+from egosim_jax.types import Cameras, InputError
+
+INTRINSICS = np.array([[40.0, 0, 19.5], [0, 40.0, 11.5], [0, 0, 1]])
+POSE = look_at(np.array([0.1, -1.0, 0.4]), np.zeros(3), up=np.array([0, 0, 1.0]))
+
+
+def image_and_depth():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (24, 40, 3), np.uint8)
+    depth_m = rng.uniform(0.5, 2, (24, 40))
+    depth_m[0, :3] = 0, np.nan, np.inf
+    return image, depth_m
+
+
+def test_the_state_seen_from_its_camera_is_the_image():
+    image, depth_m = image_and_depth()
+    ids = np.arange(24 * 40).reshape(24, 40) % 7
+    state = state_from_depth(image, depth_m, INTRINSICS, POSE, object_ids=ids, names={1: "cup"})
+    cameras = Cameras(world_from_camera=POSE[None], intrinsics_px=INTRINSICS, height=24, width=40)
+    view = render(state, cameras, point_px=1)
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    np.testing.assert_array_equal(view.frames[0][known], image[known])
+    np.testing.assert_allclose(view.depth_m[0][known], depth_m[known], rtol=1e-5)
+    np.testing.assert_array_equal(view.object_ids[0][known], ids[known])
+    assert not view.frames[0][~known].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda image, depth: (image[:-1], depth), "must be of the same image"),
+        (lambda image, depth: (image, 1000 * depth), "Convert depth_m to meters"),
+        (lambda image, depth: (image, np.zeros_like(depth)), "no positive finite value"),
+    ],
+)
+def test_an_image_or_depth_that_makes_no_sense_is_refused(change, message):
+    image, depth_m = change(*image_and_depth())
+    with pytest.raises(InputError, match=message):
+        state_from_depth(image, np.nan_to_num(depth_m), INTRINSICS, POSE)
