@@ -223,7 +223,7 @@ class Generator:
         return cls(config.at(folder), networks, mesh, renderer=renderer)
 
     def programs(self, batch: int) -> Iterator[tuple[str, CompiledFn, tuple]]:
-        """What `generate` runs for a batch of this size, by name, and the shapes it is given."""
+        """Yield name, function and input shapes of each function that `generate` calls."""
         inputs = Inputs.shapes(batch, self.config)
         yield "encode", self._encode, (inputs,)
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
@@ -259,7 +259,7 @@ class Generator:
         *,
         without: ConditionName | None = None,
     ) -> Float[Array, "b f h w z"]:
-        """What `generate` decodes; it raises the same."""
+        """Return the latents that `generate` decodes; raises what it raises."""
         condition = self._encode(Inputs.of(triplets, self.config))
         if without is not None:
             condition = condition.drop(without)
@@ -312,7 +312,7 @@ class Generator:
         )
 
     def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
-        """The truth through the autoencoder and back: the best any denoiser could give."""
+        """Encode and decode the targets: an upper bound for any denoiser."""
         return self._clips(self._latents(truths(triplets)))
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
@@ -347,5 +347,5 @@ def truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
     """The true videos. Raises `InputError` naming the clips that have none."""
     without = [t.video_id for t in triplets if t.target is None]
     if without:
-        raise InputError(f"{', '.join(without)}: no truth to encode. (column video)")
+        raise InputError(f"{', '.join(without)}: no target to encode. (column video)")
     return np.stack([t.target for t in triplets if t.target is not None])

@@ -130,8 +130,10 @@ WAN_GRID = VideoGrid(temporal_stride=4, spatial_stride=8, patch=2)
 
 @dataclass(frozen=True, kw_only=True)
 class MeshConfig:
-    """Sizes of the mesh axes; their product is the number of devices. One of them may be -1: it
-    takes all devices that are left."""
+    """Sizes of the mesh axes, whose product is the number of devices.
+
+    One of them may be -1: it takes all remaining devices.
+    """
 
     data: int = 1
     """Copies of the weights, each with its own part of the batch."""

@@ -38,9 +38,12 @@ class ChannelLayout:
     )  # fmt: skip
     """Name and number of channels of each part, in their order; the noisy latents come first."""
     mask_packing: Packing = "space"
-    """Pixels of a latent cell's mask: `space`, 2 x 2 of one frame in 4 channels (EgoSim); `time`,
-    one of each pixel frame (Wan's inpainting models); `single`, one in all; `observed`, none: the
-    mask is constant and says that everything was observed (DWM)."""
+    """Pixels of the mask in a latent cell.
+
+    `space`: 2 x 2 of one frame in 4 channels (EgoSim); `time`: one of each pixel frame (Wan's
+    inpainting models); `single`: one in all; `observed`: none, the mask is constant and says that
+    everything was observed (DWM).
+    """
     mask_one: Literal["generate", "keep"] = "generate"
     """Meaning of a mask of 1 to the denoiser: `generate` (EgoSim) or `keep` (Wan, CogVideoX)."""
     mask_scale: float = 1.0

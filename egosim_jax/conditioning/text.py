@@ -48,7 +48,7 @@ class Tokens:
 
     @property
     def cut(self) -> int:
-        """How many prompts were too long and have lost their last tokens."""
+        """Number of prompts that were too long and have lost their last tokens."""
         return sum(length > self.ids.shape[1] for length in self.lengths)
 
 

@@ -32,17 +32,22 @@ from egosim_jax.sharding import (
 from egosim_jax.types import InputError
 
 Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
-"""`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`);
-`cudnn` is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only), `hopper` that of H100 and
-H200, which is faster where it can be used and cuDNN's elsewhere, `splash` that of TPUs (elsewhere
-it is interpreted, for tests); `auto` is the device's, where it can be used."""
+"""Names of the attention kernels.
+
+`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`); `cudnn`
+is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only), `hopper` that of H100 and H200, which
+is faster where it can be used and cuDNN's elsewhere, `splash` that of TPUs (elsewhere it is
+interpreted, for tests); `auto` is the device's, where it can be used.
+"""
 SCORES = 2**26
-"""Bytes of scores that the `xla` kernel makes at a time, if a single head's are not more: a small
-model's heads all at once, which is faster, and those of a long video one by one."""
+"""Bytes of scores that the `xla` kernel makes at a time, if a single head's are not more.
+
+A small model's heads are computed all at once, which is faster, those of a long video one by one.
+"""
 SELF_ATTENTION = "self_attention"
 """The name, for checkpoint policies, of what a kernel's backward pass needs of the forward pass."""
 HOPPER = ("NVIDIA H100", "NVIDIA H200")
-"""How jax's names of the devices begin that have the `hopper` kernel."""
+"""Prefixes of jax's names of the devices that have the `hopper` kernel."""
 CUDNN_FORWARD = "dot_product_attention_fwd_wrapper"
 """The primitive whose results are the output and the log-sum-exp of jax's cuDNN kernel."""
 

@@ -1,6 +1,6 @@
 """Attention on the H100 and H200: the forward pass of FlashAttention-3 in Pallas.
 
-A block of threads answers for 128 queries of a head and walks over its keys and values, BLOCK at a
+A block of threads computes 128 queries of a head and walks over its keys and values, BLOCK at a
 time. Two warpgroups compute, 64 queries each; the third only fetches. With running maximum t and
 sum l of a row, in base 2,
 
@@ -38,7 +38,7 @@ STAGES = 2
 MANY_KEYS = 8 * BLOCK
 """From here on, filling the pipeline costs less than it gains over cuDNN."""
 REGISTERS = {"computing": 240, "fetching": 24}
-"""Of a thread."""
+"""Registers of a thread, by the kind of its warpgroup."""
 
 Queries = Float[Array, "b n h k"]
 Keys = Float[Array, "b m h k"]
@@ -50,7 +50,7 @@ def attend(q: Queries, k: Keys, v: Keys, *, scale: float) -> Queries:
 
 
 def fits(q: jax.Array, k: jax.Array) -> bool:
-    """Whether the kernel can attend from so many queries to so many keys, and gains by it."""
+    """Return whether the kernel supports the numbers of queries and keys, and is faster."""
     _, queries, _, size = q.shape
     keys = k.shape[1]
     whole = queries % (COMPUTING * ROWS) == 0 and keys % BLOCK == 0
@@ -160,7 +160,7 @@ def _walk(
     keys_done: Any,
     values_done: Any,
 ) -> jax.Array:
-    """One warpgroup's way over all keys; `o` accumulates. Returns the answer in float32."""
+    """One warpgroup's way over all keys; `o` accumulates. Returns the output in float32."""
     scores = partial(pl.run_scoped, s=gpu.ACC((ROWS, BLOCK), jnp.float32))
     across = lambda x: lax.broadcast_in_dim(x, (ROWS, BLOCK), (0,))  # noqa: E731
     over = lambda x: lax.broadcast_in_dim(x, o.shape, (0,))  # noqa: E731
@@ -188,7 +188,7 @@ def _walk(
         def both(s: Any) -> jax.Array:
             gpu.wgmma(s, tile, keys.at[stage].transpose((1, 0)))
             gpu.wgmma(o, p, values.at[before])
-            return gpu.wgmma_accumulator_load(s, wait_n=1)  # p v goes on
+            return gpu.wgmma_accumulator_load(s, wait_n=1)  # p v continues
 
         s = scores(both)
         gpu.barrier_arrive(keys_done.at[stage])

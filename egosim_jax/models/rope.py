@@ -18,7 +18,7 @@ THETA = 10000.0
 
 
 def pairs(head_dim: int) -> tuple[int, int, int]:
-    """How many of a head's pairs turn with the frame, the row and the column."""
+    """Return the numbers of a head's pairs that rotate with the frame, the row and the column."""
     side = head_dim // 6
     return head_dim // 2 - 2 * side, side, side
 

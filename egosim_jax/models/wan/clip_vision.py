@@ -50,7 +50,7 @@ class CLIPVisionConfig:
     eps: float = 1e-5
     """Added to the variance in LayerNorm."""
     skip_last: int = 1
-    """Blocks at the end that are left out."""
+    """Number of blocks at the end that are skipped."""
     dtype: str = "float32"
     """Dtype of the linears and of the residual stream; norms and softmax are float32."""
 
@@ -118,7 +118,7 @@ class SelfAttention(nnx.Module):
         self.o = linear(axes=("heads", "embed"))
 
     def __call__(self, x: Float[Array, "b n d"]) -> Float[Array, "b n d"]:
-        """Attend."""
+        """Attend from all tokens to all tokens."""
         split = partial(rearrange, pattern="b n (h k) -> b n h k", h=self.heads)
         y = attention(split(self.q(x)), split(self.k(x)), split(self.v(x)))
         return self.o(rearrange(y, "b n h k -> b n (h k)"))

@@ -48,7 +48,7 @@ class WanDiTConfig:
     heads: int = 40
     """Attention heads, each of dim / heads."""
     layers: int = 40
-    """Blocks."""
+    """Number of blocks."""
     text_dim: int = 4096
     """Width of the text encoder's tokens."""
     image_dim: int | None = 1280
@@ -62,9 +62,12 @@ class WanDiTConfig:
     attention: Kernel = "auto"
     """Attention kernel."""
     remat: Remat = "none"
-    """Activations that the backward pass recomputes: none; all but self-attention and products with
-    weights; all but self-attention and attention's linear layers (`PROJECTION`); all but
-    self-attention; every block; or every block from its input, which waits in the host's memory."""
+    """Activations that the backward pass recomputes.
+
+    None; all but self-attention and products with weights; all but self-attention and attention's
+    linear layers (`PROJECTION`); all but self-attention; every block; or every block from its
+    input, which waits in the host's memory.
+    """
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other and the kernel fits the dtype."""

@@ -215,7 +215,7 @@ class SelfAttention(Attention):
     def __call__(
         self, x: Float[Array, "b n d"], rotation: Float[Array, "n k 2"]
     ) -> Float[Array, "b n d"]:
-        """Attend."""
+        """Attend from all tokens to all tokens, with rotated queries and keys."""
         q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
         return checkpoint_proj(self.o(self.attend(q, k, self.values(x), "heads")))
 

@@ -6,7 +6,7 @@ The encoder of T5 1.1 (Raffel et al. 2020) as trained in umT5 (Chung et al. 2023
     x += D (gelu(G y) * U y)          y = RMSNorm(x), gelu in its tanh form
 
 and a last RMSNorm follows; no linear has a bias. B depends on the offset of key and query only,
-B[h, i, j] = table[bucket(j - i), h], and every block has a table of its own (in T5 all share one).
+B[h, i, j] = table[bucket(j - i), h], and every block has its own table (in T5 all share one).
 Half of the buckets are for keys after the query. Within a half of m buckets, the first m/2 are the
 distances 0 ... m/2 - 1; the others widen logarithmically up to `max_distance`:
 
@@ -51,7 +51,7 @@ class UMT5Config:
     head_dim: int = 64
     """Width of a head."""
     layers: int = 24
-    """Blocks."""
+    """Number of blocks."""
     buckets: int = 32
     """Relative-position buckets, of both directions together."""
     max_distance: int = 128

@@ -61,7 +61,7 @@ class WanVAEConfig:
     res_blocks: int = 2
     """Residual blocks per level of the encoder; the decoder has one more."""
     temporal_downsample: tuple[bool, ...] = (False, True, True)
-    """Whether the step below each level also halves the frame rate."""
+    """For each level but the last, True if the step below it also halves the frame rate."""
     latent_mean: tuple[float, ...] = (
         -0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508,
         0.4134, -0.0715, 0.5517, -0.3632, -0.1922, -0.9497, 0.2503, -0.2921,
