@@ -54,7 +54,7 @@ T = TypeVar("T")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """A batch of triplets as arrays."""
+    """Batch of triplets as arrays."""
 
     prior: UInt8[Any, "b f h w 3"] | None
     hands: UInt8[Any, "b f h w 3"] | None
@@ -84,7 +84,7 @@ class Inputs:
 
     @classmethod
     def shapes(cls, batch: int, config: ModelConfig) -> Inputs:
-        """The shapes and dtypes of a batch, to compile for before there is one."""
+        """Return the shapes and dtypes of a batch, to compile for before there is one."""
         shape = lambda dtype, *sizes: jax.ShapeDtypeStruct((batch, *sizes), dtype)  # noqa: E731
         video, tokens, layout = config.video, config.tokenizer.max_tokens, config.layout
         frames = shape(np.uint8, video.frames, video.height, video.width, 3)
@@ -101,7 +101,7 @@ class Inputs:
 
 
 def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
-    """Run the frozen parts: videos to latents, prompt and image to tokens."""
+    """Encode the conditions: videos to latents, prompt and image to tokens."""
 
     def encode(video: Array | None) -> Array | None:
         return None if video is None else networks.vae.encode(to_model(video))
@@ -149,7 +149,7 @@ def denoise(
 
 
 class Generator:
-    """A model ready to generate, on one device or on those of a mesh."""
+    """Model that is ready to generate, on one device or on the devices of a mesh."""
 
     def __init__(
         self,
@@ -233,7 +233,7 @@ class Generator:
         yield "decode", self._decode, (self._denoise.shapes(*given),)
 
     def compile(self, batch: int) -> None:
-        """Compile everything that `generate` needs for batches of this size."""
+        """Compile all functions of `generate` for batches of this size."""
         for _, program, given in self.programs(batch):
             program.compile(*given)
 
@@ -244,7 +244,7 @@ class Generator:
         *,
         without: ConditionName | None = None,
     ) -> list[Clip]:
-        """One clip for each triplet, from the noise of its seed.
+        """Generate one clip for each triplet, from the noise of its seed.
 
         `without` hides one condition, as training does (`conditioning/dropout.py`). Raises
         `InputError` if a mesh does not divide the batch, and `FloatingPointError` naming the clips
@@ -313,10 +313,10 @@ class Generator:
 
     def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
         """Encode and decode the targets: an upper bound for any denoiser."""
-        return self._clips(self._latents(truths(triplets)))
+        return self._clips(self._latents(targets_of(triplets)))
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
-        """The starting noise of each seed, of which the last 32 bits count."""
+        """Return the initial noise of each seed, of which the last 32 bits count."""
         return self._noise(_uint32(seeds))
 
     def _stepping(self, seeds: T) -> tuple[T, ...]:
@@ -338,13 +338,13 @@ def _step_keys(seeds: Array) -> Key[Array, " b"]:
 
 
 def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    """The items, `size` at a time; the last batch may be smaller."""
+    """Iterate over the items in batches of `size`; the last one may be smaller."""
     for first in range(0, len(items), size):
         yield items[first : first + size]
 
 
-def truths(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
-    """The true videos. Raises `InputError` naming the clips that have none."""
+def targets_of(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
+    """Return the target videos. Raises `InputError` naming the clips that have none."""
     without = [t.video_id for t in triplets if t.target is None]
     if without:
         raise InputError(f"{', '.join(without)}: no target to encode. (column video)")

@@ -1,4 +1,4 @@
-"""A model as a choice of networks, and the networks of a model."""
+"""Configs of models, each a choice of networks, and containers of their networks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NAMES: tuple[Name, ...] = ("dit", "vae", "text", "image")
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:
-    """A released model: its networks, its conditioning and its sampling."""
+    """Config of a model: its networks, its conditioning and its sampling."""
 
     name: str
     """Name of the model on the command line."""

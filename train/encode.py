@@ -30,7 +30,7 @@ from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.transforms import decode_record, record_length
-from egosim_jax.generator import Inputs, batches, truths
+from egosim_jax.generator import Inputs, batches, targets_of
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote
 from egosim_jax.io.video import Decoding
@@ -63,7 +63,7 @@ class Encoding:
         With frozen encoders they hold embeddings; with joint ones, the encoders' inputs.
         """
         inputs = Inputs.of(triplets, self.config)
-        arrays = {"mask": inputs.mask, **self._encode(inputs, truths(triplets))}
+        arrays = {"mask": inputs.mask, **self._encode(inputs, targets_of(triplets))}
         if self.config.encoders == "joint":
             arrays |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
         present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}

@@ -1,4 +1,4 @@
-"""The first frame, as the CLIP image encoder wants it.
+"""Preprocessing of the first frame for the CLIP image encoder.
 
 Wan 2.1 takes a picture in [-1, 1], resizes it to the encoder's square, maps it to [0, 1] and
 normalizes it with CLIP's statistics:
@@ -36,7 +36,7 @@ def clip_pixels(
     image_size: int,
     image_range: Literal["unit", "signed"],
 ) -> Float[np.ndarray, "b {image_size} {image_size} 3"]:
-    """Pictures of the model's size to the image encoder's normalized input, float32."""
+    """Return the image encoder's normalized float32 input for frames of the model's size."""
     _, height, width, _ = frames.shape
     x = frames.astype(np.float32) / 255
     if image_range == "signed":
@@ -47,7 +47,7 @@ def clip_pixels(
 
 
 def bicubic(size_in: int, size_out: int) -> Float[np.ndarray, "{size_out} {size_in}"]:
-    """The matrix that resizes one axis."""
+    """Return the matrix that resizes one axis."""
     center = (np.arange(size_out) + 0.5) * size_in / size_out - 0.5
     matrix = np.zeros((size_out, size_in))
     for tap in range(-1, 3):

@@ -1,4 +1,4 @@
-"""The mask of what must be generated: from gray pixels to four latent channels.
+"""Packing of the mask of unobserved pixels into channels of the latent grid.
 
 The rules are those of the EgoSim release; 1 says not observed, generate, and 0 observed, keep, the
 opposite of the Wan 2.1 inpainting models. For a mask video of the model's size:
@@ -33,7 +33,7 @@ from egosim_jax.types import WAN_GRID, InputError, VideoGrid
 
 Packing = Literal["space", "time", "single", "observed"]
 HALF_WHITE = 127
-"""The last gray level that is not above one half of 255."""
+"""Highest gray level that is not above one half of 255."""
 
 
 def pack_mask(

@@ -37,7 +37,7 @@ BYT5_VOCAB = 384
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Tokens:
-    """A batch of tokenized prompts, all of one length n."""
+    """Batch of tokenized prompts, all of one length n."""
 
     ids: Int32[np.ndarray, "b n"]
     """Token ids, 0 after the end of the prompt."""
@@ -54,7 +54,7 @@ class Tokens:
 
 @dataclass(frozen=True, kw_only=True)
 class PromptTokenizer:
-    """Cleans and tokenizes prompts."""
+    """Tokenizer of prompts, which it cleans first."""
 
     kind: Literal["byt5"] | Path = "byt5"
     """`byt5`, or a folder with the tokenizer.json of google/umt5-xxl."""

@@ -1,4 +1,4 @@
-"""The two ranges of pixels: uint8 RGB on disk, [-1, 1] in the models.
+"""Conversion of pixels between uint8 RGB on disk and [-1, 1] in the models.
 
     to the model     x = p / 127.5 - 1
     from the model   p = floor((x + 1) / 2 * 255), x clipped to [-1, 1]
@@ -19,10 +19,10 @@ Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
 
 def to_model(frames: Numbers) -> Numbers:
-    """RGB in uint8, of any shape, to float32 in [-1, 1]."""
+    """Convert RGB in uint8, of any shape, to float32 in [-1, 1]."""
     return frames.astype(np.float32) / 127.5 - 1
 
 
 def to_uint8(video: Numbers) -> Numbers:
-    """RGB in [-1, 1], of any shape, clipped, to uint8."""
+    """Convert RGB in [-1, 1], of any shape, to uint8, clipped."""
     return ((video.clip(-1, 1) + 1) / 2 * 255).astype(np.uint8)

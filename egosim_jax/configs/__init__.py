@@ -1,4 +1,4 @@
-"""The released models by name, one file each."""
+"""Configs of the released models by name, one file each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RELEASED = Path(__file__).with_name("released.json")
 
 
 def names() -> list[str]:
-    """Every name that `get` knows."""
+    """Return the names of all configs."""
     return sorted(module.name for module in pkgutil.iter_modules(__path__))
 
 
@@ -49,7 +49,7 @@ def _module(name: str) -> ModuleType:
 
 
 def shipped_weights(name: str) -> Path | None:
-    """The folder of the weights that come with the package, if the config has any."""
+    """Return the folder of the weights that come with the package, or None."""
     folder = SHIPPED / name
     return folder if folder.is_dir() else None
 

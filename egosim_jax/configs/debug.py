@@ -1,4 +1,4 @@
-"""The smallest model that has every part, with random weights: to see that everything runs."""
+"""Smallest model that has every part, with random weights, to check that everything runs."""
 
 import dataclasses
 

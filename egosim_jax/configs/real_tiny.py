@@ -1,4 +1,4 @@
-"""The true architecture with small numbers, for clips of 17 frames of 160 x 96 on a CPU.
+"""EgoSim's architecture with small sizes, for clips of 17 frames of 160 x 96 on a CPU.
 
 Text and image encoder are small too, read bytes and 56 x 56 pixels, and are trained together with
 the denoiser. `egosim-train real_tiny` trains all of it.

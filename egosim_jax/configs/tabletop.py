@@ -1,4 +1,4 @@
-"""The model that ships: small enough for a laptop, trained on the tabletop world alone.
+"""Model that comes with the package: small, and trained on the tabletop world alone.
 
 Trained from scratch by `egosim-train tabletop`; its weights are in the package and its card
 in `weights/tabletop/README.md`.

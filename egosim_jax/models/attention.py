@@ -32,24 +32,23 @@ from egosim_jax.sharding import (
 from egosim_jax.types import InputError
 
 Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
-"""Names of the attention kernels.
+"""Attention kernel.
 
 `xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`); `cudnn`
-is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only), `hopper` that of H100 and H200, which
-is faster where it can be used and cuDNN's elsewhere, `splash` that of TPUs (elsewhere it is
-interpreted, for tests); `auto` is the device's, where it can be used.
-"""
+is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only); `hopper` is the inference kernel of
+H100 and H200, replaced by cuDNN's where it does not apply, as under differentiation; `splash` is
+that of TPUs (elsewhere it is interpreted, for tests); `auto` is the device's, where it applies."""
 SCORES = 2**26
-"""Bytes of scores that the `xla` kernel makes at a time, if a single head's are not more.
+"""Bytes of scores that the `xla` kernel computes at a time, or one head's if these are more.
 
 A small model's heads are computed all at once, which is faster, those of a long video one by one.
 """
 SELF_ATTENTION = "self_attention"
-"""The name, for checkpoint policies, of what a kernel's backward pass needs of the forward pass."""
+"""Checkpoint name of the residuals that a kernel's backward pass needs."""
 HOPPER = ("NVIDIA H100", "NVIDIA H200")
 """Prefixes of jax's names of the devices that have the `hopper` kernel."""
 CUDNN_FORWARD = "dot_product_attention_fwd_wrapper"
-"""The primitive whose results are the output and the log-sum-exp of jax's cuDNN kernel."""
+"""Primitive that returns the output and the log-sum-exp of jax's cuDNN kernel."""
 
 
 def attention(
@@ -105,7 +104,7 @@ def attention(
 
 
 def _best(q: jax.Array) -> Kernel:
-    """The kernel of the device, if it can compute this."""
+    """Return the kernel of the device, if it can compute this."""
     size = q.shape[-1]
     if platform() == "gpu" and q.dtype.itemsize == 2 and size % 8 == 0 and size <= 128:
         return "hopper" if device_kind().startswith(HOPPER) else "cudnn"
@@ -180,7 +179,7 @@ def _matmul(pattern: str, a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def keep_attention(primitive: Any, *operands: Any, **parameters: Any) -> bool:
-    """Say which values a checkpointed block keeps: what self-attention returns, nothing else.
+    """Return whether a checkpointed block keeps a value: only the output of self-attention.
 
     This is a policy of `jax.checkpoint`. The kernels' backward passes need the output and the
     log-sum-exp; keeping both spares a second forward pass of the kernel. Cross-attention, which

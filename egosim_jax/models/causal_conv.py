@@ -1,4 +1,4 @@
-"""The convolution of a causal video network, in the form that each backend computes fastest.
+"""Convolution of a causal video network, in the form that each backend computes fastest.
 
     y[t, p] = sum_(k, s) x[t + k, p + s] W[k, s]        VALID in time, SAME in space
 
@@ -97,7 +97,7 @@ by_image.defvjp(_forward, _backward)
 
 
 def _kernel_gradient(x: Array, dy: Array, kernel: Array) -> Array:
-    """The sum over t and p; `dy` with kt - 1 frames of zeros before and after."""
+    """Return the sum over t and p; `dy` with kt - 1 frames of zeros before and after."""
     taps, rows, columns, _, _ = kernel.shape
     frames, height, width = x.shape[1:4]
     x = jnp.pad(x, ((0, 0), (0, 0), (rows // 2,) * 2, (columns // 2,) * 2, (0, 0)))

@@ -83,7 +83,7 @@ def splash(
 
 
 def _blocks(tokens: int) -> tuple[int, int]:
-    """The padded length, as short as can be, and the longest block that divides it."""
+    """Return the shortest padded length and the longest block that divides it."""
     if tokens <= BLOCKS[0]:
         length = -(-tokens // LANES) * LANES
         return length, length
@@ -93,7 +93,7 @@ def _blocks(tokens: int) -> tuple[int, int]:
 
 
 def _outside(length: int, tokens: int) -> Int[Array, " length"]:
-    """The segment of each place: 0 of the tokens, 1 of what was added."""
+    """Return the segment of each position: 0 for tokens, 1 for padding."""
     return (jnp.arange(length) >= tokens).astype(jnp.int32)
 
 

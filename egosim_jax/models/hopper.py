@@ -9,7 +9,7 @@ sum l of a row, in base 2,
 
 so that the scores are never in memory. The tensor cores are given the next block's scores and this
 block's p v together, and the exponentials of the next block are taken while p v is under way
-(Shah et al. 2024, "FlashAttention-3", section 3.2). Gradients are cuDNN's (`models/flash.py`).
+(Shah et al. 2024, "FlashAttention-3", section 3.2).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _attend.defvjp(_forward, _backward)
 
 @partial(jax.jit, static_argnums=3)
 def hopper_attention(q: Queries, k: Keys, v: Keys, scale: float) -> Queries:
-    """The kernel; programs know it by this name (`preflight/flops.py`)."""
+    """Run the kernel, which preflight finds by this name (`preflight/flops.py`)."""
     batch, queries, heads, size = q.shape
     shared = partial(gpu.SMEM, transforms=(gpu.TilingTransform((8, 64)), gpu.SwizzleTransform(128)))
     blocks = shared((STAGES, BLOCK, size), q.dtype)

@@ -1,4 +1,4 @@
-"""The sinusoidal embedding of the diffusion time.
+"""Sinusoidal embedding of the diffusion time.
 
 Angles t·w_i, w_i = 10000^(-i/half), reach 1000 radians, where float32 has lost four digits. With n
 the integer next to t and r = t - n, both exact in float32,
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 MAX_TIME = 1000
-"""The time of pure noise."""
+"""Timestep of pure noise."""
 
 
 def time_sinusoid(t: Float[Array, " b"], dim: int) -> Float[Array, "b d"]:

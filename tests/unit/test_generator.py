@@ -125,7 +125,7 @@ def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, trip
     )
 
 
-def test_a_clip_without_truth_cannot_be_reconstructed(generator, triplets):
+def test_a_clip_without_a_target_cannot_be_reconstructed(generator, triplets):
     blind = dataclasses.replace(triplets[0], target=None)
     with pytest.raises(InputError, match="tabletop_human_0_0: no target"):
         generator.reconstruct([blind])

@@ -1,4 +1,4 @@
-"""The CLIP image encoder: a picture to a grid of tokens, as Wan 2.1's image-to-video models use it.
+"""CLIP image encoder: a picture to a grid of tokens, as Wan 2.1's image-to-video models use it.
 
 The vision transformer of open-clip's XLM-RoBERTa-Large ViT-H/14 (Dosovitskiy et al. 2021; Radford
 et al. 2021). The picture is cut into patches, a class token is put before them, positions are
@@ -89,7 +89,7 @@ class CLIPVisionConfig:
 
 
 class PatchEmbed(nnx.Module):
-    """One linear, without bias, over the pixels of each patch; kernel `[rows, columns, 3, d]`."""
+    """Linear patch embedding without bias; kernel `[rows, columns, 3, d]`."""
 
     def __init__(self, config: CLIPVisionConfig, *, rngs: nnx.Rngs):
         self.dtype = jnp.dtype(config.dtype)
@@ -142,7 +142,7 @@ class Block(nnx.Module):
 
 
 class CLIPVision(nnx.Module):
-    """The image encoder; the class token comes first, then the patches row by row."""
+    """CLIP image encoder; the class token comes first, then the patches row by row."""
 
     def __init__(self, config: CLIPVisionConfig, *, rngs: nnx.Rngs):
         self.config = config

@@ -1,4 +1,4 @@
-"""The video diffusion transformer of Wan 2.1, in all its published shapes, and EgoSim's.
+"""Video diffusion transformer of Wan 2.1, in all its published shapes, and EgoSim's.
 
 Noisy latents of 16 channels and a condition of 0 (text to video), 20 (image to video) or 36
 channels (EgoSim) are split into patches of 1 x 2 x 2 cells, one token each, which pass through the

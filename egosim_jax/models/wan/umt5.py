@@ -1,4 +1,4 @@
-"""The umT5 text encoder: token ids of a prompt to the embeddings that the denoiser attends to.
+"""umT5 text encoder: token ids of a prompt to the embeddings that the denoiser attends to.
 
 The encoder of T5 1.1 (Raffel et al. 2020) as trained in umT5 (Chung et al. 2023). Each block adds
 
@@ -82,7 +82,7 @@ class UMT5Config:
 def relative_buckets(
     tokens: int, *, buckets: int, max_distance: int
 ) -> Int[np.ndarray, "{tokens} {tokens}"]:
-    """The bucket of every (query, key) pair of positions, a constant of the traced program.
+    """Return the bucket of every (query, key) pair of positions, a constant of the traced program.
 
     The logarithm is taken in float32, in which the official weights were trained: a distance on
     the border of two buckets must round the same way.
@@ -164,7 +164,7 @@ class Block(nnx.Module):
 
 
 class UMT5(nnx.Module):
-    """The text encoder; token ids to embeddings of width `dim`."""
+    """umT5 text encoder; token ids to embeddings of width `dim`."""
 
     def __init__(self, config: UMT5Config, *, rngs: nnx.Rngs):
         self.config = config

@@ -1,4 +1,4 @@
-"""The layers of the causal video VAE, each called as `layer(x, cache) -> (y, new cache)`.
+"""Layers of the causal video VAE, each called as `layer(x, cache) -> (y, new cache)`.
 
 A layer's *cache* is what it remembers of the frames before. None marks the start of the video,
 where the three stateful layers follow these rules (x_t = 0 for t < 0):
