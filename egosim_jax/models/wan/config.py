@@ -42,7 +42,7 @@ class WanDiTConfig:
     out_channels: int = 16
     """Channels of the noisy latents and the velocity."""
     dim: int = 5120
-    """Width of a token."""
+    """Width of a token's embedding, in channels."""
     ffn_dim: int = 13824
     """Hidden width of the MLP."""
     heads: int = 40

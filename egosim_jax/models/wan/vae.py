@@ -262,7 +262,7 @@ class WanVAE(nnx.Module):
         return (mean - jnp.array(self.config.latent_mean)) / jnp.array(self.config.latent_std)
 
     def denormalize(self, latents: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
-        """Undo `normalize`."""
+        """Undo the normalization of latents by channel (`normalize`)."""
         return latents * jnp.array(self.config.latent_std) + jnp.array(self.config.latent_mean)
 
     def _check(self, video: Array) -> None:
