@@ -220,7 +220,7 @@ def test_a_sparse_lora_of_four_gigabytes_is_refused_unread(tmp_path):
 def test_a_scale_is_a_finite_number(tmp_path, capsys, scale):
     file = save(tmp_path / "x.safetensors", pair())
     args = ["lora", file, "--config", "debug", "--out", tmp_path / "out", "--scale", scale]
-    assert "scale is a finite number" in one_line(capsys, 2, *args)
+    assert "scale must be a finite number" in one_line(capsys, 2, *args)
     with pytest.raises(InputError, match="scale"):
         lora.apply(nnx.Module(), {}, scale=float(scale))
 
