@@ -62,7 +62,7 @@ def main(kills: int = 20, processes: int = 1, seed: int = 0) -> int:
         inside = 0
         for kill in range(1, kills + 1):
             moment = Moment(killed, saving=kill % 2 == 0, draw=draw)
-            assert killed.kill_when(moment.is_there), killed.said()
+            assert killed.kill_when(moment.is_there), killed.output()
             inside += (was_saving := killed.is_saving())
             what = ", while saving" if was_saving else ""
             print(f"kill {kill}/{kills} at step {len(killed.lines())}{what}", file=sys.stderr)
