@@ -173,10 +173,15 @@ def to_diffusers(arrays: Mapping[str, Reader], config: WanDiTConfig) -> Mapping[
 def pipeline(config: ModelConfig) -> dict[str, dict[str, Any]]:
     """Return the JSON files of a diffusers pipeline around the transformer.
 
-    Raises `InputError` for a diffusion process that diffusers' scheduler does not have.
+    Raises `InputError` for a diffusion process or prediction that diffusers' scheduler lacks.
     """
     if not isinstance(config.process, RectifiedFlow):
         raise InputError(f"{SCHEDULER} has no {type(config.process).__name__}. (--layout wan)")
+    if config.process.prediction != "velocity":
+        raise InputError(
+            f"{SCHEDULER} takes the prediction as velocity; the model predicts "
+            f"{config.process.prediction}. (--layout wan)"
+        )
     name = "WanPipeline" if config.image is None else "WanImageToVideoPipeline"
     parts = ("tokenizer",) if config.image is None else ("tokenizer", "image_processor")
     return {

@@ -26,9 +26,12 @@ from egosim_jax.convert import commands
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of, wan_dit
+from egosim_jax.diffusion import DDIM, RectifiedFlow, VariancePreserving
 from egosim_jax.io.weights import flat_shapes, hashes, load
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.networks import Networks
+from egosim_jax.testing import write_weights
+from egosim_jax.types import InputError
 from tests.translation import translate_back
 
 CONFIG = configs.get("debug")
@@ -310,6 +313,24 @@ def test_what_is_not_of_the_config_is_not_written_back(tmp_path, capsys):
     args = ["--config", "tabletop", "--out", str(tmp_path / "out"), "--only", "vae"]
     assert main(["to-torch", str(tmp_path / "ours"), *args]) == 2
     assert "has shape" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("process", "reason"),
+    [(VariancePreserving(), "no VariancePreserving"), (RectifiedFlow(prediction="x0"), "x0")],
+)
+def test_a_process_without_a_scheduler_is_refused_before_writing(
+    tmp_path, monkeypatch, process, reason
+):
+    write_weights(tmp_path / "ours", CONFIG)
+    changed = replace(CONFIG, process=process, solver=DDIM())
+    monkeypatch.setattr(configs, "get", lambda name: changed)
+    command = commands.ToTorch(
+        weights=tmp_path / "ours", config="debug", out=tmp_path / "out", layout="diffusers"
+    )
+    with pytest.raises(InputError, match=reason):
+        command.run()
     assert not (tmp_path / "out").exists()
 
 
