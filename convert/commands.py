@@ -106,8 +106,8 @@ class Weights:
     `polarity` re-expresses the base's mask (Wan: 1 = keep) in the model's; `copy` takes both masks
     as equal."""
 
-    def run(self) -> int:
-        """Detect the networks, check them, write."""
+    def run(self, *, keep_logs: bool = False) -> int:
+        """Detect the networks, check them, write; with the logs kept, only incomplete ones."""
         from egosim_jax import configs
 
         config = configs.get(self.config)
@@ -132,7 +132,8 @@ class Weights:
             for found, weights in planned:
                 target = self.out / f"{found.network}.safetensors"
                 metadata = {"format": OURS, "config": self.config, "source": found.source.name}
-                _write(target, weights, origin=found.source.files, metadata=metadata)
+                origin = found.source.files
+                _write(target, weights, origin=origin, metadata=metadata, keep_log=keep_logs)
             if kept:
                 with atomic_folder(self.out / config.tokenizer.kind) as temporary:
                     for name, data in kept.items():
@@ -182,13 +183,14 @@ class ToTorch:
             converted = to_torch(tensors, network, naming, dtype=self.dtype, source=file.name)
             files = table.namings[naming]
             planned.append((name, self.out / files.folder / files.stem, file, converted))
+        pipeline = {}
+        if self.layout == "diffusers":
+            pipeline = pipeline_files(config, [name for name, *_ in planned])
         with lock_folder(self.out):
             for _, stem, file, converted in planned:
                 _write_sharded(stem, converted, origin=[file])
-            if self.layout == "diffusers":
-                files = pipeline_files(config, [name for name, *_ in planned])
-                for path, content in files.items():
-                    write_json(self.out / path, content)
+            for path, content in pipeline.items():
+                write_json(self.out / path, content)
         return command.ExitCode.DONE
 
 
@@ -389,10 +391,15 @@ def _same(weight: Weight, tensor: Tensor) -> bool:
 
 
 def _write(
-    target: Path, weights: Sequence[Weight], *, origin: Sequence[Path], metadata: Mapping[str, str]
+    target: Path,
+    weights: Sequence[Weight],
+    *,
+    origin: Sequence[Path],
+    metadata: Mapping[str, str],
+    keep_log: bool = False,
 ) -> None:
     total = sum(weight.bytes for weight in weights)
-    pieces = write(target, weights, origin=origin, metadata=metadata)
+    pieces = write(target, weights, origin=origin, metadata=metadata, keep_log=keep_log)
     for _ in track_bytes(pieces, f"writing {target.name}", total=total):
         pass
     print(quote_path(target))

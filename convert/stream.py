@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.io.atomic import sync
+from egosim_jax.io.atomic import LOG, PART, sync
 from egosim_jax.io.mapped import BLANK, CODES, TensorInfo, digest, header
 from egosim_jax.types import InputError
 
@@ -46,13 +46,19 @@ class Weight:
 
 
 def write(
-    target: Path, weights: Sequence[Weight], *, origin: Sequence[Path], metadata: Mapping[str, str]
+    target: Path,
+    weights: Sequence[Weight],
+    *,
+    origin: Sequence[Path],
+    metadata: Mapping[str, str],
+    keep_log: bool = False,
 ) -> Iterator[int]:
     """Write the weights to `target`; yield the bytes of each piece when it is written.
 
     `origin` are the files that the pieces are read from: an incomplete file is resumed only if they
-    have not changed. `metadata` goes into the header, which is sealed if the format is ours. If a
-    piece turns out to be damaged, nothing is left behind.
+    have not changed. With `keep_log` the log of a complete file is kept, by which the same call
+    recognizes the file and does not write it again. `metadata` goes into the header, which is
+    sealed if the format is ours. If a piece turns out to be damaged, nothing is left behind.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # Wide dtypes first, so that every weight is aligned to its item size.
@@ -61,7 +67,12 @@ def write(
     sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
     blank = _header(ordered, metadata, len(pieces) * [BLANK])
     plan = _fingerprint(blank, origin)
-    part, log = (target.with_name(target.name + end) for end in (".part", ".part.log"))
+    part, log = (target.with_name(target.name + end) for end in (PART, LOG))
+    if keep_log and _complete(
+        target, log, plan, lambda done: _header(ordered, metadata, done), len(pieces)
+    ):
+        yield sum(sizes)
+        return
     try:
         with _open(part) as file, _open(log) as journal:
             done = _resume(file, journal, plan, start=len(blank), sizes=sizes)
@@ -84,8 +95,23 @@ def write(
         log.unlink()
         raise
     part.replace(target)
-    log.unlink()
+    if not keep_log:
+        log.unlink()
     sync(target.parent)
+
+
+def _complete(
+    target: Path, log: Path, plan: str, header_of: Callable[[Sequence[str]], bytes], pieces: int
+) -> bool:
+    """Return True if a file has the header of the logged pieces, all of which are of the plan."""
+    if not (target.is_file() and log.is_file()):
+        return False
+    logged, *checksums = log.read_text().split("\n")[:-1]
+    if logged != plan or len(checksums) != pieces:
+        return False
+    expected = header_of(checksums)
+    with target.open("rb") as file:
+        return file.read(len(expected)) == expected
 
 
 def _open(path: Path) -> FileIO:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,6 @@ from egosim_jax.command import ExitCode
 
 if TYPE_CHECKING:
     from egosim_jax.io.hub import Listing, Release
-
-DOWNLOADS = ".download"
-"""Folder of the downloaded files in a folder of weights, until they are converted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +44,8 @@ class List:
 class Fetch:
     """Download released weights, verify them and convert them.
 
-    A partial download or conversion is continued when the same command runs again.
+    A partial download or conversion is continued when the same command runs again; networks that
+    are complete are kept.
     """
 
     name: Annotated[str, tyro.conf.Positional]
@@ -56,12 +53,13 @@ class Fetch:
     out: Path | None = None
     """Folder of the converted weights, by default one in the user's cache.
 
-    There, `--config` and `Generator.load` find the weights by name.
+    In the cache, `--config` and `Generator.load` find the weights of a release that has the name of
+    its config; those of a base model are given as `--weights`.
     """
     dry_run: bool = False
     """Print files, sizes and disk space, and download nothing."""
     keep_download: bool = False
-    """Keep the downloaded files after the conversion."""
+    """Keep the downloaded files after the conversion; a later fetch without it removes them."""
 
     def run(self) -> int:
         """Download, verify, convert, print the folder."""
@@ -71,11 +69,12 @@ class Fetch:
         release = configs.release(self.name)
         folder = self.out or hub.fetched_folder(release.name)
         if hub.is_fetched(folder) and not self.dry_run:
+            hub.check_fetched(release, folder)
+            hub.remove_leftovers(folder, keep_download=self.keep_download)
             print(folder)
             return ExitCode.DONE
         listing = hub.list_files(release)
-        downloads = folder / DOWNLOADS
-        needed = hub.bytes_needed(listing, downloads)
+        needed = hub.bytes_needed(listing, folder)
         if self.dry_run:
             for file in listing.files:
                 print(f"{file.path}  {file.bytes:,} bytes  sha256 {file.sha256 or 'unknown'}")
@@ -98,13 +97,12 @@ def _fetch(release: Release, listing: Listing, folder: Path, *, keep_download: b
 
     with lock_folder(folder):
         print(f"{release.repository}: {listing.bytes / 1e9:.2f} GB", file=sys.stderr)
-        downloads = folder / DOWNLOADS
+        downloads = folder / hub.DOWNLOADS
         hashes = hub.download(release, listing, downloads)
         convert = Weights(source=downloads, config=release.config, out=folder, widen=release.widen)
-        convert.run()
+        convert.run(keep_logs=True)
         write_json(folder / hub.RECORD, hub.as_record(release, listing, hashes))
-        if not keep_download:
-            shutil.rmtree(downloads)
+        hub.remove_leftovers(folder, keep_download=keep_download)
 
 
 @dataclass(frozen=True, kw_only=True)

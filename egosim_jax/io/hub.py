@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from egosim_jax.io.atomic import LOG, PART, lock_folder
 from egosim_jax.io.private import cache_folder
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import open_regular, quote, read_json
+from egosim_jax.io.untrusted import open_regular, quote, quote_text, read_json
 from egosim_jax.progress import track_bytes
 from egosim_jax.types import InputError
 
@@ -26,6 +27,8 @@ T = TypeVar("T")
 
 RECORD = "release.json"
 """Name of the record in a folder of fetched weights."""
+DOWNLOADS = ".download"
+"""Name of the folder of downloaded files in a folder of weights, until they are converted."""
 BLOCK = 1 << 24
 """Bytes hashed at a time."""
 _SAFE = re.compile(r"(?!\.)[A-Za-z0-9._-]+(?:/(?!\.)[A-Za-z0-9._-]+)*")
@@ -90,6 +93,30 @@ def is_fetched(folder: Path) -> bool:
     return (folder / RECORD).is_file()
 
 
+def check_fetched(release: Release, folder: Path) -> None:
+    """Raise `InputError` if the weights in a folder are not those of a release, by its record."""
+    record = _read_record(folder / RECORD)
+    problems = []
+    if record["repository"] != release.repository:
+        problems.append(f"repository {quote(record['repository'])}")
+    if release.revision not in (None, record["revision"]):
+        problems.append(f"commit {record['revision']}")
+    for pattern, pinned in release.files.items():
+        files = fnmatch.filter(record["files"], pattern)
+        hashes = {record["files"][file]["sha256"] for file in files}
+        if not hashes:
+            problems.append(f"no file {pattern}")
+        elif pinned not in (None, *hashes) or (pinned and len(hashes) > 1):
+            problems.append(f"{pattern} with another SHA-256")
+    if problems:
+        at = f" at commit {release.revision}" if release.revision else ""
+        raise InputError(
+            f"{folder} holds weights of another release: {'; '.join(problems)}; expected "
+            f"{release.repository}{at} for {release.name}. Choose another folder, or remove this "
+            "one. (--out)"
+        )
+
+
 def record_path(name: str) -> Path:
     """Return the path of the record of a release's first fetch."""
     return cache_folder() / "releases" / f"{name}.json"
@@ -103,7 +130,13 @@ def list_files(release: Release) -> Listing:
     """
     from huggingface_hub import HfApi
 
-    record = _read_record(release)
+    path = record_path(release.name)
+    record = _read_record(path) if path.is_file() else {}
+    if record and record["repository"] != release.repository:
+        raise InputError(
+            f"{path} records a fetch from {quote(record['repository'])}; expected "
+            f"{release.repository}. Remove it to fetch the new release."
+        )
     revision = release.revision or record.get("revision")
     info = _ask(
         release,
@@ -111,6 +144,12 @@ def list_files(release: Release) -> Listing:
     )
     if not _COMMIT.fullmatch(info.sha or ""):
         raise InputError(f"The hub names no commit of {release.repository}: {quote(info.sha)}.")
+    if revision not in (None, info.sha):
+        raise InputError(
+            f"The hub gave commit {info.sha} of {release.repository}; expected {revision}. Run the "
+            "same command again, or download the weights by hand and convert them. "
+            f"({_by_hand(release)})"
+        )
     files = []
     for pattern, pinned in release.files.items():
         found = [s for s in info.siblings or () if fnmatch.fnmatchcase(s.rfilename, pattern)]
@@ -120,10 +159,10 @@ def list_files(release: Release) -> Listing:
                 f"weights by hand and convert them. ({_by_hand(release)})"
             )
         for sibling in found:
-            if not _SAFE.fullmatch(sibling.rfilename) or sibling.size is None:
+            if not _SAFE.fullmatch(sibling.rfilename) or not isinstance(sibling.size, int):
                 raise InputError(
-                    f"{release.repository}: {quote(sibling.rfilename)} of {sibling.size} bytes is "
-                    "not a file that can be downloaded safely."
+                    f"{release.repository}: {quote(sibling.rfilename)} of {quote(sibling.size)} "
+                    "bytes is not a file that can be downloaded safely."
                 )
             published = sibling.lfs.sha256 if sibling.lfs else None
             recorded = record.get("files", {}).get(sibling.rfilename, {}).get("sha256")
@@ -178,10 +217,29 @@ def as_record(release: Release, listing: Listing, hashes: Mapping[str, str]) -> 
     return {"repository": release.repository, "revision": listing.revision, "files": files}
 
 
-def bytes_needed(listing: Listing, downloads: Path) -> int:
-    """Return the bytes of free disk space that the rest of the download and a conversion need."""
-    there = sum(f.stat().st_size for f in downloads.rglob("*") if f.is_file())
+def bytes_needed(listing: Listing, folder: Path) -> int:
+    """Return the bytes of free disk space that the rest of a download and its conversion need."""
+    files = [file for file in (folder / DOWNLOADS).rglob("*") if file.is_file()]
+    for log in folder.glob(f"*{LOG}"):
+        target = log.with_name(log.name.removesuffix(LOG))
+        part = target.with_name(target.name + PART)
+        files += [file for file in (part, target) if file.is_file()][:1]
+    found = [file.stat() for file in files]
+    # A network that is being written has its full size from the start; its blocks come later.
+    there = sum(min(stat.st_size, 512 * stat.st_blocks) for stat in found)
     return max(2 * listing.bytes - there, 0)
+
+
+def remove_leftovers(folder: Path, *, keep_download: bool) -> None:
+    """Remove what a complete fetch no longer needs: logs of the conversion and the download."""
+    downloads = folder / DOWNLOADS
+    if not any(folder.glob(f"*{LOG}")) and (keep_download or not downloads.exists()):
+        return
+    with lock_folder(folder):
+        for log in folder.glob(f"*{LOG}"):
+            log.unlink()
+        if downloads.exists() and not keep_download:
+            shutil.rmtree(downloads)
 
 
 def check_space(needed: int, folder: Path) -> None:
@@ -201,14 +259,12 @@ def free_space(folder: Path) -> int:
     return shutil.disk_usage(above).free
 
 
-def _read_record(release: Release) -> dict[str, Any]:
-    path = record_path(release.name)
-    if not path.is_file():
-        return {}
+def _read_record(path: Path) -> dict[str, Any]:
     record = read_json(path)
     files = record.get("files") if isinstance(record, dict) else None
     valid = (
         isinstance(files, dict)
+        and isinstance(record.get("repository"), str)
         and _COMMIT.fullmatch(str(record.get("revision")))
         and all(
             isinstance(f, dict) and _SHA256.fullmatch(str(f.get("sha256"))) for f in files.values()
@@ -228,8 +284,8 @@ def _ask(release: Release, call: Callable[[], T]) -> T:
             raise
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
-            f"{release.repository} cannot be downloaded: {reason[0]} Run the same command again "
-            "to continue, or download the weights by hand and convert them. "
+            f"{release.repository} cannot be downloaded: {quote_text(reason[0])}. Run the same "
+            "command again to continue, or download the weights by hand and convert them. "
             f"({_by_hand(release)})"
         ) from error
 
@@ -241,7 +297,7 @@ def _by_hand(release: Release) -> str:
 
 def _mismatch(release: Release, path: str, have: str, expected: str) -> str:
     return (
-        f"{release.repository}: {path} has SHA-256 {have}; expected {expected}. The download was "
-        "damaged or the release has changed: run the same command again, or remove "
-        f"{record_path(release.name)} to accept the new files."
+        f"{release.repository}: {path} has SHA-256 {quote_text(have)}; expected "
+        f"{quote_text(expected)}. The download was damaged or the release has changed: run "
+        f"the same command again, or remove {record_path(release.name)} to accept the new files."
     )

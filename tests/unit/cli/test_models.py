@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.cli.models import Fetch
 from egosim_jax.command import ExitCode
 from egosim_jax.convert.commands import ToTorch
 from egosim_jax.io import hub
@@ -88,3 +89,57 @@ def test_every_release_is_of_a_config():
     assert {release.config for release in configs.releases().values()} <= set(configs.names())
     with pytest.raises(InputError, match="Nearest: egosim_14b"):
         configs.release("egosim14b")
+
+
+def test_a_folder_of_another_release_is_refused(served, tmp_path, monkeypatch):
+    out = tmp_path / "weights"
+    assert main(["models", "fetch", "debug", "--out", str(out)]) == ExitCode.DONE
+    released = json.loads(configs.RELEASED.read_text())
+    entry = released["debug"]
+    hashes = {**entry["files"], "Wan2.1_VAE.pth": "0" * 64}
+    changes = [{"repository": "someone/else"}, {"revision": "f" * 40}, {"files": hashes}]
+    for change in changes:
+        configs.RELEASED.write_text(json.dumps({"other": entry | change}))
+        with pytest.raises(InputError, match=r"holds weights of another release.*\(--out\)"):
+            Fetch(name="other", out=out).run()
+
+
+def test_a_fetch_that_was_killed_after_the_record_removes_the_download(served):
+    assert main(["models", "fetch", "debug", "--keep-download"]) == ExitCode.DONE
+    folder = hub.fetched_folder("debug")
+    assert not list(folder.glob("*.log"))
+    (folder / "vae.safetensors.part.log").touch()
+    assert main(["models", "fetch", "debug", "--keep-download"]) == ExitCode.DONE
+    assert (folder / ".download").exists()
+    assert not list(folder.glob("*.log"))
+    assert main(["models", "fetch", "debug"]) == ExitCode.DONE
+    assert not (folder / ".download").exists()
+
+
+def test_an_interrupted_fetch_keeps_its_complete_networks(served, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(hub, "as_record", interrupt_after_download())
+        with pytest.raises(KeyboardInterrupt):
+            Fetch(name="debug").run()
+    folder, listing = hub.fetched_folder("debug"), hub.list_files(configs.release("debug"))
+    networks = sorted(folder.glob("*.safetensors"))
+    before = [file.stat().st_ino for file in networks]
+    there = sum(f.stat().st_size for f in networks)
+    assert hub.bytes_needed(listing, folder) <= max(listing.bytes - there, 0)
+    assert main(["models", "fetch", "debug"]) == ExitCode.DONE
+    assert [file.stat().st_ino for file in networks] == before
+    assert hub.is_fetched(folder)
+    assert not list(folder.glob("*.log"))
+
+
+def interrupt_after_download():
+    """Return an `as_record` that is interrupted when all networks are converted."""
+    real, calls = hub.as_record, []
+
+    def as_record(*args):
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    return as_record

@@ -135,3 +135,40 @@ def test_too_little_disk_space_is_found_before_the_download(tmp_path, monkeypatc
     monkeypatch.setattr(hub, "free_space", lambda folder: 10**9)
     with pytest.raises(InputError, match=r"has 1\.0 GB free, and 2\.5 GB are needed"):
         hub.check_space(2_500_000_000, tmp_path)
+
+
+def test_a_hub_that_gives_another_commit_is_refused(served, monkeypatch):
+    release = replace(RELEASE, revision="f" * 40)
+    info = SimpleNamespace(sha=COMMIT, siblings=[])
+    monkeypatch.setattr("huggingface_hub.HfApi.model_info", lambda *args, **options: info)
+    with pytest.raises(InputError, match=f"commit {COMMIT} .* expected {'f' * 40}"):
+        hub.list_files(release)
+
+
+def test_a_record_of_another_repository_is_refused(served, tmp_path):
+    fetch(RELEASE, tmp_path / "here")
+    with pytest.raises(InputError, match="records a fetch from 'someone/some-model'"):
+        hub.list_files(replace(RELEASE, repository="someone/else"))
+
+
+def test_text_of_the_hub_is_escaped_and_cut_in_messages(served, monkeypatch):
+    def fail(*args, **options):
+        raise ValueError("\x1b[31m" + 1000 * "x")
+
+    monkeypatch.setattr("huggingface_hub.HfApi.model_info", fail)
+    with pytest.raises(InputError) as refused:
+        hub.list_files(RELEASE)
+    assert "\x1b" not in str(refused.value)
+    assert len(str(refused.value)) < 400
+
+
+def test_blocks_of_an_incomplete_network_count_as_disk_space_that_is_there(tmp_path):
+    listing = hub.Listing(
+        revision=COMMIT, files=(hub.RemoteFile(path="a", bytes=10**6, sha256=None),)
+    )
+    with (tmp_path / "dit.safetensors.part").open("wb") as file:
+        file.write(bytes(100_000))
+        file.truncate(10**6)
+    (tmp_path / "dit.safetensors.part.log").touch()
+    needed = hub.bytes_needed(listing, tmp_path)
+    assert 1_890_000 < needed <= 1_900_000
