@@ -24,8 +24,9 @@ def write_conditions(
 ) -> Path:
     """Write prior, mask and hand videos of an action in EgoSim's layout; return its metadata.csv.
 
+    Other clips in the folder keep their rows there; one of the same `video_id` is replaced.
     Without a first frame it is that of the view. Raises `InputError` if the first camera sees none
-    of the state.
+    of the state, and for a `video_id` that is not a valid file name.
     """
     view = renderer.render(state, action.cameras, point_px=2)
     triplet = Triplet(
@@ -36,4 +37,4 @@ def write_conditions(
         hands=renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0],
         first_frame=view.frames[0] if first_frame is None else first_frame,
     )
-    return write_clips(Path(folder), [triplet], fps=fps)
+    return write_clips(Path(folder), [triplet], fps=fps, append=True)

@@ -276,7 +276,7 @@ class Generator:
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Generate one clip of a simulation (`simulator.Generator`).
+        """Generate one clip of a simulation (`simulator.VideoGenerator`).
 
         Raises `InputError` unless view, action and first frame have the length and size of the
         model's clips.

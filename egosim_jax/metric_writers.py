@@ -62,7 +62,10 @@ class Console:
 
 
 class JsonLines:
-    """A file of one JSON object per line; a resumed run first drops the steps that it repeats."""
+    """A file of one JSON object per line; a resumed run first drops the steps that it repeats.
+
+    A run that starts at step 0 repeats that one, too.
+    """
 
     def __init__(self, path: Path, *, resume_after: int = 0):
         self.path = path
@@ -70,7 +73,7 @@ class JsonLines:
         for number, line in read_lines(path) if path.exists() else ():
             if not isinstance(line, dict) or type(line.get("step")) is not int:
                 raise InputError(f"{path}, line {number} has no step. Restore or remove it.")
-            if line["step"] <= resume_after:
+            if line["step"] <= resume_after and resume_after > 0:
                 kept.append(json.dumps(upgrade_metrics(line)))
         write_text(path, "".join(f"{line}\n" for line in kept))
 
@@ -86,9 +89,8 @@ class TensorBoard:
     """Scalars for TensorBoard, by tensorboardX; a resumed run hides the steps that it repeats."""
 
     def __init__(self, folder: Path, *, resume_after: int = 0):
-        self._writer = _package("tensorboard").SummaryWriter(
-            str(folder), purge_step=resume_after + 1
-        )
+        purge_step = resume_after + 1 if resume_after else 0
+        self._writer = _package("tensorboard").SummaryWriter(str(folder), purge_step=purge_step)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a scalar for each metric."""

@@ -8,7 +8,7 @@ folder/clip_N/state/            state after it
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from pathlib import Path
 
 import numpy as np
@@ -46,15 +46,18 @@ class Rollout:
         """Run one step per action, each from the state after the previous one.
 
         The same call resumes an interrupted run. `first_frame` is the first frame of the first
-        clip; step N uses `seed + N`. Raises `InputError` showing both values if the folder holds a
-        run of another state, action, generator, renderer, perception or seed, and if another
-        process writes to it.
+        clip; step N uses `seed + N`, which must be a valid seed, too. Raises `InputError` showing
+        both values if the folder holds a run of another state, action, generator, renderer,
+        perception or seed, and if another process writes to it.
         """
         check_seed(seed, name="seed")
+        if isinstance(actions, Sized):
+            check_seed(seed + len(actions), name="seed + number of actions")
         with lock_folder(self.folder):
             journal = Journal(self.folder, outputs=OUTPUTS)
             journal.require("run", self._made_of(state, seed, first_frame))
             for number, action in enumerate(actions, start=1):
+                check_seed(seed + number, name="seed + number of actions")
                 journal.require(f"{number} action", {"action": fingerprint(action)})
                 image = first_frame if number == 1 else None
                 step = self._step(journal, number, state, action, seed + number, image)

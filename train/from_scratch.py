@@ -91,7 +91,7 @@ class FromScratch(Recipe):
         from egosim_jax.train.loop import train
 
         require_single_process(self.config)
-        mutable = [*resume_mutable("vae", "denoiser"), "preflight", "json", "search", "clips"]
+        mutable = [*resume_mutable("vae", "denoiser"), "preflight", "json", "search"]
         open_folder(out, self, mutable=mutable)
         frames = self.frames(out)
         networks = Networks.random(configs.get(self.config), seed=0)

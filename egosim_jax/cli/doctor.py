@@ -40,7 +40,7 @@ class Doctor:
     """
 
     weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of weights to report, by default those in ./weights."""
+    """Folders of weights to report, by default those in ./weights and those that were fetched."""
 
     def run(self) -> int:
         """Print the report."""
@@ -66,8 +66,17 @@ class Doctor:
         from egosim_jax import configs
 
         shipped = (configs.shipped_weights(name) for name in configs.names())
-        given = self.weights or (sorted(HERE.iterdir()) if HERE.is_dir() else ())
-        return [*(folder for folder in shipped if folder), *given]
+        return [*(folder for folder in shipped if folder), *(self.weights or _default_folders())]
+
+
+def _default_folders() -> Iterator[Path]:
+    """Yield the folders in ./weights, then those of fetched releases."""
+    from egosim_jax import configs
+    from egosim_jax.io.hub import fetched_folder, is_fetched
+
+    here = sorted(HERE.iterdir()) if HERE.is_dir() else ()
+    yield from (folder for folder in here if folder.is_dir())
+    yield from filter(is_fetched, map(fetched_folder, configs.releases()))
 
 
 def _memory(device: object) -> str:
@@ -104,7 +113,7 @@ def _print_models(console: Console, folders: list[Path]) -> None:
     for folder in folders:
         for row in _rows(folder):
             found.add_row(*row)
-    console.print(found if found.row_count else "no weights found in ./weights")
+    console.print(found if found.row_count else "no weights found")
 
 
 def _bytes(config: ModelConfig) -> int:

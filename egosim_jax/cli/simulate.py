@@ -252,9 +252,12 @@ def _print(report: Sequence[Mapping[str, Any]]) -> None:
     from egosim_jax.metrics.loop import MEASURES
     from egosim_jax.metrics.report import print_table
 
-    shown = {name: measure for name, measure in MEASURES.items() if name in report[0]}
+    scored = {name for line in report for name in line}
+    shown = {name: measure for name, measure in MEASURES.items() if name in scored}
     rows = {
-        f"{line['clip']}: {line['action']}": {name: {"mean": line[name]} for name in shown}
+        f"{line['clip']}: {line['action']}": {
+            name: {"mean": line[name]} for name in shown if name in line
+        }
         for line in report
     }
     print_table("clip", rows, shown)

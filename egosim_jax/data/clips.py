@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import io
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from egosim_jax.data.metadata import MASK_NAME, ClipFiles
+from egosim_jax.data.metadata import MASK_NAME, SAFE_IDS, ClipFiles, csv_rows, is_safe_id
 from egosim_jax.data.transforms import fit_length, resize_image, resize_mask
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted import listing, quote_path
+from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text
 from egosim_jax.io.video import (
     Damage,
     Decoding,
@@ -45,15 +45,23 @@ DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
-def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
+def write_clips(
+    folder: Path, triplets: Iterable[Triplet], *, fps: int, append: bool = False
+) -> Path:
     """Write triplets as files in EgoSim's layout; return the path of their metadata.csv.
 
     Each clip has a folder; the entries of `extra` become columns. All clips must have the same
-    columns, and either all or none a target video.
+    columns, and either all or none a target video. `append` keeps the rows of other clips in an
+    existing metadata.csv. Raises `InputError` for an id that is not a valid file name.
     """
-    rows: list[dict[str, str]] = []
+    path = folder / "metadata.csv"
+    rows: dict[str, dict[str, str]] = {}
+    if append and path.exists():
+        rows = {row.get("video_id", ""): row for _, row in csv_rows(path)}
     for triplet in triplets:
         name = triplet.video_id
+        if not is_safe_id(name):
+            raise InputError(f"video_id {quote(name)} is not a valid file name; use {SAFE_IDS}.")
         videos = {
             "ego_prior_video.mp4": triplet.prior,
             "hand_keypoint_video.mp4": triplet.hands,
@@ -74,13 +82,25 @@ def write_clips(folder: Path, triplets: Iterable[Triplet], *, fps: int) -> Path:
             write_video(folder / name / file, frames, fps)
         with atomic_write(folder / name / "first_frame.png") as temporary:
             Image.fromarray(triplet.first_frame).save(temporary)
-        rows.append(row)
+        rows[name] = row
+    _write_rows(path, list(rows.values()))
+    return path
+
+
+def _write_rows(path: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    columns = list(rows[-1])
+    for row in rows:
+        if row.keys() != set(columns):
+            raise InputError(
+                f"{quote_path(path)}: the clips of a table must have the same columns, not "
+                f"{quote_text(', '.join(row))} and {quote_text(', '.join(columns))}. Write them "
+                "to another folder."
+            )
     table = io.StringIO()
-    writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(table, fieldnames=columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_text(folder / "metadata.csv", table.getvalue())
-    return folder / "metadata.csv"
+    write_text(path, table.getvalue())
 
 
 def check_clip(

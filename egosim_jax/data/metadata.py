@@ -41,6 +41,8 @@ MAX_CLIPS = 400_000
 MAX_COLUMNS = 256
 """Maximum number of columns."""
 _SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
+SAFE_IDS = "letters, digits, '.', '_' and '-', and '/' between folders without dots"
+"""Rule of `is_safe_id`."""
 
 
 def is_safe_id(video_id: str) -> bool:
@@ -84,7 +86,7 @@ def read_metadata(path: Path) -> list[ClipFiles]:
     clips: list[ClipFiles] = []
     problems = _Problems()
     first_seen: dict[str, int] = {}
-    for line, row in _json_rows(path) if path.suffix == ".jsonl" else _csv_rows(path):
+    for line, row in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
         found = list(_row_problems(row, first_seen))
         problems.add(f"line {line}{problem}" for problem in found)
         if not found:
@@ -184,10 +186,7 @@ def _row_problems(row: Mapping[str, str], first_seen: Mapping[str, int]) -> Iter
             yield f", column {name}: the cell is empty"
     video_id = _video_id(row)
     if video_id.strip() and not is_safe_id(video_id):
-        yield (
-            f": video_id {quote(video_id)} is not a valid file name; use letters, digits, '.', '_' "
-            "and '-', and '/' between folders without dots"
-        )
+        yield (f": video_id {quote(video_id)} is not a valid file name; use {SAFE_IDS}")
     if video_id in first_seen:
         yield f": video_id {quote(video_id)} is a duplicate of line {first_seen[video_id]}"
 
@@ -198,7 +197,7 @@ def _video_id(row: Mapping[str, str]) -> str:
     return row[TARGET].replace("/", "_").removesuffix(".mp4")
 
 
-def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield line number and cells of each row; raise `InputError` for an invalid table."""
     name = quote_path(path)
     try:

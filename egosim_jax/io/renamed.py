@@ -60,6 +60,7 @@ _NO_DROPOUT = {"type": "ConditionDropout", "prior": 0.0, "mask": 0.0, "hands": 0
 _DROPOUT = {"type": "ConditionDropout", "prior": 0.15, "mask": 0.15, "hands": 0.15, "text": 0.15}
 ADDED: Mapping[str, Mapping[str, Any]] = {
     "RealTiny": {
+        "clips": 0,
         "crop": [48, 64],
         "dropout": _NO_DROPOUT,
         "change_loss_weight": 0.0,
@@ -101,7 +102,7 @@ def upgrade(recorded: Any) -> Any:
         if name not in dropped
     }
     if kind == "RealTiny" and _made_its_clips(recorded):
-        fields["metadata"] = None
+        fields |= {"metadata": None, "clips": 8}
     return {**ADDED.get(kind, {}), **fields, "type": TYPES.get(kind, kind)}
 
 

@@ -115,7 +115,7 @@ def quote(value: Any) -> str:
 
 def quote_text(text: str) -> str:
     """Cut and escape text for a message, without quotation marks."""
-    return quote(text)[1:].replace("'…", "…").removesuffix("'")
+    return ascii(text[:MAX_QUOTED])[1:-1] + ("…" if len(text) > MAX_QUOTED else "")
 
 
 def listing(items: Sequence[str], *, most: int = 5) -> str:

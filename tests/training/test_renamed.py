@@ -87,7 +87,7 @@ def test_an_old_run_resumes_bit_for_bit(points, tmp_path, monkeypatch):
 
 def test_the_configs_of_an_old_run_are_those_of_today(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(OLD_RUN["run"]))
-    mutable = [*resume_mutable("vae", "denoiser"), "preflight", "json", "search", "clips"]
+    mutable = [*resume_mutable("vae", "denoiser"), "preflight", "json", "search"]
     open_folder(tmp_path, DEBUG, mutable=mutable)
     for name, (task, config) in DEBUG.stages().items():
         folder = tmp_path / name

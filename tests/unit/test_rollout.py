@@ -278,3 +278,12 @@ def test_the_loop_does_not_import_jax(tmp_path):
     )
     command = [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path)]
     subprocess.run(command, check=True)
+
+
+@pytest.mark.parametrize("make", [list, iter])
+def test_seeds_of_all_steps_must_be_valid(tmp_path, make):
+    actions = make([to_action(clip) for clip in clips()])
+    steps = Rollout(simulator(), tmp_path).run(clips()[0].state, actions, seed=2**63 - 1)
+    with pytest.raises(InputError, match=r"seed . number of actions must be a whole number"):
+        next(steps)
+    assert not (tmp_path / "clip_1").exists()

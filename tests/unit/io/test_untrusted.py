@@ -10,6 +10,7 @@ from egosim_jax.io.untrusted import (
     open_regular,
     parse_json,
     quote,
+    quote_text,
     read_bytes,
     read_json,
     read_lines,
@@ -77,3 +78,17 @@ def test_what_is_quoted_is_short_and_printable(value):
     text = quote(value)
     assert len(text) < MAX_QUOTED + 20
     assert text.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a clip", "a clip"),
+        ("it's", "it's"),
+        ("it's " + "x" * 90, "it's " + "x" * 75 + "…"),
+        ("ends'", "ends'"),
+        ("a\nb", r"a\nb"),
+    ],
+)
+def test_text_is_shown_without_quotation_marks(text, shown):
+    assert quote_text(text) == shown

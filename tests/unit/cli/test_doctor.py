@@ -1,0 +1,19 @@
+"""`egosim doctor`: the folders of weights that it reports."""
+
+from pathlib import Path
+
+from egosim_jax.cli.doctor import Doctor
+from egosim_jax.configs import releases
+from egosim_jax.io import hub
+
+
+def test_fetched_weights_are_listed_and_files_are_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(hub, "fetched_folder", lambda name: tmp_path / "cache" / name)
+    (tmp_path / "weights" / "mine").mkdir(parents=True)
+    (tmp_path / "weights" / "notes.txt").write_text("not weights")
+    fetched = tmp_path / "cache" / next(iter(releases()))
+    fetched.mkdir(parents=True)
+    assert Doctor()._folders()[-1] == Path("weights/mine")
+    (fetched / hub.RECORD).write_text("{}")
+    assert Doctor()._folders()[-2:] == [Path("weights/mine"), fetched]

@@ -1,0 +1,17 @@
+"""`egosim simulate`: the table of scores."""
+
+from egosim_jax.cli import simulate
+from egosim_jax.metrics.loop import MEASURES
+
+
+def test_clips_with_other_ground_truth_have_empty_cells(capsys):
+    names = list(MEASURES)
+    report = [
+        {"clip": 1, "action": "lift", names[0]: 1.0},
+        {"clip": 2, "action": "drop", names[1]: 2.0},
+        {"clip": 3, "action": "wave"},
+    ]
+    simulate._print(report)
+    table = capsys.readouterr().out
+    for text in (MEASURES[names[0]][0], MEASURES[names[1]][0], "1: lift", "2: drop", "3: wave"):
+        assert text in table

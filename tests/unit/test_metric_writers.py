@@ -1,0 +1,15 @@
+"""metrics.jsonl of runs that are started again."""
+
+import pytest
+
+from egosim_jax.metric_writers import JsonLines
+
+
+@pytest.mark.parametrize(("resume_after", "kept"), [(0, 0), (5, 2)])
+def test_a_run_repeats_no_line(tmp_path, resume_after, kept):
+    path = tmp_path / "metrics.jsonl"
+    writer = JsonLines(path)
+    for step in (0, 5, 10):
+        writer.write(step, {"loss": 1.0})
+    JsonLines(path, resume_after=resume_after)
+    assert len(path.read_text().splitlines()) == kept
