@@ -22,8 +22,10 @@ from egosim_jax import configs
 from egosim_jax.data.metadata import MASK_NAME
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.video import write_video
+from egosim_jax.io.weights import hashes
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.train.encode import example_shapes
 from egosim_jax.types import Triplet, VideoSpec
 
 
@@ -104,23 +106,34 @@ def write_dataset(
     return path
 
 
-def write_latents(folder: Path, model: ModelConfig, records: int = 7) -> Path:
-    """Write shards of random latents, as encoded clips for training a model; return the folder."""
+def write_latents(
+    folder: Path, model: ModelConfig, records: int = 7, *, weights: Path | None = None
+) -> Path:
+    """Write shards of random latents, as encoded clips for training a model; return the folder.
+
+    With a folder of `weights` the shards have the hashes of its encoders, as fine-tuning requires.
+    """
     rng = np.random.default_rng(0)
 
-    def draw(*size: int) -> np.ndarray:
-        return rng.normal(size=size).astype(np.float32)
+    def draw(name: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        if name == "ids_mask":
+            return np.ones(shape, dtype)
+        if np.issubdtype(dtype, np.integer):
+            return rng.integers(0, 2 if name == "mask" else 100, shape).astype(dtype)
+        return rng.normal(size=shape).astype(dtype)
 
-    with ShardWriter(folder, kind="latents", spec=model.video) as writer:
+    encoders = {} if weights is None else hashes(weights, only=model.cached_networks)
+    shards = ShardWriter(
+        folder,
+        kind="latents",
+        spec=model.video,
+        grid=model.grid,
+        provenance={"config": model.name, "encoders": encoders},
+    )
+    shapes = example_shapes(model, 1)
+    with shards as writer:
         for number in range(records):
-            arrays = {"text": draw(7, model.dit.text_dim)}
-            if model.dit.image_dim is not None:
-                arrays["image"] = draw(5, model.dit.image_dim)
-            for part, channels in model.layout.parts:
-                values = draw(*model.latent_shape, channels)
-                if part == "mask":
-                    values = (values > 0).astype(np.uint8)
-                arrays["target" if part == "noisy" else part] = values
+            arrays = {name: draw(name, a.shape[1:], a.dtype) for name, a in shapes.items()}
             writer.add(arrays, {"video_id": f"clip_{number}", "prompt": ""})
     return folder
 
