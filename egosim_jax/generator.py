@@ -124,7 +124,7 @@ def denoise(
     config: ModelConfig,
     keys: Key[Array, " b"] | None = None,
 ) -> Float[Array, "b f h w z"]:
-    """Run the sampler; the unconditional branch uses an empty prompt.
+    """Run the sampler; the unconditional branch gets text embeddings of zeros.
 
     `keys`, one for each item, draw the noise that a stochastic solver adds.
     """
@@ -208,7 +208,7 @@ class Generator:
 
         Without a folder, these are the weights that come with the package or were fetched. `lora`
         is a file in any naming that `egosim-convert` reads. Raises `InputError` if config, weights
-        or LoRA are missing or do not fit each other.
+        or LoRA are missing or do not fit each other, or if the LoRA names another base.
         """
         from egosim_jax import configs
 
@@ -216,9 +216,11 @@ class Generator:
         folder = configs.weights_of(config.name, None if weights is None else Path(weights))
         networks = Networks.load(config, folder, mesh=mesh)
         if lora is not None:
-            from egosim_jax.convert.lora import read_lora
+            from egosim_jax.convert.lora import check_base, read_lora
+            from egosim_jax.io.weights import hashes
             from egosim_jax.models.lora import apply
 
+            check_base(lora, [hashes(folder, only=["dit"])["dit"]])
             apply(networks.dit, read_lora(lora, config.dit), scale=lora_scale)
         return cls(config.at(folder), networks, mesh, renderer=renderer)
 

@@ -92,6 +92,17 @@ class ModelConfig:
         for left, a, right, b in pairs:
             if a != b:
                 raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+        if "mask" in layout and layout.mask_packing == "space" and self.vae.spatial_stride % 2:
+            raise InputError(
+                f"{self.name}: the mask packing space takes 2 x 2 pixels of a latent cell, so that "
+                f"the codec's stride must be even, not {self.vae.spatial_stride}. Choose another "
+                "packing. (layout.mask_packing)"
+            )
+        if dit.patch[1] != dit.patch[2]:
+            raise InputError(
+                f"{self.name}: the tokens have {dit.patch[1]} rows and {dit.patch[2]} columns; "
+                "they must be square. (dit.patch)"
+            )
         # Raises if the solver does not fit the process, or the steps.
         self.solver.coefficients(self.process, self.process.times(self.steps))
         self.grid.check(self.video)

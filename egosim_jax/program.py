@@ -11,7 +11,7 @@ import numpy as np
 from flax import nnx
 from jax.sharding import Mesh, PartitionSpec
 
-from egosim_jax.io.executables import cached_compile, share_with_jax
+from egosim_jax.io.executables import cached_compile
 from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
 
 Module = TypeVar("Module")
@@ -35,7 +35,6 @@ class CompiledFn:
         cache_key: Any = None,
         **options: Any,
     ):
-        share_with_jax()
         graph, self._params = nnx.split(networks, nnx.Param)
         self._mesh, self._cache_key = mesh, cache_key
         if mesh is not None:

@@ -16,6 +16,7 @@ import optax
 from flax import nnx
 from optax.contrib import MuonDimensionNumbers, muon
 
+from egosim_jax.io.executables import share_with_jax
 from egosim_jax.metric_writers import EXTRAS, check_installed
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.types import InputError, check_counts, check_seed
@@ -166,6 +167,7 @@ class Recipe(ABC):
         if self.preflight is None:
             for stage in self.stages().values():
                 stage.training.check_packages()
+            share_with_jax()
             return self.train()
         from egosim_jax.preflight.targets import compile_offline
         from egosim_jax.train.preflight import preflight

@@ -43,6 +43,8 @@ from egosim_jax.types import InputError, Triplet, check_counts
 
 MAX_PARTS = 100_000
 """Maximum number of shards, whose names have five digits."""
+OLD_MASK = {"packing": "space", "channels": 4}
+"""Packing and channels of the mask in shards that do not name them."""
 READ_THREADS = min(8, os.cpu_count() or 1)
 """Threads that read clips while others are encoded."""
 
@@ -97,6 +99,11 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
     if config.encoders == "joint":
         given |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
     return {name: shape for name, shape in {**given, **encoded}.items() if shape is not None}
+
+
+def mask_of(config: ModelConfig) -> dict[str, Any]:
+    """Return packing and number of channels of a model's mask, as shards name them."""
+    return {"packing": config.layout.mask_packing, "channels": config.layout.count("mask")}
 
 
 def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
@@ -159,6 +166,8 @@ def encode_shards(
         "encoders": hashes(folder, only=config.cached_networks),
         "decoding": decoding,
     }
+    if (mask := mask_of(config)) != OLD_MASK:
+        provenance["mask"] = mask
     _open(
         out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
     )
@@ -278,9 +287,9 @@ def _clip(source: ShardReader, window: Window, config: ModelConfig, decoding: De
 def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> None:
     """Raise `InputError` unless latents shards were encoded for a model, by the given weights.
 
-    Compares config and video with the manifest in `shards`, and the hashes of the encoders with
-    those of the weights folder, in which only the VAE is required; without a folder, only config
-    and video.
+    Compares config, video and the packing of the mask with the manifest in `shards`, and the hashes
+    of the encoders with those of the weights folder, in which only the VAE is required; without a
+    folder, hashes are not compared.
     """
     manifest = read_manifest(shards)
     encoders = manifest.provenance.get("encoders")
@@ -297,6 +306,9 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
         )
         if have != want
     ]
+    mask = manifest.provenance.get("mask", OLD_MASK)
+    if "mask" in config.layout and mask != mask_of(config):
+        problems.append(f"mask: the shards have {mask}, this training has {mask_of(config)}")
     if weights is not None:
         ours = {"vae": "none", **hashes(weights, only=encoders)}
         problems += [

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 from egosim_jax.command import ExitCode
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
-from egosim_jax.models.wan.config import Remat
 from egosim_jax.train.config import Recipe, TrainConfig
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
@@ -44,8 +43,8 @@ class FineTuning(Recipe):
     """Distribution and weighting of the noise levels."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
-    remat: Remat | None = None
-    """Rematerialization in the backward pass, if not the model's."""
+    remat: str | None = None
+    """Rematerialization in the backward pass, if not the model's (`remat_levels`)."""
     attention: Kernel | None = None
     """Attention kernel, if not the model's."""
     dtype: Literal["float32", "bfloat16"] | None = None
@@ -87,7 +86,7 @@ class FineTuning(Recipe):
             samples=self.validation
             and Samples(model=model, latents=self.validation, vae=weights, count=self.samples),
         )
-        print(write_trained(trained, out, model=model, start=weights))
+        print(write_trained(trained, out, model=model, start=weights, rank=self.rank))
         return ExitCode.DONE
 
     def model(self) -> ModelConfig:
@@ -104,11 +103,19 @@ class FineTuning(Recipe):
         if unknown := sorted(given.keys() - set(model.dit.numerics_only)):
             options = ", ".join(f"--{name}" for name in unknown)
             raise InputError(f"The denoiser of {model.name} has no {options}: omit it.")
+        levels = model.dit.remat_levels
+        if self.remat is not None and self.remat not in levels:
+            raise InputError(
+                f"The denoiser of {model.name} has no rematerialization {self.remat}: it must be "
+                f"one of {', '.join(levels)}. (--remat)"
+            )
         return replace(model, dit=replace(model.dit, **given))
 
 
-def write_trained(trained: Networks, out: Path, *, model: ModelConfig, start: Path) -> Path:
-    """Write OUT/lora.safetensors, if a LoRA was trained, or the complete OUT/weights.
+def write_trained(
+    trained: Networks, out: Path, *, model: ModelConfig, start: Path, rank: int | None
+) -> Path:
+    """Write OUT/lora.safetensors, if a LoRA of some rank was trained, or the complete OUT/weights.
 
     `start` is the weights folder that the LoRA belongs to, or that has the networks that were not
     trained. All processes of the training call it with the same arguments.
@@ -119,9 +126,9 @@ def write_trained(trained: Networks, out: Path, *, model: ModelConfig, start: Pa
     from egosim_jax.io.mapped import read_safetensors
     from egosim_jax.models import lora
 
-    if deltas := lora.deltas_of(trained.dit):
+    if rank is not None:
         path, base = out / "lora.safetensors", weights.hashes(start)["dit"]
-        changes: dict[str, lora.Change] = {**deltas}
+        changes: dict[str, lora.Change] = {**lora.deltas_of(trained.dit)}
         before = read_safetensors(start / "dit.safetensors")
         for name, value in lora.full_weights(trained.dit, model.dit.also_train).items():
             if (gathered := weights.gather(value)) is not None:

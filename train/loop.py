@@ -29,7 +29,6 @@ from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
-from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
@@ -66,7 +65,6 @@ def train(
     settings = {"task": task, "training": training, "weights": digests}
     mutable = [*resume_mutable("training"), *numerics_only(task, "task")]
     open_folder(out, settings, mutable=mutable)
-    share_with_jax()
     mesh, source = make_mesh(training.mesh), ShardReader(data)
     programs = Programs.of(task, training, mesh)
     if weights is None and jax.tree.leaves(programs.frozen):

@@ -112,10 +112,12 @@ class Encode:
 
         from egosim_jax import configs
         from egosim_jax.data.shards import ShardReader
+        from egosim_jax.io.executables import share_with_jax
         from egosim_jax.sharding import MeshConfig, make_mesh
         from egosim_jax.train.distributed import launched_context
         from egosim_jax.train.encode import encode_shards
 
+        share_with_jax()
         with launched_context():
             mesh = make_mesh(MeshConfig(data=-1, fsdp=1), jax.local_devices())
             encode_shards(

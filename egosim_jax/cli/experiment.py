@@ -44,6 +44,9 @@ class Experiment:
 
     def run(self) -> int:
         """Run the chosen experiment."""
+        from egosim_jax.io.executables import share_with_jax
+
+        share_with_jax()
         name = MODULES[type(self.command)]
         import_module(f"egosim_jax.experiments.{name}").run(self.command)
         return ExitCode.DONE

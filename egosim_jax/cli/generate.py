@@ -85,9 +85,11 @@ class Generate:
     def run(self) -> int:
         """Check everything, compile, generate."""
         from egosim_jax.batch import BatchJob
+        from egosim_jax.io.executables import share_with_jax
         from egosim_jax.worlds.tabletop.dataset import write_scenes
 
         self._check()
+        share_with_jax()
         job = BatchJob(
             model=self._model(),
             out=self.out or Path("runs") / f"{self.config}_{self.seed}",

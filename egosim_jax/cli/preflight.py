@@ -48,12 +48,14 @@ class Preflight:
     def run(self) -> int:
         """Compile and print."""
         from egosim_jax import configs
+        from egosim_jax.io.executables import share_with_jax
         from egosim_jax.preflight import report as reports
         from egosim_jax.preflight.targets import compile_offline, find
         from egosim_jax.sharding import make_mesh, parts
 
         check_counts({"--batch-size": self.batch_size, "--steps": self.steps})
         compile_offline()
+        share_with_jax()
         config, target = configs.get(self.config), find(self.target)
         config = replace(config, steps=self.steps or config.steps)
         mesh = make_mesh(self.mesh, target.devices)

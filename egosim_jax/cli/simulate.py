@@ -66,6 +66,7 @@ class Simulate:
         """Simulate; write videos, states and scores."""
         from egosim_jax import configs, rendering
         from egosim_jax.generator import Generator
+        from egosim_jax.io.executables import share_with_jax
         from egosim_jax.io.fingerprint import fingerprint
         from egosim_jax.io.journal import Journal
         from egosim_jax.io.run import open_folder, write_json
@@ -77,6 +78,7 @@ class Simulate:
 
         check_counts({"--clips": self.clips})
         check_seed(self.seed)
+        share_with_jax()
         config = configs.get(self.config)
         weights = configs.weights_of(self.config, self.weights)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"

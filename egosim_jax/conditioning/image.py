@@ -9,7 +9,7 @@ The EgoSim release hands over a picture in [0, 1] instead, so that its encoder s
 half of the range, in training too; `image_range="unit"` reproduces that, "signed" is Wan's.
 
 The resize is bicubic without antialiasing, on a grid of cells (not of corners), as torch's
-`interpolate`. Output cell i is centerd on s = (i + 1/2) n_in / n_out - 1/2 and weighs the four
+`interpolate`. Output cell i is centered on s = (i + 1/2) n_in / n_out - 1/2 and weighs the four
 cells around s, at distances d, by Keys' kernel (1981) with a = -3/4, the edge cells repeated:
 
     k(d) = (a + 2) d^3 - (a + 3) d^2 + 1              d <= 1

@@ -14,7 +14,7 @@ cell is latent 0, not the latent of gray or black (EgoSim release).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +54,11 @@ class ChannelLayout:
     def __post_init__(self) -> None:
         """Check that the noisy latents come first, every part once, with enough channels."""
         names = [name for name, _ in self.parts]
+        if unknown := [name for name in names if name not in get_args(Part)]:
+            raise InputError(
+                f"A channel layout has no part {', '.join(unknown)}: all parts are "
+                f"{', '.join(get_args(Part))}. (layout.parts)"
+            )
         if names[:1] != ["noisy"] or len({*names}) < len(names):
             raise InputError(
                 f"The parts of a channel layout are {', '.join(names) or 'none'}: noisy must come "

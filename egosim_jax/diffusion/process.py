@@ -228,6 +228,11 @@ class RectifiedFlow(Process):
             visited = self.warp(np.linspace(1.0, 0.0, _count(steps) + 1)[:-1])
         else:
             visited = _falling(steps, low=0, high=TIMESTEPS) / TIMESTEPS
+            if self.prediction == "epsilon" and visited[0] == 1:
+                raise InputError(
+                    f"timesteps {list(steps)} cannot be sampled: prediction epsilon needs signal "
+                    f"at every timestep, and {TIMESTEPS} has none. Start lower. (--steps)"
+                )
         return np.append(visited, 0.0)
 
 

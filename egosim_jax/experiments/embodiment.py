@@ -211,7 +211,7 @@ class _Experiment:
             out=out,
             weights=start,
         )
-        return write_trained(trained, out, model=model, start=start or self.origin)
+        return write_trained(trained, out, model=model, start=start or self.origin, rank=rank)
 
     def _generator(self, trained: Mapping[str, Path], name: str) -> Generator:
         if name == "lora":

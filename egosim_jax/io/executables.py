@@ -2,19 +2,22 @@
 
 The files are in a `PrivateCache`, because reading one runs native code in it. Its key is the digest
 of everything that the compiled function depends on: its name and config, the shapes of its
-arguments, the devices, the versions of the libraries, XLA's flags, and the modules of this package
-that run while it is traced. jax's own compilation cache is in another one (`share_with_jax`).
+arguments, the devices, the versions of the libraries, XLA's flags, the modules of this package that
+run while it is traced, and other packages whose classes are in the config. jax's own compilation
+cache is in another one (`share_with_jax`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import json
 import os
 import pickle
+import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -41,14 +44,17 @@ JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
 def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
     """Return the compiled function of this key and these arguments, from the cache if it is there.
 
-    `args` are arrays or shapes. Without a private folder, or with several processes, it is compiled
-    and not stored.
+    `args` are arrays or shapes. Without a private folder, with several processes, or with a class
+    in the key whose source is not in a file, it is compiled and not stored.
     """
     from jax.experimental import serialize_executable
 
-    if jax.process_count() > 1 or (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
+    sources = _sources(key)
+    if sources is None or jax.process_count() > 1:
         return compile_fn()
-    name = _digest(key, args)
+    if (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
+        return compile_fn()
+    name = _digest((key, sources), args)
     if (data := cache.get(name)) is not None:
         try:
             return serialize_executable.deserialize_and_load(*pickle.loads(data))  # noqa: S301
@@ -66,7 +72,8 @@ def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
 def share_with_jax() -> None:
     """Store jax's own compilation cache in a `PrivateCache`, unless the user chose a folder.
 
-    Without it, jax's files have no checksum if zstandard compresses them, and any user's are read.
+    For entry points, since it changes jax's settings. Without it, jax's files have no checksum if
+    zstandard compresses them, and any user's are read.
     """
     from jax._src import compilation_cache
 
@@ -154,3 +161,45 @@ def _code() -> str:
         for module in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(module.read_bytes())
     return digest.hexdigest()
+
+
+def _sources(key: Any) -> dict[str, str] | None:
+    """Return the digest of each module outside this package that defines a class in a key.
+
+    Covers the top-level package of the module. None if a module has no source file.
+    """
+    sources = {}
+    for name in {kind.__module__ for kind in _classes(key)}:
+        module = sys.modules[name]
+        if (top := _full_name(module).partition(".")[0]) in sys.stdlib_module_names:
+            continue
+        if (file := getattr(module, "__file__", None)) is None or not file.endswith(".py"):
+            return None
+        if (own := Path(file).resolve()).is_relative_to(PACKAGE.resolve()):
+            continue  # `_code` has it
+        folders = [] if top == PACKAGE.name else getattr(sys.modules.get(top), "__path__", [])
+        files = {own, *(path for folder in folders for path in Path(folder).rglob("*.py"))}
+        digest = hashlib.sha256()
+        for path in sorted(files):
+            digest.update(path.read_bytes())
+        sources[_full_name(module)] = digest.hexdigest()
+    return dict(sorted(sources.items()))
+
+
+def _full_name(module: Any) -> str:
+    """Return a module's name; `__main__` of `python -m` has it in its spec."""
+    spec = getattr(module, "__spec__", None)
+    return module.__name__ if spec is None else spec.name
+
+
+def _classes(value: Any) -> Iterator[type]:
+    """Iterate over the classes, with their bases, of a value and of all that it holds."""
+    yield from type(value).__mro__
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from _classes(getattr(value, field.name))
+    elif isinstance(value, Mapping):
+        yield from _classes(tuple(value.values()))
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _classes(item)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 @runtime_checkable
 class Denoiser(Protocol):
-    """Network that predicts noise, data or velocity from noisy latents."""
+    """Network that predicts noise, data, velocity or v from noisy latents (`Process`)."""
 
     def prepare(
         self,
@@ -32,7 +32,10 @@ class Denoiser(Protocol):
     def denoise(
         self, noisy: Float[Array, "b f h w c"], t: Float[Array, " b"], context: Any
     ) -> Float[Array, "b f h w c"]:
-        """Return the prediction, in float32, for noisy latents at times in [0, 1000]."""
+        """Return the prediction, in float32, for noisy latents at timesteps `t`.
+
+        They are those of `Process.timesteps`.
+        """
         ...
 
 

@@ -66,6 +66,8 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
     check_scale(scale)
     check(flat_shapes(network), changes)
     layers = dict(linears(network))
+    low = [path for path, change in changes.items() if isinstance(change, Delta)]
+    refuse([f"{path}: is not a linear layer" for path in low if path not in layers])
     state = nnx.state(network, nnx.Param)
     weights = {".".join(map(str, path)): leaf for path, leaf in nnx.to_flat_state(state)}
     for path, change in changes.items():
@@ -92,8 +94,9 @@ def deltas_of(network: Any) -> dict[str, Delta]:
 
 
 def full_weights(network: Any, patterns: Sequence[str]) -> dict[str, Any]:
-    """Return the weights whose paths match `also_train` patterns."""
-    leaves = nnx.to_flat_state(nnx.state(network, nnx.Param))
+    """Return the weights whose paths match `also_train` patterns, without low-rank ones."""
+    kind = nnx.All(nnx.Param, nnx.Not(LowRankParam))
+    leaves = nnx.to_flat_state(nnx.state(network, kind))
     named = {".".join(map(str, path)): leaf.get_value() for path, leaf in leaves}
     return {path: value for path, value in named.items() if matches(path, patterns)}
 
@@ -134,19 +137,38 @@ def metadata(config: str, *, base: str) -> dict[str, str]:
     return {"format": OURS, "config": config, BASE: base}
 
 
-def start(network: Any, rank: int, *, targets: Sequence[str], rngs: nnx.Rngs) -> None:
+def start(
+    network: Any,
+    rank: int,
+    *,
+    targets: Sequence[str],
+    also_train: Sequence[str] = (),
+    rngs: nnx.Rngs,
+) -> None:
     """Add trainable low-rank changes to the linear layers that match `targets`, in place.
 
     A is drawn as the paper does, from a normal distribution of deviation 1 / sqrt(in), and B is 0,
-    so that nothing changes before the first update.
+    so that nothing changes before the first update. Raises `InputError` if no linear layer matches
+    `targets`, or no weight a pattern of `also_train`.
     """
     if rank < 1:
         raise InputError(f"The rank of a LoRA must be at least 1, not {rank}.")
-    for path, layer in linears(network):
-        if matches(path, targets):
-            *stacked, wide, out = layer.kernel.shape
-            down = jax.random.normal(rngs.params(), (*stacked, wide, rank)) / wide**0.5
-            layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
+    layers = [layer for path, layer in linears(network) if matches(path, targets)]
+    if not layers:
+        raise InputError(
+            "A LoRA needs a linear layer: none matches the denoiser's patterns "
+            f"{listing(targets)}. Correct its config, or train all weights. (lora_targets, --rank)"
+        )
+    weights = flat_shapes(network)
+    if bad := [p for p in also_train if not any(matches(path, [p]) for path in weights)]:
+        raise InputError(
+            "Every pattern of weights to train in full must match one: the denoiser has none of "
+            f"{listing(bad)}. Correct its config. (also_train)"
+        )
+    for layer in layers:
+        *stacked, wide, out = layer.kernel.shape
+        down = jax.random.normal(rngs.params(), (*stacked, wide, rank)) / wide**0.5
+        layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
 
 
 def trained(also_train: Sequence[str]) -> Any:

@@ -5,10 +5,13 @@ users call.
 """
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main as egosim
@@ -24,12 +27,19 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
 )
+from egosim_jax.models.lora import metadata
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.config import TrainConfig
+from egosim_jax.train.encode import check_encoders
 from egosim_jax.train.fine_tuning import FineTuning
-from egosim_jax.types import Triplet
+from egosim_jax.types import InputError, Triplet
 
 HERE = Path(__file__).parent
+SPACE_MASK = {
+    "parts": (("noisy", 6), ("mask", 4), ("prior", 6), ("hands", 6)),
+    "mask_packing": "space",
+}
+WIDER = {"in_channels": 22}
 PROMPTS = ("take cup", "open drawer", "close drawer")
 
 
@@ -122,6 +132,46 @@ def test_it_caches_what_its_layout_reads(toy: ModelConfig, latents: Path):
     assert record["text"].shape == (16, 8)
 
 
+def test_latents_of_another_packing_of_the_mask_are_refused(toy: ModelConfig, latents: Path):
+    check_encoders(latents, toy, None)
+    other = replace(toy, layout=replace(toy.layout, mask_packing="observed"))
+    with pytest.raises(InputError, match=r"mask: the shards have .*single.* has .*observed"):
+        check_encoders(latents, other, None)
+
+
+def test_its_rematerialization_is_refused_unless_it_has_it(toy: ModelConfig):
+    with pytest.raises(InputError, match="no --remat"):
+        FineTuning(config="toy", remat="full", training=TrainConfig(steps=1)).model()
+    with pytest.raises(InputError, match=r"rematerialization most: it must be one of offload"):
+        FineTuning(config="debug", remat="most", training=TrainConfig(steps=1)).model()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dit": {"patch": (1, 1, 5)}}, "must be square"),
+        ({"vae": {"spatial_stride": 3}, "layout": SPACE_MASK, "dit": WIDER}, "must be even, not 3"),
+    ],
+)
+def test_a_mask_or_patch_without_cells_is_refused(toy: ModelConfig, changes, message):
+    changed = {name: replace(getattr(toy, name), **fields) for name, fields in changes.items()}
+    with pytest.raises(InputError, match=message):
+        replace(toy, **changed)
+
+
+def test_a_lora_of_other_weights_is_refused(weights: Path, tmp_path: Path):
+    file = tmp_path / "lora.safetensors"
+    save_file({}, file, metadata=metadata("toy", base="0" * 64))
+    with pytest.raises(InputError, match="trained on other weights"):
+        Generator.load("toy", weights, lora=file)
+
+
+def test_loading_changes_no_setting_of_jax(weights: Path):
+    before = dict(jax.config.values)
+    Generator.load("toy", weights)
+    assert dict(jax.config.values) == before
+
+
 def test_it_trains_and_resumes_bit_for_bit(weights: Path, latents: Path, tmp_path: Path):
     tune(weights, latents, tmp_path / "whole")
     shutil.copytree(tmp_path / "whole", tmp_path / "stopped")
@@ -173,7 +223,7 @@ def test_a_base_model_without_hands_is_widened(toy: ModelConfig, weights: Path, 
     there, back = tmp_path / "there", tmp_path / "back"
     command = f"to-torch {weights} --config toy --layout toy --only dit --out {there}"
     assert egosim_convert(command.split()) == 0
-    from safetensors.numpy import load_file, save_file
+    from safetensors.numpy import load_file
 
     base = load_file(there / "denoiser.safetensors")
     base["proj_in.weight"] = np.ascontiguousarray(base["proj_in.weight"][:, :13])

@@ -4,12 +4,15 @@ import dataclasses
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
+from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.train.tasks.denoising import Denoising, loss_weights
+from egosim_jax.types import InputError
 from tests.training.run_tiny import MODEL
 
 
@@ -30,6 +33,20 @@ def test_without_change_loss_weight_all_locations_weigh_one():
     rng = np.random.default_rng(0)
     target, prior = rng.normal(size=(2, 1, 2, 3, 4, 16)).astype(np.float32)
     np.testing.assert_array_equal(loss_weights(jnp.asarray(target), jnp.asarray(prior), 0.0), 1)
+
+
+def test_a_layout_without_a_prior_trains_unless_changes_shall_weigh_more():
+    dit = dataclasses.replace(MODEL.dit, in_channels=16)
+    layout = ChannelLayout(parts=(("noisy", 16),))
+    model = dataclasses.replace(MODEL, dit=dit, layout=layout)
+    task = Denoising(model=model)
+    networks = task.networks(nnx.Rngs(0))
+    batch = {name: jnp.zeros(s.shape, s.dtype) for name, s in task.shapes(2).items()}
+    batch.pop("prior", None)
+    loss, _ = task.loss(networks, batch, task.keys(jax.random.key(0), 2))
+    assert np.isfinite(loss)
+    with pytest.raises(InputError, match="has no prior"):
+        Denoising(model=model, change_loss_weight=1.0)
 
 
 def test_a_lora_is_all_that_its_task_trains_and_the_rest_is_in_the_compute_dtype():

@@ -22,6 +22,7 @@ from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.models import lora
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.update import Batch, Metrics
+from egosim_jax.types import InputError
 
 VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)
 """Noise levels at which the validation loss is measured."""
@@ -45,6 +46,14 @@ class Denoising:
     rank: int | None = None
     """Rank of a LoRA, which is then trained instead of the weights; None: no LoRA."""
 
+    def __post_init__(self) -> None:
+        """Check that a weight of changes has a prior to compare with."""
+        if self.change_loss_weight and "prior" not in self.model.layout:
+            raise InputError(
+                f"{self.model.name} has no prior, from which a clip could change: the loss weight "
+                f"of changes must be 0, not {self.change_loss_weight}. (change_loss_weight)"
+            )
+
     @property
     def trained(self) -> Any:
         """The nnx filter of all weights, or of those of the LoRA."""
@@ -59,7 +68,14 @@ class Denoising:
         """Return the networks with random weights."""
         networks = Networks.build(self.model, only=self.model.trained_networks, rngs=rngs)
         if self.rank is not None:
-            lora.start(networks.dit, self.rank, targets=self.model.dit.lora_targets, rngs=rngs)
+            dit = self.model.dit
+            lora.start(
+                networks.dit,
+                self.rank,
+                targets=dit.lora_targets,
+                also_train=dit.also_train,
+                rngs=rngs,
+            )
         return networks
 
     def examples(self) -> None:
@@ -83,7 +99,7 @@ class Denoising:
         condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
         process, target = self.model.process, batch["target"]
         denoise = _denoise(self.model, networks, condition, target)
-        weights = loss_weights(target, batch["prior"], self.change_loss_weight)
+        weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
         loss, _ = self.objective.loss(process, denoise, target, keys[:, 1], loss_weights=weights)
         return loss, {}
 

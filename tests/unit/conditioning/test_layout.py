@@ -155,3 +155,10 @@ def test_a_condition_that_lacks_a_part_is_refused(condition):
 def test_a_layout_that_cannot_be_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         ChannelLayout(**changes)
+
+
+def test_a_part_that_is_not_known_is_refused():
+    layout = ChannelLayout()
+    object.__setattr__(layout, "parts", (("noisy", 16), ("depth", 4)))  # past the checks of types
+    with pytest.raises(InputError, match="no part depth: all parts are noisy, mask"):
+        layout.__post_init__()

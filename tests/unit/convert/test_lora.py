@@ -184,6 +184,39 @@ def test_a_fresh_summand_changes_nothing_until_it_is_trained():
         lora.start(made, 0, targets=CONFIG.lora_targets, rngs=nnx.Rngs(3))
 
 
+@pytest.mark.parametrize(
+    ("patterns", "message"),
+    [
+        ({"targets": ("layers.*",)}, r"none matches .*layers\.\*.*lora_targets"),
+        ({"targets": ("blocks.*",), "also_train": ("input.*",)}, r"none of input\.\*"),
+    ],
+)
+def test_patterns_of_a_lora_that_match_nothing_are_refused(patterns, message):
+    with pytest.raises(InputError, match=message):
+        lora.start(network(), 2, **patterns, rngs=nnx.Rngs(0))
+
+
+def test_weights_trained_in_full_are_not_those_of_the_lora():
+    made = network()
+    lora.start(made, 2, targets=("blocks.*",), rngs=nnx.Rngs(0))
+    full = lora.full_weights(made, ("blocks.mlp.*",))
+    assert full.keys() == {
+        f"blocks.mlp.{p}.{w}" for p in ("up", "down") for w in ("kernel", "bias")
+    }
+
+
+def test_a_pair_for_a_layer_that_is_not_linear_is_refused():
+    class Conv(nnx.Module):
+        def __init__(self):
+            self.kernel = nnx.Param(jnp.ones((2, 3)))
+
+    other = nnx.Module()
+    other.conv = Conv()
+    delta = lora.Delta(down=np.ones((2, 1), np.float32), up=np.ones((1, 3), np.float32))
+    with pytest.raises(InputError, match="conv: is not a linear layer"):
+        lora.apply(other, {"conv": delta})
+
+
 def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
     base = "diffusion_model.blocks.0.self_attn"
     bad = {

@@ -134,6 +134,7 @@ def test_given_timesteps_are_what_the_network_is_given():
         (RectifiedFlow(), [500, 500], "must fall"),
         (RectifiedFlow(), [1001, 500], "at most 1000"),
         (RectifiedFlow(), [500, 0], "above 0"),
+        (RectifiedFlow(sigma_max=0.999, prediction="epsilon"), (1000, 500), "needs signal"),
         (VariancePreserving(), [1000, 500], "at most 999"),
         (VariancePreserving(), [998.5, 500], "integers"),
         (VariancePreserving(), 1001, "more than the 1000"),

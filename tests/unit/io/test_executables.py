@@ -1,9 +1,12 @@
 """Compiled functions are found in the cache, and only by their user."""
 
+import dataclasses
+import importlib
 import os
 import random
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import jax
@@ -101,6 +104,48 @@ def test_every_module_that_runs_while_tracing_is_part_of_the_key():
     ran = {Path(file).resolve() for file in files}
     ours = {path.relative_to(package) for path in ran if path.is_relative_to(package)}
     assert {path.parts[0] for path in ours} <= set(executables.TRACED)
+
+
+OUTSIDE = """
+from dataclasses import dataclass
+
+from egosim_jax.diffusion.solver import Euler
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outside(Euler):
+    pass
+"""
+
+
+@pytest.mark.parametrize("place", ["outside_module.py", "outside_package/solver.py"])
+def test_modules_outside_the_package_are_part_of_the_key(
+    folder, double, tmp_path, monkeypatch, place
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    file = tmp_path / place
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(OUTSIDE)
+    module = importlib.import_module(place.removesuffix(".py").replace("/", "."))
+    config = dataclasses.replace(configs.get("debug"), solver=module.Outside())
+    for _ in range(2):
+        cached_compile(("denoise", config), GIVEN, double)
+    assert double.times == 1
+    file.write_text(OUTSIDE + "# edited")
+    cached_compile(("denoise", config), GIVEN, double)
+    assert double.times == 2
+    (file.parent / "another.py").write_text("x = 1")
+    cached_compile(("denoise", config), GIVEN, double)
+    assert double.times == (3 if "/" in place else 2)  # all modules of a package count
+
+
+def test_a_class_without_a_source_file_is_not_cached(folder, double, monkeypatch):
+    module = types.ModuleType("typed_in")
+    monkeypatch.setitem(sys.modules, "typed_in", module)
+    key = type("Solver", (), {"__module__": "typed_in", "__repr__": lambda self: "Solver"})()
+    for _ in range(2):
+        cached_compile(key, GIVEN, double)
+    assert double.times == 2
 
 
 def test_another_key_or_shape_is_another_function(folder, double):
