@@ -73,6 +73,7 @@ class Simulate:
         from egosim_jax.io.weights import hashes
         from egosim_jax.metrics.loop import DEFINITIONS
         from egosim_jax.perception import registry
+        from egosim_jax.perception.recorded import RecordedConfig
         from egosim_jax.rollout import OUTPUTS, Rollout
         from egosim_jax.simulator import Simulator
 
@@ -85,7 +86,10 @@ class Simulate:
         episode = self._episode(config.video)
         perception = None
         if self.update == "full":
-            perception = registry.parse(self.perception).build(episode.observations())
+            pipeline = registry.parse(self.perception)
+            if isinstance(pipeline, RecordedConfig):
+                pipeline.check_clips(len(episode.actions))
+            perception = pipeline.build(episode.observations())
         made_of = {
             "simulate": self,
             "model": config,

@@ -70,6 +70,10 @@ class RevealedSurfaces:
     point_px: int = 2
     """Size in pixels of the points with which the state is rendered."""
 
+    def __post_init__(self) -> None:
+        """Check that points have a size."""
+        check_counts({"point_px": self.point_px})
+
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:

@@ -26,6 +26,7 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
+from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
 from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
 
 PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
@@ -167,21 +168,28 @@ def _object_model(number: int, state: SceneState, config: TrackObjects) -> Objec
         number=number,
         points_m=points,
         colors=state.colors[own].astype(np.float32),
-        plane=_support_plane(points, state.points_m[~own], config),
+        plane=_support_plane(points, state.points_m[~own], config, up=up_of(state)),
     )
 
 
 def _support_plane(
-    points_m: Float[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], config: TrackObjects
+    points_m: Float[np.ndarray, "n 3"],
+    others_m: Float32[np.ndarray, "m 3"],
+    config: TrackObjects,
+    *,
+    up: Up = "z",
 ) -> Float[np.ndarray, " 4"]:
-    """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC)."""
+    """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC).
+
+    Of too few points it is the horizontal plane of unknown height.
+    """
     import open3d as o3d
     from threadpoolctl import threadpool_limits
 
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
     if len(near) < config.min_points:
-        return np.array([0.0, 0.0, 1.0, np.nan])
+        return np.array([*UP_AXES[up], np.nan])
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
     with threadpool_limits(1, user_api="openmp"):  # else its threads race, and runs differ

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from glob import escape, glob
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from egosim_jax.io.digest import sha256
 from egosim_jax.io.npz import DAMAGE, read_arrays
 from egosim_jax.io.untrusted import open_regular, quote, quote_text, read_bytes
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
@@ -30,6 +32,12 @@ from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
 
 IDS_PER_STEP = 1000
 """Offset between the object ids of successive steps: recorded ids are unique in one clip only."""
+STEP = "{step}"
+"""Placeholder for the number of the step in the name of the files."""
+FILES = (
+    ("pose", "npz"), ("intrinsics", "npz"), ("depth", "zip"), ("mask", "zip"), ("mask", "txt"),
+)  # fmt: skip
+"""Folder and suffix of each file of a clip."""
 MAX_FRAME_BYTES = 2**28
 """Largest unpacked frame in bytes."""
 MAX_FRAME_PIXELS = 2**25
@@ -41,18 +49,39 @@ MAX_TEXT_BYTES = 2**20
 @register("recorded")
 @dataclass(frozen=True, kw_only=True)
 class RecordedConfig:
-    """Perception results read from the files of one clip."""
+    """Perception results read from files, of one clip or of one per step."""
 
     folder: Path
     """Folder with pose/, intrinsics/, depth/ and mask/."""
     name: str
-    """Name of the clip's files, without suffix."""
+    """Name of the clip's files, without suffix; {step} in it is the number of the step, from 1."""
     alignment: CameraMethod = "orientations"
     """Method that aligns the recorded cameras with the action's."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
         """Return the pipeline that reads the files; the ground truth is not used."""
-        return Pipeline(stages=(ReadRecording(config=self), find_interactions))
+        stage = ReadRecording(config=self, files=self._hashes())
+        return Pipeline(stages=(stage, find_interactions))
+
+    def check_clips(self, count: int) -> None:
+        """Raise `InputError` if several clips would be read from the same files."""
+        if count > 1 and STEP not in self.name:
+            raise InputError(
+                f"recorded --name {quote_text(self.name)} names the files of one clip, and "
+                f"{count} clips are simulated: the name must contain {STEP}, the number of the "
+                f"step. Use a name such as clip_{STEP}, or --clips 1. (--perception)"
+            )
+
+    def path(self, kind: str, suffix: str, step: int | str) -> Path:
+        """Return the path of a file of a step."""
+        return self.folder / kind / f"{self.name.replace(STEP, str(step))}.{suffix}"
+
+    def _hashes(self) -> dict[str, str]:
+        """Return the SHA-256 of every file that exists, by its path in the folder."""
+        config = replace(self, folder=Path(escape(str(self.folder))), name=escape(self.name))
+        patterns = (str(config.path(kind, suffix, "*")) for kind, suffix in FILES)
+        paths = (Path(path) for pattern in patterns for path in sorted(glob(pattern)))
+        return {f"{path.parent.name}/{path.name}": sha256(path) for path in paths if path.is_file()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,33 +89,36 @@ class ReadRecording:
     """Stage that sets cameras, depth, object ids and names from files, each of them read once."""
 
     config: RecordedConfig
+    """Location of the files."""
+    files: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of each file, which identifies the recording in the fingerprint of a run."""
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
         """Set everything but hand joints and interactions; no object is tracked."""
-        cameras, scale = self._cameras(clip, action)
-        phrases = self._phrases()
+        cameras, scale = self._cameras(clip, action, state.step + 1)
+        phrases = self._phrases(state.step + 1)
         first_id = IDS_PER_STEP * (state.step + 1)
         return replace(
             so_far,
             cameras=cameras,
-            depth_m=self._depth(clip, scale),
-            object_ids=self._object_ids(clip, phrases, first_id),
+            depth_m=self._depth(clip, scale, state.step + 1),
+            object_ids=self._object_ids(clip, phrases, state.step + 1),
             names={first_id + number: p for number, p in phrases.items() if not is_hand(p)},
             motions={},
         )
 
-    def _cameras(self, clip: Clip, action: Action) -> tuple[Cameras, float]:
+    def _cameras(self, clip: Clip, action: Action, step: int) -> tuple[Cameras, float]:
         """Return the recorded cameras in the world, and the scale of the alignment."""
-        recorded = self._frames("pose", clip, 4, 4)
+        recorded = self._frames("pose", step, clip, 4, 4)
         alignment = align_cameras(
             recorded, action.cameras.world_from_camera, method=self.config.alignment
         )
         scale = np.cbrt(np.linalg.det(alignment[:3, :3]))
         poses = alignment @ recorded
         poses[:, :3, :3] /= scale
-        fx, fy, cx, cy = self._frames("intrinsics", clip, 4).mean(axis=0)
+        fx, fy, cx, cy = self._frames("intrinsics", step, clip, 4).mean(axis=0)
         cameras = Cameras(
             world_from_camera=poses,
             intrinsics_px=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
@@ -95,17 +127,17 @@ class ReadRecording:
         )
         return cameras, scale
 
-    def _depth(self, clip: Clip, scale: float) -> Float32[np.ndarray, "f h w"]:
+    def _depth(self, clip: Clip, scale: float, step: int) -> Float32[np.ndarray, "f h w"]:
         """Return the recorded depth in meters of the world; infinite where it is 0 or NaN."""
-        depth = scale * self._images("depth", clip)
+        depth = scale * self._images("depth", step, clip)
         return np.where(depth > 0, depth, np.inf).astype(np.float32)
 
     def _object_ids(
-        self, clip: Clip, phrases: Mapping[int, str], first_id: int
+        self, clip: Clip, phrases: Mapping[int, str], step: int
     ) -> Int32[np.ndarray, "f h w"]:
         """Return recorded object ids in the state's numbering, those of hands and arms negative."""
-        recorded = self._images("mask", clip).astype(np.int32)
-        ids = np.where(recorded > 0, recorded + first_id, 0)
+        recorded = self._images("mask", step, clip).astype(np.int32)
+        ids = np.where(recorded > 0, recorded + IDS_PER_STEP * step, 0)
         for number, phrase in phrases.items():
             if is_hand(phrase):
                 ids[recorded == number] = -number
@@ -113,8 +145,8 @@ class ReadRecording:
                 ids[recorded == number] = 0
         return ids.astype(np.int32)
 
-    def _phrases(self) -> dict[int, str]:
-        path = self._path("mask", "txt")
+    def _phrases(self, step: int) -> dict[int, str]:
+        path = self._path("mask", "txt", step)
         text = read_bytes(path, limit=MAX_TEXT_BYTES).decode("utf-8", "replace")
         found = {}
         for line in text.splitlines():
@@ -124,9 +156,9 @@ class ReadRecording:
             found[int(number[:18])] = phrase.strip()
         return found
 
-    def _frames(self, kind: str, clip: Clip, *size: int) -> Float[np.ndarray, "f ..."]:
+    def _frames(self, kind: str, step: int, clip: Clip, *size: int) -> Float[np.ndarray, "f ..."]:
         """Return the rows of an npz, one of the given size for each frame of the clip."""
-        path = self._path(kind, "npz")
+        path = self._path(kind, "npz", step)
         arrays = read_arrays(path, {}, others=("data", "inds"), packed=True)
         data, numbers, count = arrays["data"].astype(float), arrays["inds"], len(clip.frames)
         if not np.array_equal(numbers, np.arange(count)):
@@ -138,8 +170,8 @@ class ReadRecording:
             raise InputError(f"{path}: data is {data.shape}, not finite numbers {(count, *size)}.")
         return data
 
-    def _images(self, kind: str, clip: Clip) -> np.ndarray:
-        path = self._path(kind, "zip")
+    def _images(self, kind: str, step: int, clip: Clip) -> np.ndarray:
+        path = self._path(kind, "zip", step)
         count, *size = clip.frames.shape[:3]
         images = list(_unpack(path, count))
         if any(image.shape != tuple(size) for image in images) or len(images) != count:
@@ -150,8 +182,8 @@ class ReadRecording:
             )
         return np.stack(images)
 
-    def _path(self, kind: str, ending: str) -> Path:
-        path = self.config.folder / kind / f"{self.config.name}.{ending}"
+    def _path(self, kind: str, suffix: str, step: int) -> Path:
+        path = self.config.path(kind, suffix, step)
         if not path.is_file():
             raise InputError(f"{path} is missing: the recorded perception of a clip needs it.")
         return path

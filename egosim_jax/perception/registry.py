@@ -67,6 +67,11 @@ def get(name: str) -> type[PipelineConfig]:
     Raises `InputError` naming the closest name if there is none.
     """
     module, _, name = name.rpartition(":")
+    if module.startswith("."):
+        raise InputError(
+            f"Perception pipeline {name[:80]!r}: module {module[:80]!r} is relative; give its full "
+            "name. (--perception)"
+        )
     if module := module or ("" if name in _CONFIGS else _MODULES.get(name, "")):
         try:
             importlib.import_module(module)
@@ -92,5 +97,10 @@ def parse(text: str) -> PipelineConfig:
     """
     import tyro
 
-    name, *options = shlex.split(text) or [""]
+    try:
+        name, *options = shlex.split(text) or [""]
+    except ValueError as error:
+        raise InputError(
+            f"Perception pipeline {text[:80]!r} is not a name with options: {error}. (--perception)"
+        ) from error
     return tyro.cli(get(name), prog=f"--perception {name}", args=options)

@@ -16,6 +16,8 @@ from egosim_jax.types import Cameras, SceneState
 
 Up = Literal["z", "-y"]
 """Axis of the world that points up: z in the tabletop world, -y in EgoSim's first camera."""
+UP_AXES: dict[Up, tuple[float, float, float]] = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
+"""Unit vector of each axis that may point up."""
 SIDES, ABOVE = (-40.0, 0.0, 40.0), 30.0
 """Directions of the cameras in degrees: around the vertical, and above the horizon."""
 DISTANCE, FIELD_OF_VIEW = 3.0, 50.0
@@ -45,8 +47,8 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
     """
     import open3d as o3d
 
-    axes = {"z": ((0, 0, 1), (0, 1, 0)), "-y": ((0, -1, 0), (0, 0, 1))}[up]
-    upward, forward = np.array(axes, float)
+    upward = np.array(UP_AXES[up])
+    forward = np.array({"z": (0.0, 1.0, 0.0), "-y": (0.0, 0.0, 1.0)}[up])
     rightward = np.cross(forward, upward)
     middle = np.median(state.points_m, axis=0).astype(float)
     radius = float(np.quantile(np.linalg.norm(state.points_m - middle, axis=1), 0.75))

@@ -10,6 +10,7 @@ import OpenEXR
 import pytest
 
 from egosim_jax.geometry import look_at, transform
+from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.perception import recorded
 from egosim_jax.perception.recorded import IDS_PER_STEP, RecordedConfig
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
@@ -166,3 +167,31 @@ def test_every_damaged_archive_of_pictures_is_refused_in_one_line(tmp_path, kind
         except InputError as error:
             messages.append(str(error))
         assert not any("\n" in message for message in messages)
+
+
+def test_each_step_reads_separate_files(tmp_path):
+    for step, depth in ((1, 0.5), (2, 0.25)):
+        write(tmp_path, depth=depth)
+        for path in list(tmp_path.glob("*/clip.*")):
+            path.rename(path.with_stem(f"clip_{step}"))
+    read = RecordedConfig(folder=tmp_path, name="clip_{step}").build()
+    for step, depth in enumerate((0.5, 0.25)):
+        np.testing.assert_allclose(read(*asked(step)).depth_m[:, 1:], depth, rtol=1e-3)
+
+
+def test_several_clips_are_not_read_from_the_same_files(tmp_path):
+    config = RecordedConfig(folder=tmp_path, name="clip")
+    config.check_clips(1)
+    with pytest.raises(InputError, match=r"2 clips are simulated: the name must contain \{step\}"):
+        config.check_clips(2)
+    RecordedConfig(folder=tmp_path, name="clip_{step}").check_clips(2)
+
+
+@pytest.mark.parametrize("name", ["clip", "cl{step}p"])
+def test_changed_files_change_the_fingerprint(tmp_path, name):
+    write(tmp_path)
+    config = RecordedConfig(folder=tmp_path, name=name)
+    before = fingerprint(config.build())
+    assert fingerprint(config.build()) == before
+    (tmp_path / "mask" / "clip.txt").write_text("1: blue cup\n")
+    assert fingerprint(config.build()) != before

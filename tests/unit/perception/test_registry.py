@@ -37,6 +37,7 @@ def test_each_threshold_is_an_option():
     ("options", "message"),
     [
         ("--hands.discs 0", "discs must be at least 1"),
+        ("--surfaces.point-px 0", "point_px must be at least 1"),
         ("--motion.blur-px 0", "blur_px must be positive"),
         ("--motion.refinement.steps-m 0.01", "one step per round"),
     ],
@@ -94,3 +95,12 @@ def test_a_module_that_registers_a_pipeline_is_imported(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     assert registry.parse("their_perception:theirs --size 4").size == 4
     del sys.modules["their_perception"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("classical 'x", "not a name with options: No closing"), (".x:mine", "'.x' is relative")],
+)
+def test_a_text_that_names_no_pipeline_is_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        registry.parse(text)
