@@ -35,7 +35,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from egosim_jax.geometry import invert, pixels_of, transform
-from egosim_jax.io.atomic import atomic_folder, atomic_write
+from egosim_jax.io.atomic import atomic_folder, atomic_write, check_replaceable
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.npz import DAMAGE, read_arrays
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes, read_json
@@ -72,8 +72,8 @@ ORDERS = {
     "by joint, each over all fingers": np.array([0, *np.arange(1, 21).reshape(4, 5).T.ravel()]),
 }
 """Other orders of a human hand's joints in use, as indices that bring them into ours."""
-UNEQUAL = 1.25
-"""Ratio of the lengths of a gripper's fingers that is too large to be one in our order."""
+UNEQUAL = 1.4
+"""Median ratio of the lengths of a gripper's fingers that is too large to be one in our order."""
 SHORTER = 0.75
 """Bones shorter by this factor under another order mean that the joints are in that order."""
 
@@ -100,6 +100,8 @@ class Episode:
             raise InputError("An episode must have at least one action.")
         if len(self.actions) > MAX_CLIPS:
             raise InputError(f"{len(self.actions)} clips are more than {MAX_CLIPS}, the most.")
+        if type(self.fps) is not int:
+            raise InputError(f"fps is {self.fps!r:.40}: it must be a whole number (int).")
         check_counts({"fps": self.fps})
         if len(self.ground_truth) not in (0, len(self.actions)):
             raise InputError(
@@ -111,11 +113,13 @@ class Episode:
                 _check_equal(action, self.actions[0])
                 _check_speed(action.cameras, self.fps)
                 _check_order(action)
+                _check_scene(self.state, action.cameras)
         shape = self.shape
-        if self.first_frame is not None and self.first_frame.shape != (*shape[1:], 3):
+        image = self.first_frame
+        if image is not None and (image.shape != (*shape[1:], 3) or image.dtype != np.uint8):
             raise InputError(
-                f"The first frame is {self.first_frame.shape}: it must be {(*shape[1:], 3)}, as "
-                "large as the cameras' pictures."
+                f"The first frame is {image.dtype} {image.shape}: it must be uint8 "
+                f"{(*shape[1:], 3)}, as large as the cameras' pictures."
             )
         for number, ground_truth in enumerate(self.ground_truth, start=1):
             if ground_truth.frames.shape[:3] != shape:
@@ -123,7 +127,6 @@ class Episode:
                     f"The ground truth of clip {number} is {ground_truth.frames.shape[:3]}: it "
                     f"must be {shape}, as the action."
                 )
-        _check_scene(self.state, self.actions[0].cameras)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -150,13 +153,17 @@ class Episode:
         return found if found and all(value is not None for value in whole) else None
 
     def save(self, path: Path | str) -> None:
-        """Write a folder, or the byte format where the path ends in .zip."""
+        """Write a folder, or the byte format where the path ends in .zip.
+
+        Replaces a file in the byte format, an empty folder or an earlier episode; raises
+        `InputError` for any other folder.
+        """
         path = Path(path)
-        if path.suffix == ".zip":
+        if path.suffix == ".zip" and not path.is_dir():
             with atomic_write(path) as temporary:
                 temporary.write_bytes(self.to_bytes())
             return
-        with atomic_folder(path) as folder:
+        with atomic_folder(check_replaceable(path, _NAMES, description=DESCRIPTION)) as folder:
             _write(folder, self)
 
     @classmethod
@@ -169,7 +176,10 @@ class Episode:
             return cls.from_bytes(read_bytes(path, limit=MAX_BYTES))
 
     def to_bytes(self) -> bytes:
-        """Return the byte format; equal episodes have equal bytes."""
+        """Return the byte format; equal episodes have equal bytes.
+
+        Raises `InputError` if there are more bytes than are read.
+        """
         data = io.BytesIO()
         with tempfile.TemporaryDirectory() as name, zipfile.ZipFile(data, "w") as archive:
             folder = Path(name)
@@ -177,6 +187,11 @@ class Episode:
             for file in sorted(path for path in folder.rglob("*") if path.is_file()):
                 entry = zipfile.ZipInfo(str(file.relative_to(folder)))
                 archive.writestr(entry, file.read_bytes())
+        if data.tell() > MAX_BYTES:
+            raise InputError(
+                f"The episode has {data.tell():,} bytes: a .zip has at most {MAX_BYTES:,}. Save it "
+                "to a folder."
+            )
         return data.getvalue()
 
     @classmethod
@@ -227,11 +242,12 @@ def _check_order(action: Action) -> None:
         return
     if action.kind == "robot":
         sides = np.linalg.norm(hands[:, 1:] - hands[:, :1], axis=-1)
-        ratio = (sides.max(axis=1) / np.maximum(sides.min(axis=1), 1e-9)).max()
+        ratio = np.median(sides.max(axis=1) / np.maximum(sides.min(axis=1), 1e-9))
         if ratio > UNEQUAL:
             raise InputError(
-                f"the fingers of a gripper differ in length by a factor of {ratio:.3g}, more than "
-                f"{UNEQUAL}: its joints must be in the order wrist, thumb tip, index tip."
+                f"the fingers of a gripper differ in length by a factor of {ratio:.3g} "
+                f"(median), more than {UNEQUAL:g}: its joints must be in the order wrist, thumb "
+                "tip, index tip."
             )
         return
     lengths = {name: _bone_length(hands[:, order]) for name, order in ORDERS.items()}
@@ -257,13 +273,13 @@ def _check_scene(state: SceneState, cameras: Cameras) -> None:
     inside = pixels_of(cameras, local)[2]
     if not inside.any():
         raise InputError(
-            f"The first camera sees none of the {len(local)} points of the state: state and "
+            f"its first camera sees none of the {len(local)} points of the state: state and "
             "cameras must be in one world frame (OpenCV axes, world_from_camera), in meters."
         )
     median = float(np.median(local[inside, 2]))
     if not DEPTH_M[0] <= median <= DEPTH_M[1]:
         raise InputError(
-            f"The points that the first camera sees are {median:.4g} m away (median): it must be "
+            f"the points that its first camera sees are {median:.4g} m away (median): it must be "
             f"from {DEPTH_M[0]} to {DEPTH_M[1]} m. Convert the state to meters."
         )
 
@@ -276,13 +292,13 @@ def _write(folder: Path, episode: Episode) -> None:
         cameras = action.cameras
         np.savez(
             clip / "action.npz",
-            world_from_camera=np.asarray(cameras.world_from_camera, float),
-            intrinsics_px=np.asarray(cameras.intrinsics_px, float),
-            joints_m=action.joints_m,
+            world_from_camera=np.ascontiguousarray(cameras.world_from_camera, float),
+            intrinsics_px=np.ascontiguousarray(cameras.intrinsics_px, float),
+            joints_m=np.ascontiguousarray(action.joints_m),
         )
     for number, known in enumerate(episode.ground_truth, start=1):
         arrays: dict[str, Any] = {
-            name: value
+            name: np.ascontiguousarray(value)
             for name in ("frames", "depth_m", "object_ids")
             if (value := getattr(known, name)) is not None
         }
@@ -301,10 +317,13 @@ def _write(folder: Path, episode: Episode) -> None:
         "version": VERSION,
         "kind": episode.actions[0].kind,
         "fps": episode.fps,
-        "height": height,
-        "width": width,
+        "height": int(height),
+        "width": int(width),
         "prompts": [action.prompt for action in episode.actions],
-        "target_ids": [known.target_id for known in episode.ground_truth],
+        "target_ids": [
+            None if known.target_id is None else int(known.target_id)
+            for known in episode.ground_truth
+        ],
         "sha256": {str(file.relative_to(folder)): sha256(file) for file in files},
     }
     text = json.dumps(description, indent=2) + "\n"
@@ -423,11 +442,11 @@ def _read_ground_truth(path: Path, target_id: int | None) -> GroundTruth:
     arrays = read_arrays(path, {"frames": "uint8"}, optional=optional)
     motions = None
     if "motions" in arrays:
-        numbers = arrays.pop("motion_ids", np.zeros(0, np.int32)).tolist()
+        numbers = arrays.pop("motion_ids", np.zeros(0, np.int32))
         motions = arrays.pop("motions")
-        if len(set(numbers)) != len(motions):
+        if not numbers.shape == (len(np.unique(numbers)),) == motions.shape[:1]:
             raise InputError(f"{quote_path(path)}: motion_ids must name each of the motions once.")
-        motions = dict(zip(numbers, motions, strict=True))
+        motions = dict(zip(numbers.tolist(), motions, strict=True))
     arrays.pop("motion_ids", None)
     with _named(path.parent.name):
         return GroundTruth(motions=motions, target_id=target_id, **arrays)

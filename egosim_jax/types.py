@@ -143,6 +143,12 @@ class MeshConfig:
     """Devices that share one sample, each with a part of its tokens."""
 
 
+FOCAL_WIDTHS = (0.1, 20.0)
+"""Smallest and largest plausible focal length, in widths of the picture."""
+MAX_SKEW = 0.1
+"""Largest plausible skew of the pixels, in focal lengths."""
+
+
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Cameras:
@@ -160,29 +166,59 @@ class Cameras:
     def __post_init__(self) -> None:
         """Check shapes, that every pose is a rigid transform, and the intrinsics and image size."""
         for name, shape in (("world_from_camera", (4, 4)), ("intrinsics_px", (3, 3))):
-            have = np.shape(getattr(self, name))
+            value = getattr(self, name)
+            have, dtype = np.shape(value), getattr(value, "dtype", None)
             if have[-2:] != shape or len(have) != (3 if name == "world_from_camera" else 2):
                 raise InputError(
                     f"{name} has shape {have}: it must be "
                     f"{'(frames, 4, 4)' if shape == (4, 4) else '(3, 3)'}."
                 )
-        rotations = self.world_from_camera[:, :3, :3]
-        drift = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
-        rigid = np.isfinite(self.world_from_camera).all(axis=(1, 2)) & (drift < 1e-3)
-        rigid &= np.linalg.det(np.where(rigid[:, None, None], rotations, np.eye(3))) > 0
+            if 0 in have or dtype is None or dtype.kind not in "fiu":
+                raise InputError(
+                    f"{name} is {dtype or type(value).__name__} {have}: it must be an array of "
+                    "numbers, with at least one frame of poses."
+                )
+        rigid = _rigid(self.world_from_camera)
         if not rigid.all():
             frame = int(np.argmin(rigid))
             raise InputError(
                 f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with "
-                f"a rotation of determinant 1, not {self.world_from_camera[frame].tolist()}."
+                "a rotation of determinant 1 and the last row 0 0 0 1, not "
+                f"{self.world_from_camera[frame].tolist()}."
             )
-        focal = self.intrinsics_px[0, 0], self.intrinsics_px[1, 1]
-        if not (np.isfinite(self.intrinsics_px).all() and min(*focal, self.height, self.width) > 0):
+        self._check_intrinsics()
+
+    def _check_intrinsics(self) -> None:
+        (fx, skew, cx), (_, fy, cy), _ = matrix = np.asarray(self.intrinsics_px, float)
+        sizes = self.height, self.width
+        given = f"intrinsics_px {matrix.tolist()}, width {self.width}, height {self.height}"
+        integers = all(hasattr(size, "__index__") for size in sizes)
+        if not (integers and np.isfinite(matrix).all() and min(fx, fy, *sizes) > 0):
             raise InputError(
-                f"Cameras have invalid intrinsics or image size: intrinsics_px "
-                f"{self.intrinsics_px.tolist()}, width {self.width}, height {self.height}. All "
-                "must be finite, focal lengths and sizes positive."
+                f"Cameras have invalid intrinsics or image size: {given}. All must be finite, "
+                "focal lengths positive, sizes positive whole numbers."
             )
+        low, high = FOCAL_WIDTHS[0] * self.width, FOCAL_WIDTHS[1] * self.width
+        plausible = np.abs(matrix[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() < 1e-6
+        plausible &= low <= min(fx, fy) and max(fx, fy) <= high and abs(skew) <= MAX_SKEW * fx
+        plausible &= -0.5 <= cx <= self.width - 0.5 and -0.5 <= cy <= self.height - 0.5
+        if not plausible:
+            raise InputError(
+                f"Cameras have implausible intrinsics: {given}. They must be [fx, skew, cx], "
+                f"[0, fy, cy], [0, 0, 1] in pixels of this size: focal lengths from {low:g} to "
+                f"{high:g}, the principal point inside the picture. Do not transpose or normalize "
+                "them, and scale them to the clip's size."
+            )
+
+
+def _rigid(poses: Float[np.ndarray, "f 4 4"]) -> Bool[np.ndarray, " f"]:
+    """Return which poses are rigid transforms."""
+    rigid = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    poses = np.where(rigid[:, None, None], poses, np.eye(4))
+    rotations = poses[:, :3, :3]
+    drift = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
+    rigid &= (drift < 1e-3) & (np.linalg.det(rotations) > 0)
+    return rigid & (np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) < 1e-6)
 
 
 @no_type_check
@@ -243,16 +279,32 @@ class SceneState:
     """Origin of the state, as free key-value pairs."""
 
     def __post_init__(self) -> None:
-        """Check that there is at least one point, that all are finite, and all array lengths."""
+        """Check shapes and dtypes, which are never converted, and that all points are finite."""
         count = len(self.points_m)
-        for name in ("colors", "object_ids", "last_seen"):
-            if len(getattr(self, name)) != count:
+        for name, dtype, shape in (
+            ("points_m", np.float32, (count, 3)),
+            ("colors", np.uint8, (count, 3)),
+            ("object_ids", np.int32, (count,)),
+            ("last_seen", np.int32, (count,)),
+        ):
+            value = getattr(self, name)
+            have = getattr(value, "dtype", type(value).__name__)
+            if np.shape(value) != shape or have != np.dtype(dtype):
                 raise InputError(
-                    f"A state of {count} points has {len(getattr(self, name))} {name}: there must "
-                    "be one for each point."
+                    f"{name} of a state of {count} points is {have} {np.shape(value)}: it must be "
+                    f"{np.dtype(dtype)} {shape}, one for each point. Convert it with "
+                    f"astype(np.{np.dtype(dtype)})."
                 )
         if not count:
             raise InputError("SceneState must contain at least one point.")
+        poses = {f"pose of object {n}": pose for n, pose in self.world_from_object.items()}
+        for name, matrix in {"intrinsics_px": self.intrinsics_px, **poses}.items():
+            size = 3 if name == "intrinsics_px" else 4
+            if np.shape(matrix) != (size, size) or not np.isfinite(matrix).all():
+                raise InputError(
+                    f"The {name} of a state must be finite and of shape ({size}, {size}), not "
+                    f"{np.shape(matrix)}."
+                )
         finite = np.isfinite(self.points_m).all(axis=1)
         if not finite.all():
             raise InputError(
@@ -267,6 +319,8 @@ HAND_SIZE_M = (0.01, 1.0)
 """Smallest and largest plausible extent of a hand, in meters."""
 NEAR_PICTURE = 0.25
 """Margin around the image in which a joint counts as near the view, in widths and heights."""
+REACH_M = 3.0
+"""Largest distance in front of a camera at which a joint counts as near the view, in meters."""
 
 
 @no_type_check
@@ -289,8 +343,8 @@ class Action:
     def __post_init__(self) -> None:
         """Check kind, joint count, frame count, units and frame of reference.
 
-        Raises `InputError`, also where hands are given and none comes near any camera's view: then
-        they are not in world coordinates.
+        Raises `InputError`, also where a hand is given and never comes near any camera's view:
+        then it is not in world coordinates.
         """
         if self.kind not in JOINTS:
             raise InputError(
@@ -333,7 +387,10 @@ class Action:
             )
 
     def _check_place(self, joints: np.ndarray, given: np.ndarray) -> None:
-        """Raise `InputError` if no joint of any hand is in front of a camera and near its image."""
+        """Raise `InputError` if no joint of a hand is within reach of a camera and near its image.
+
+        Each hand that is given in any frame is checked separately.
+        """
         cameras, poses = self.cameras, self.cameras.world_from_camera
         where = np.where(given[:, :, None, None], joints, 0.0) - poses[:, None, None, :3, 3]
         rotations = poses[:, :3, :3]
@@ -342,13 +399,15 @@ class Action:
             u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
             v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
         near_u, near_v = NEAR_PICTURE * cameras.width, NEAR_PICTURE * cameras.height
-        seen = (z > 0) & (u > -near_u) & (u < cameras.width + near_u)
+        seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
         seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
-        if not seen.any():
+        lost = given.any(axis=0) & ~seen.any(axis=(0, 2))
+        if lost.any():
             raise InputError(
-                "No joint of any hand comes near the view of the cameras in any frame: joints must "
-                "be in world coordinates, as the cameras are, and in meters. Hands that are out of "
-                "sight all the time are given as NaN."
+                f"No joint of hand {int(np.argmax(lost))} comes near the view of the cameras, at "
+                f"most {REACH_M:g} m away, in any frame: joints must be in world coordinates, as "
+                "the cameras are, and in meters. A hand that is out of sight all the time is given "
+                "as NaN."
             )
 
 
@@ -421,8 +480,8 @@ class GroundTruth:
                 "the camera's z axis, and infinite where it is unknown."
             )
         for number, motion in (self.motions or {}).items():
-            if np.shape(motion) != (shape[0], 4, 4) or not np.isfinite(motion).all():
+            if np.shape(motion) != (shape[0], 4, 4) or not _rigid(np.asarray(motion)).all():
                 raise InputError(
-                    f"The ground-truth motion of object {number} must be finite and have shape "
-                    f"({shape[0]}, 4, 4), not {np.shape(motion)}."
+                    f"The ground-truth motion of object {number} is of shape {np.shape(motion)}: "
+                    f"it must be one finite rigid transform per frame, ({shape[0]}, 4, 4)."
                 )

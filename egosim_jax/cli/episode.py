@@ -32,7 +32,8 @@ class MakeEpisode:
     Without --actions it is drawn by the seed, at the length and size of a model's clips, with
     ground truth. With --actions there is one .npz or .json file per clip, of world_from_camera
     (f, 4, 4), intrinsics_px (3, 3) and joints_m (f, hands, 21 or 3, 3), in meters and OpenCV axes;
-    null or NaN where a hand is missing. A .json file may also have a prompt. The scene is a
+    null or NaN where a hand is missing. Intrinsics are those of the clip's size, in pixels: scale
+    them with the video. A .json file may also have a prompt. The scene is a
     --state, or an --image without hands with its --depth, seen from the first camera.
     """
 
@@ -40,16 +41,16 @@ class MakeEpisode:
     """Folder to write, or a file whose name ends in .zip."""
     config: str = "tabletop"
     """Model whose length, size and frame rate the clips have."""
-    seed: int = 0
-    """Seed of scene and actions in the tabletop world."""
-    clips: int = 3
-    """Number of clips of the tabletop world."""
+    seed: int | None = None
+    """Seed of scene and actions in the tabletop world; 0 if not given."""
+    clips: int | None = None
+    """Number of clips of the tabletop world; 3 if not given."""
     robot: bool = False
     """Use a robot gripper instead of human hands in the tabletop world."""
     actions: tuple[Path, ...] = ()
     """Files of your own cameras and hand joints, one per clip."""
     prompts: tuple[str, ...] = ()
-    """Prompt of each clip, where the files have none."""
+    """Prompt of each clip, instead of those in the files."""
     state: Path | None = None
     """Folder of a state, or a .ply of colored points."""
     image: Path | None = None
@@ -60,7 +61,7 @@ class MakeEpisode:
     def run(self) -> int:
         """Make, check and write the episode."""
         check_counts({"--clips": self.clips})
-        check_seed(self.seed)
+        check_seed(self.seed or 0)
         episode = self._own() if self.actions else self._tabletop()
         episode.save(self.out)
         print(f"{self.out}: {summary(episode)}")
@@ -74,7 +75,8 @@ class MakeEpisode:
             raise InputError(f"--{given[0]} needs --actions: the tabletop world makes its own.")
         video = configs.get(self.config).video
         kind = "robot" if self.robot else "human"
-        clips = list(make_sequence(self.seed, spec=video, clips=self.clips, kind=kind))
+        seed, count = self.seed or 0, self.clips or 3
+        clips = list(make_sequence(seed, spec=video, clips=count, kind=kind))
         return to_episode(clips, fps=video.fps)
 
     def _own(self) -> episodes.Episode:
@@ -82,6 +84,12 @@ class MakeEpisode:
         from egosim_jax.cli.simulate import check_fits
         from egosim_jax.episode import Episode
 
+        given = {"clips": self.clips, "seed": self.seed, "robot": self.robot or None}
+        if names := [name for name, value in given.items() if value is not None]:
+            raise InputError(
+                f"--{names[0]} is of the tabletop world: the files of --actions have their own "
+                f"clips and hands. Remove --{names[0]} or --actions."
+            )
         if self.prompts and len(self.prompts) != len(self.actions):
             raise InputError(
                 f"{len(self.prompts)} prompts for {len(self.actions)} files: give one per clip. "
@@ -216,6 +224,7 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
     import numpy as np
 
     from egosim_jax.io.npz import read_arrays
+    from egosim_jax.io.untrusted import quote
     from egosim_jax.types import JOINTS, Action, Cameras, Kind
 
     values: Mapping[str, Any]
@@ -225,7 +234,10 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
         values = read_arrays(path, {}, others=ARRAYS, packed=True)
     else:
         raise InputError(f"{path}: actions are read from .npz and .json files. (--actions)")
-    prompt = prompt or str(values.get("prompt") or "")
+    written = values.get("prompt")
+    if not isinstance(written, str | None):
+        raise InputError(f"{path}: prompt is {quote(written)}: it must be text.")
+    prompt = prompt or written
     if not prompt:
         raise InputError(f"{path} has no prompt: give one per clip. (--prompts)")
     joints = np.asarray(values["joints_m"])
@@ -267,7 +279,7 @@ def _read_json(path: Path) -> dict[str, Any]:
             rows = _fill_missing(rows)
         try:
             values[name] = np.array(rows, float)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             raise InputError(
                 f"{path}: {name} is {quote(rows)}, not an array of numbers: all rows must have "
                 "equal lengths."
@@ -276,9 +288,15 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _fill_missing(frames: list[Any]) -> list[Any]:
-    """Return frames of hands with null replaced by as many NaN joints as the others have."""
-    given = [hand for hands in frames if isinstance(hands, list) for hand in hands if hand]
-    nan = [[float("nan")] * 3] * len(given[0]) if given and isinstance(given[0], list) else None
+    """Return frames of hands with null replaced by as many NaN joints as the others have.
+
+    Where all are null, they are human hands.
+    """
+    from egosim_jax.types import JOINTS
+
+    lists = [hands for hands in frames if isinstance(hands, list)]
+    given = [hand for hands in lists for hand in hands if isinstance(hand, list)]
+    nan = [[float("nan")] * 3] * (len(given[0]) if given else JOINTS["human"])
     return [
         [nan if hand is None else hand for hand in hands] if isinstance(hands, list) else hands
         for hands in frames

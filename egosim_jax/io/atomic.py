@@ -11,6 +11,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import secrets
 import shutil
 import sys
@@ -19,6 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from egosim_jax.io.untrusted import quote_path, read_json
 from egosim_jax.types import InputError
 
 TEMPORARY = ".tmp"
@@ -77,6 +79,47 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     finally:
         os.close(descriptor)
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_replaceable(path: Path, names: re.Pattern[str], *, description: str) -> Path:
+    """Return the resolved path of a folder to write, if writing it loses no other files.
+
+    Raises `InputError` unless nothing exists there, or an empty folder, or an earlier folder of the
+    same kind: one with a JSON `description` that records SHA-256, and only files of these `names`.
+    """
+    path = Path(os.path.realpath(path))
+    if not os.path.lexists(path):
+        return path
+    if not path.is_dir():
+        found = "is a file"
+    elif not any(path.iterdir()):
+        return path
+    elif foreign := next(
+        (
+            file
+            for file in path.rglob("*")
+            if (file.is_symlink() or not file.is_dir())
+            and not names.fullmatch(str(file.relative_to(path)))
+        ),
+        None,
+    ):
+        found = f"holds {quote_path(foreign.relative_to(path))}"
+    elif _is_description(path / description):
+        return path
+    else:
+        found = f"has no {description} of this program"
+    raise InputError(
+        f"{quote_path(path)} exists and {found}: only an empty folder, or one of the same kind, is "
+        "replaced. Choose another path, or remove it first."
+    )
+
+
+def _is_description(path: Path) -> bool:
+    try:
+        written = read_json(path)
+    except InputError:
+        return False
+    return isinstance(written, dict) and "sha256" in written
 
 
 def append_line(path: Path, record: Mapping[str, Any]) -> None:

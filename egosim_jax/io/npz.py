@@ -75,6 +75,7 @@ def _read(
     shape, fortran, kind = np.lib.format.read_array_header_1_0(header, max_header_size=_HEADER)
     if kind.hasobject or kind.kind not in "biuf" or (dtype is not None and kind != np.dtype(dtype)):
         raise ValueError(f"{quote(entry.filename)} holds {quote_text(str(kind))}")
-    if fortran or len(data) - header.tell() != math.prod(shape) * kind.itemsize:
+    if len(data) - header.tell() != math.prod(shape) * kind.itemsize:
         raise ValueError(f"{quote(entry.filename)} does not have the size that its header says")
-    return np.frombuffer(data, kind, offset=header.tell()).reshape(shape).copy()
+    values = np.frombuffer(data, kind, offset=header.tell())
+    return values.reshape(shape, order="F" if fortran else "C").copy(order="C")

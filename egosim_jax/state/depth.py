@@ -27,8 +27,19 @@ def state_from_depth(
 
     Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Pixel centers
     are at integer coordinates. Without `object_ids` all points are background. Raises `InputError`
-    if shapes differ, if no depth is known, and if depth does not look like meters.
+    if shapes or dtypes differ, if no depth is known, and if depth does not look like meters.
     """
+    for name, value, rule, fits in (
+        ("depth_m", depth_m, "(height, width)", np.ndim(depth_m) == 2),
+        (
+            "image",
+            image,
+            "uint8 (height, width, 3)",
+            np.ndim(image) == 3 and image.shape[2] == 3 and image.dtype == np.uint8,
+        ),
+    ):
+        if not fits:
+            raise InputError(f"{name} is {value.dtype} {value.shape}: it must be {rule}.")
     height, width = depth_m.shape
     shapes = {"image": image.shape[:2]}
     if object_ids is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.atomic import atomic_folder, check_replaceable
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
@@ -27,6 +28,7 @@ VERSION = 3
 READABLE = (1, 2, VERSION)
 """Versions that `load` reads: 1 has no description hash; 1 and 2 spell colors the British way."""
 POINTS, DESCRIPTION = "points.npz", "state.json"
+_NAMES = re.compile(r"points\.npz|state\.json")
 ARRAYS = ("points_m", "colors", "object_ids", "last_seen")
 CHANNELS = ("red", "green", "blue")
 _DTYPES = {"points_m": "float32", "colors": "uint8", "object_ids": "int32", "last_seen": "int32"}
@@ -41,9 +43,14 @@ def fingerprint(state: SceneState) -> str:
 
 
 def save(folder: Path | str, state: SceneState) -> None:
-    """Write a state to a folder, atomically."""
-    with atomic_folder(Path(folder)) as temporary:
-        np.savez(temporary / POINTS, **{name: getattr(state, name) for name in ARRAYS})
+    """Write a state to a folder, atomically.
+
+    Replaces an empty folder or an earlier state; raises `InputError` for any other.
+    """
+    path = check_replaceable(Path(folder), _NAMES, description=DESCRIPTION)
+    arrays: dict[str, Any] = {name: np.ascontiguousarray(getattr(state, name)) for name in ARRAYS}
+    with atomic_folder(path) as temporary:
+        np.savez(temporary / POINTS, **arrays)
         description = _description(state)
         written = {
             "version": VERSION,
@@ -146,7 +153,7 @@ def _matrix(rows: Any, size: int, name: str) -> np.ndarray:
 
 def _description(state: SceneState) -> dict[str, Any]:
     return {
-        "step": state.step,
+        "step": int(state.step),
         "names": {str(number): state.names[number] for number in sorted(state.names)},
         "world_from_object": {
             str(number): np.asarray(state.world_from_object[number]).tolist()

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.episode import ORDERS, Episode
+from egosim_jax.episode import ORDERS, Episode, _read_ground_truth
 from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.state.snapshot import save
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
@@ -193,3 +194,79 @@ def archive(entries, compression=zipfile.ZIP_STORED):
 def test_bytes_that_are_no_episode_are_refused(data, message):
     with pytest.raises(InputError, match=message):
         Episode.from_bytes(data)
+
+
+def test_a_folder_of_other_files_is_never_replaced(hands, tmp_path, monkeypatch):
+    (tmp_path / "cap").mkdir()
+    (tmp_path / "cap" / "notes.txt").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for path in ("cap", ".", "cap/notes.txt"):
+        with pytest.raises(InputError, match="Choose another path"):
+            hands.save(path)
+        with pytest.raises(InputError, match="Choose another path"):
+            save(path, hands.state)
+    assert (tmp_path / "cap" / "notes.txt").read_text() == "mine"
+    (tmp_path / "empty").mkdir()
+    for _ in range(2):
+        hands.save("empty")
+    (tmp_path / "empty" / "clip_1" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"holds clip_1/notes\.txt"):
+        hands.save("empty")
+
+
+def test_arrays_of_any_layout_are_read_back(hands, tmp_path):
+    points = np.asfortranarray(hands.state.points_m)
+    known = tuple(
+        replace(k, target_id=np.int64(5), depth_m=np.asfortranarray(k.depth_m))
+        for k in hands.ground_truth
+    )
+    given = replace(hands, state=replace(hands.state, points_m=points), ground_truth=known)
+    given = with_joints(given, lambda action: np.asfortranarray(action.joints_m))
+    given.save(tmp_path / "episode")
+    assert fingerprint(Episode.load(tmp_path / "episode").state) == fingerprint(hands.state)
+    assert Episode.from_bytes(given.to_bytes()).to_bytes() == given.to_bytes()
+
+
+def test_bytes_over_the_limit_of_reading_are_not_written(hands, monkeypatch):
+    monkeypatch.setattr("egosim_jax.episode.MAX_BYTES", 1000)
+    with pytest.raises(InputError, match=r"at most 1,000\. Save it to a folder"):
+        hands.to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda e: replace(e, fps=16.0), "whole number"),
+        (lambda e: replace(e, first_frame=e.first_frame / 255), "must be uint8"),
+        (lambda e: with_cameras(e, world_from_camera=turned(e)), "clip 2: its first camera"),
+    ],
+)
+def test_values_that_could_not_be_read_back_are_refused(hands, break_it, message):
+    with pytest.raises(InputError, match=message):
+        break_it(replace(hands, actions=tuple(without_hands(a) for a in hands.actions)))
+
+
+def without_hands(action):
+    return replace(action, joints_m=np.full_like(action.joints_m, np.nan))
+
+
+def turned(episode):
+    """Cameras of the second clip that look the other way."""
+    return episode.actions[1].cameras.world_from_camera @ np.diag([-1.0, 1, -1, 1])
+
+
+@pytest.mark.parametrize("ids", [[7, 7], [[7, 8]], [7]])
+def test_motions_without_one_id_each_are_refused(hands, tmp_path, ids):
+    frames = hands.ground_truth[0].frames
+    motions = np.tile(np.eye(4), (2, len(frames), 1, 1))
+    path = tmp_path / "ground_truth.npz"
+    np.savez(path, frames=frames, motion_ids=np.array(ids, np.int32), motions=motions)
+    with pytest.raises(InputError, match="each of the motions once"):
+        _read_ground_truth(path, None)
+
+
+def test_a_gripper_may_have_unequal_fingers_in_some_frames():
+    robot = to_episode(list(make_sequence(3, spec=SPEC, clips=2, kind="robot")), fps=8)
+    joints = robot.actions[1].joints_m.copy()
+    joints[0, :, 1] = joints[0, :, 0] + 0.5 * (joints[0, :, 1] - joints[0, :, 0])
+    assert with_joints(robot, lambda _: joints).actions[1].joints_m is joints

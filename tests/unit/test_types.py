@@ -6,7 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from egosim_jax.types import Action, Cameras, Clip, InputError, VideoSpec, check_seed
+from egosim_jax.types import (
+    Action,
+    Cameras,
+    Clip,
+    GroundTruth,
+    InputError,
+    SceneState,
+    VideoSpec,
+    check_seed,
+)
 from egosim_jax.worlds.tabletop import make_sequence, to_action
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
@@ -104,3 +113,66 @@ def test_a_seed_out_of_range_is_refused(seed):
 def test_cameras_are_checked_as_before():
     cameras = action().cameras
     assert Cameras(**vars(cameras)).height == 48
+
+
+K = np.array([[60.0, 0, 39.5], [0, 60, 23.5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"intrinsics_px": K.T}, "implausible"),
+        ({"intrinsics_px": np.diag([1 / 80, 1 / 48, 1]) @ K}, "implausible"),
+        ({"intrinsics_px": np.diag([20, 20, 1]) @ K}, "implausible"),
+        ({"intrinsics_px": K.tolist()}, "must be an array of numbers"),
+        ({"world_from_camera": np.zeros((0, 4, 4))}, "at least one frame"),
+        (
+            {"world_from_camera": action().cameras.world_from_camera.swapaxes(1, 2)},
+            "last row 0 0 0 1",
+        ),
+        ({"height": 48.0}, "whole numbers"),
+    ],
+)
+def test_cameras_in_another_convention_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        replace(action().cameras, **changes)
+
+
+@pytest.mark.parametrize("away", [9.0, 4.0])
+def test_each_hand_must_be_within_reach(away):
+    given = action()
+    other = given.joints_m[:, :1] + away * given.cameras.world_from_camera[:, None, None, :3, 2]
+    with pytest.raises(InputError, match="No joint of hand 1 comes near"):
+        replace(given, joints_m=np.concatenate([given.joints_m[:, :1], other], axis=1))
+    other[:] = np.nan
+    replace(given, joints_m=np.concatenate([given.joints_m[:, :1], other], axis=1))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"points_m": np.zeros((2, 3))},
+        {"colors": np.zeros((2, 3), np.float32)},
+        {"object_ids": np.zeros(2, np.int64)},
+        {"last_seen": np.zeros((2, 1), np.int32)},
+        {"intrinsics_px": np.eye(4)},
+    ],
+)
+def test_a_state_of_other_shapes_or_dtypes_is_refused(changes):
+    fields = {
+        "points_m": np.zeros((2, 3), np.float32),
+        "colors": np.zeros((2, 3), np.uint8),
+        "object_ids": np.zeros(2, np.int32),
+        "last_seen": np.zeros(2, np.int32),
+        "intrinsics_px": np.eye(3),
+    }
+    SceneState(**fields)
+    with pytest.raises(InputError, match=next(iter(changes))):
+        SceneState(**{**fields, **changes})
+
+
+def test_ground_truth_motions_are_rigid():
+    frames, motion = np.zeros((2, 4, 4, 3), np.uint8), np.tile(np.eye(4), (2, 1, 1))
+    GroundTruth(frames=frames, motions={1: motion})
+    with pytest.raises(InputError, match="rigid transform per frame"):
+        GroundTruth(frames=frames, motions={1: 2 * motion})

@@ -125,7 +125,11 @@ def test_a_state_of_the_first_release_is_still_read(tmp_path):
 
 def test_a_save_that_fails_leaves_the_older_state(tmp_path, monkeypatch):
     save(tmp_path / "state", state(50))
-    monkeypatch.setattr("egosim_jax.state.snapshot.DESCRIPTION", "no/such/folder.json")
+
+    def fail(path):
+        return (path.parent / "missing").read_bytes()
+
+    monkeypatch.setattr("egosim_jax.state.snapshot.sha256", fail)
     with pytest.raises(OSError, match="No such file"):
         save(tmp_path / "state", state(20))
     monkeypatch.undo()
