@@ -39,7 +39,7 @@ def make_clip() -> tuple[np.ndarray, float]:
     target = next(make_sequence(SEED, spec=config.video))
     generator = Generator(config.at(folder), Networks.load(config, folder))
     (clip,) = generator.generate([to_triplet(target)], seeds=[SEED])
-    return clip.frames, score(clip.frames[1:], target.frames[1:]).psnr
+    return clip.frames, score(clip.frames[1:], target.frames[1:])["psnr"]
 
 
 def side_by_side(frames: np.ndarray) -> np.ndarray:
