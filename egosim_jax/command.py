@@ -84,7 +84,10 @@ def main(
             config=(tyro.conf.OmitSubcommandPrefixes,),
         )
         with context():
-            return command.run()
+            code = command.run()
+        if args is None:
+            interrupts.ignore()  # the process ends, and nothing is left to continue
+        return code
 
     return run_with_exit_codes(run)
 

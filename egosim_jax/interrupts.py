@@ -18,6 +18,12 @@ def expect() -> None:
         signal.signal(signal.SIGINT, _interrupt)
 
 
+def ignore() -> None:
+    """Ignore Ctrl-C from now on; a program calls this when its work is done."""
+    with suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 @contextmanager
 def not_inherited() -> Iterator[None]:
     """Make child processes that are started in this context ignore Ctrl-C."""

@@ -35,7 +35,7 @@ def main(args: Sequence[str] | None = None) -> int:
         program="egosim-train",
         description="Train a model. The same command resumes an interrupted run. With --preflight "
         "it only reports whether the training would fit a machine, which need not be present.",
-        args=given,
+        args=args,
         context=distributed_context if args is None and not without_training else nullcontext,
     )
 

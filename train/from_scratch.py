@@ -207,9 +207,14 @@ class FromClips(FromScratch):
         frames = out / "frames" / split
         if not (frames / MANIFEST).exists():
             items = select(read_metadata(metadata), where=f"split={split}")
-            spec = replace(configs.get(self.config).video, frames=self.clip_frames)
-            provenance = {"metadata": str(metadata)}
-            progress = pack(items, out=frames, spec=spec, provenance=provenance)
+            model = configs.get(self.config)
+            progress = pack(
+                items,
+                out=frames,
+                spec=replace(model.video, frames=self.clip_frames),
+                grid=model.grid,
+                provenance={"metadata": str(metadata)},
+            )
             for problem in track(progress, f"packing {split}", total=len(items)):
                 if problem:
                     print(f"skipped: {problem}", file=sys.stderr)
@@ -236,10 +241,11 @@ class FromTabletop(FromScratch):
     def _make(self, split: str, seeds: range, clips: int, out: Path) -> Path:
         from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
-        spec = configs.get(self.config).video
-        plan = DatasetConfig(seeds=tuple(seeds), clips=clips, spec=spec, kind="mixed")
+        model = configs.get(self.config)
+        plan = DatasetConfig(seeds=tuple(seeds), clips=clips, spec=model.video, kind="mixed")
         frames = out / "frames" / split
-        scenes = make_shards(plan, out=frames, workers=os.cpu_count() or 1)
+        workers = os.cpu_count() or 1
+        scenes = make_shards(plan, out=frames, workers=workers, grid=model.grid)
         for _ in track(scenes, f"making {split}", total=len(seeds)):
             pass
         return frames

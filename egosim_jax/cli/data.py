@@ -12,7 +12,16 @@ import tyro
 
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
-from egosim_jax.types import WAN_GRID, VideoSpec, check_counts
+from egosim_jax.types import WAN_GRID, VideoGrid, VideoSpec, check_counts
+
+
+def _grid(name: str | None) -> VideoGrid:
+    """Return the latent grid of a model, Wan's without a name."""
+    if name is None:
+        return WAN_GRID
+    from egosim_jax import configs
+
+    return configs.get(name).grid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +54,8 @@ class Pack:
     """Replace the shards that the folder holds."""
     decoding: Literal["accurate", "official"] = "accurate"
     """With a size, color decoding; official: as in EgoSim's loader, a gray level darker."""
+    config: str | None = None
+    """Name of a model whose latent grid the clips must fit, by default Wan's."""
 
     def run(self) -> int:
         """Check and pack clip after clip."""
@@ -62,6 +73,7 @@ class Pack:
             shard_bytes=self.shard_megabytes * 2**20,
             overwrite=self.overwrite,
             decoding=self.decoding,
+            grid=_grid(self.config),
         )
         problems = [problem for problem in track(progress, "packing", total=len(items)) if problem]
         for problem in problems:
@@ -73,7 +85,7 @@ class Pack:
         if self.size is None:
             return None
         spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1])
-        WAN_GRID.check(spec)
+        _grid(self.config).check(spec)
         return spec
 
 
@@ -164,6 +176,8 @@ class Make:
     """Frames per second."""
     workers: int = os.cpu_count() or 1
     """Number of processes."""
+    config: str | None = None
+    """Name of a model whose latent grid the clips must fit, by default Wan's."""
 
     def run(self) -> int:
         """Make scene after scene."""
@@ -171,14 +185,13 @@ class Make:
 
         check_counts({"--workers": self.workers})
         spec = VideoSpec(frames=self.frames, height=self.height, width=self.width, fps=self.fps)
-        WAN_GRID.check(spec)
         config = DatasetConfig(
             seeds=tuple(range(self.seed, self.seed + self.scenes)),
             clips=self.clips,
             spec=spec,
             kind=self.kind,
         )
-        progress = make_shards(config, out=self.out, workers=self.workers)
+        progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))
         for _ in track(progress, "making", total=self.scenes):
             pass
         print(self.out)

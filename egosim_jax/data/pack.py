@@ -15,7 +15,7 @@ from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import listing, read_bytes
 from egosim_jax.io.video import Decoding
-from egosim_jax.types import InputError, Triplet, VideoSpec
+from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 MAX_FILE = 1 << 28
 """Maximum size of a source file that is packed, in bytes."""
@@ -30,11 +30,12 @@ def pack(
     shard_bytes: int = 256 * 2**20,
     overwrite: bool = False,
     decoding: Decoding = "accurate",
+    grid: VideoGrid = WAN_GRID,
 ) -> Iterator[str | None]:
     """Write the shards of clips: decoded at `spec`, or as their source files without one.
 
-    Yields, after each clip, why it was skipped, or None. Raises `InputError` if all were skipped,
-    or if another process writes to the same folder.
+    Clips must fit the latent `grid`. Yields, after each clip, why it was skipped, or None. Raises
+    `InputError` if all were skipped, or if another process writes to the same folder.
     """
     failed = 0
     check_presence(items)
@@ -43,6 +44,7 @@ def pack(
         out,
         kind="frames" if spec else "videos",
         spec=spec,
+        grid=grid,
         provenance={**provenance, **decoded},
         shard_bytes=shard_bytes,
         overwrite=overwrite,
@@ -51,7 +53,10 @@ def pack(
         for files in items:
             problem = None
             try:
-                record = decoded_record(files, spec, decoding) if spec else encoded_record(files)
+                if spec:
+                    record = decoded_record(files, spec, decoding, grid)
+                else:
+                    record = encoded_record(files, grid)
                 writer.add(record.arrays, record.metadata)
             except InputError as error:
                 failed, problem = failed + 1, str(error)
@@ -65,12 +70,12 @@ def clip_metadata(clip: ClipFiles | Triplet) -> dict[str, object]:
     return {"video_id": clip.video_id, "prompt": clip.prompt, "extra": dict(clip.extra)}
 
 
-def encoded_record(files: ClipFiles) -> Record:
+def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID) -> Record:
     """Return a record of the bytes of a clip's files, after the strict checks.
 
     Raises `InputError` listing what `check_clip` finds.
     """
-    problems = check_clip(files, None)
+    problems = check_clip(files, None, grid=grid)
     if problems:
         raise InputError(listing(problems))
     paths = {
@@ -88,9 +93,14 @@ def encoded_record(files: ClipFiles) -> Record:
     return Record(arrays=arrays, metadata=clip_metadata(files))
 
 
-def decoded_record(files: ClipFiles, spec: VideoSpec, decoding: Decoding = "accurate") -> Record:
+def decoded_record(
+    files: ClipFiles,
+    spec: VideoSpec,
+    decoding: Decoding = "accurate",
+    grid: VideoGrid = WAN_GRID,
+) -> Record:
     """Return a record of a clip's first `spec.frames` frames, after the strict checks."""
-    return triplet_record(load_triplet(files, spec, decoding=decoding))
+    return triplet_record(load_triplet(files, spec, decoding=decoding, grid=grid))
 
 
 def triplet_record(triplet: Triplet) -> Record:

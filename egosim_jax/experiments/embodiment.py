@@ -170,7 +170,8 @@ class _Experiment:
         """Make the clips of a split, and cache their latents."""
         config = DatasetConfig(seeds=tuple(seeds), clips=1, spec=self.model.video, kind=kind)
         frames, latents = self.out / "frames" / split, self.out / "latents" / split
-        scenes = make_shards(config, out=frames, workers=os.cpu_count() or 1)
+        workers = os.cpu_count() or 1
+        scenes = make_shards(config, out=frames, workers=workers, grid=self.model.grid)
         for _ in track(scenes, f"making {split}", total=len(seeds)):
             pass
         encode_shards(

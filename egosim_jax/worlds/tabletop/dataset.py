@@ -13,13 +13,14 @@ from typing import Literal
 
 from egosim_jax import interrupts
 from egosim_jax.data.clips import write_clips
-from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.records import from_bytes, to_bytes
 from egosim_jax.data.shards import ShardWriter, gather
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
-from egosim_jax.types import InputError, Kind, VideoSpec
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.types import WAN_GRID, InputError, Kind, VideoGrid, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, state_after, to_triplet
 
 
@@ -57,14 +58,24 @@ def write_scenes(folder: Path, seeds: Iterable[int], *, spec: VideoSpec, kind: K
     return write_clips(folder, map(to_triplet, clips), fps=spec.fps)
 
 
-def make_shards(config: DatasetConfig, *, out: Path, workers: int) -> Iterator[int]:
+def make_shards(
+    config: DatasetConfig, *, out: Path, workers: int, grid: VideoGrid = WAN_GRID
+) -> Iterator[int]:
     """Write the shards of a dataset; yield each seed when its scene is done.
 
     Finished scenes are kept in `out`/parts, so that the same call resumes an interrupted one.
+    The manifest names the latent `grid`, which the clips must fit.
     """
+    grid.check(config.spec)
     parts = out / "parts"
     open_folder(out, config)
     if (out / MANIFEST).exists():
+        have = read_manifest(out).grid
+        if have != grid:
+            raise InputError(
+                f"{quote_path(out)} holds clips for another latent grid: it must be {grid}, not "
+                f"{have}. Choose another folder. (--out)"
+            )
         shutil.rmtree(parts, ignore_errors=True)  # killed between writing shards and removing parts
         yield from config.seeds
         return
@@ -83,7 +94,7 @@ def make_shards(config: DatasetConfig, *, out: Path, workers: int) -> Iterator[i
             yield jobs[job]
     finally:  # after an error or Ctrl-C, scenes that have not started are canceled
         pool.shutdown(cancel_futures=True)
-    _gather(config, parts, out)
+    _gather(config, grid, parts, out)
 
 
 def _make(config: DatasetConfig, seed: int, parts: Path) -> None:
@@ -100,12 +111,17 @@ def _part(parts: Path, seed: int, number: int) -> Path:
     return parts / f"{seed}_{number}.record"
 
 
-def _gather(config: DatasetConfig, parts: Path, out: Path) -> None:
+def _gather(config: DatasetConfig, grid: VideoGrid, parts: Path, out: Path) -> None:
     """Write the parts to shards, in the order of the seeds, and remove them."""
     provenance = {"world": "tabletop", "kind": config.kind, "seeds": list(config.seeds)}
     complete = parts / "shards"
     with ShardWriter(
-        complete, kind="frames", spec=config.spec, provenance=provenance, overwrite=True
+        complete,
+        kind="frames",
+        spec=config.spec,
+        grid=grid,
+        provenance=provenance,
+        overwrite=True,
     ) as writer:
         for path in (_part(parts, s, n) for s in config.seeds for n in range(config.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)

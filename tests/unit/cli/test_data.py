@@ -4,17 +4,19 @@ import os
 import resource
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from egosim_jax import configs
 from egosim_jax.cli.data import Check, Look, Pack, Stats
 from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.atomic import LOCK, hold_folder
 from egosim_jax.io.video import read_video
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, VideoGrid, VideoSpec
 
 
 @pytest.fixture
@@ -246,3 +248,16 @@ def test_missing_files_are_refused_before_anything_is_written(clips, out):
     with pytest.raises(InputError, match="None of the 2 clips has its prior video"):
         Pack(metadata=clips, out=out).run()
     assert not out.exists()
+
+
+def test_pack_takes_the_latent_grid_of_a_model(make_clips, out, monkeypatch):
+    clips = make_clips(1, frames=7, height=40, width=56)
+    with pytest.raises(InputError, match="None of the 1 clips"):
+        Pack(metadata=clips, out=out).run()
+    grid = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
+    monkeypatch.setattr(configs, "get", lambda name: SimpleNamespace(grid=grid))
+    assert Pack(metadata=clips, out=out, config="toy").run() == ExitCode.DONE
+    assert ShardReader(out).manifest.grid == grid
+    frames = out.with_name("frames")
+    Pack(metadata=clips, out=frames, config="toy", size=(24, 40), num_frames=3).run()
+    assert ShardReader(frames).manifest.grid == grid

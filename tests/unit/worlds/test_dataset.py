@@ -3,7 +3,7 @@
 import pytest
 
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, VideoGrid, VideoSpec
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 SPEC = VideoSpec(frames=5, height=32, width=48)
@@ -52,3 +52,21 @@ def test_every_fourth_mixed_scene_has_a_robot(tmp_path):
 def test_an_empty_dataset_is_refused():
     with pytest.raises(InputError, match="--scenes"):
         DatasetConfig(seeds=(), clips=1, spec=SPEC, kind="human")
+
+
+def test_the_manifest_has_the_grid_that_the_clips_fit(tmp_path):
+    grid = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
+    spec = VideoSpec(frames=3, height=24, width=40)
+    config = DatasetConfig(seeds=(5,), clips=1, spec=spec, kind="robot")
+    with pytest.raises(InputError, match="3 frames cannot be encoded"):
+        list(make_shards(config, out=tmp_path, workers=1))
+    list(make_shards(config, out=tmp_path, workers=1, grid=grid))
+    assert ShardReader(tmp_path).manifest.grid == grid
+
+
+def test_a_finished_dataset_of_another_grid_is_refused(tmp_path):
+    grid = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
+    config = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
+    list(make_shards(config, out=tmp_path, workers=1))
+    with pytest.raises(InputError, match="another latent grid"):
+        list(make_shards(config, out=tmp_path, workers=1, grid=grid))
