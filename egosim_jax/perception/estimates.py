@@ -1,0 +1,154 @@
+"""Estimates from raw video, and the Protocols of the estimators that make them.
+
+A method without weights and a network satisfy the same Protocol, so that annotation of recorded
+videos and perception of generated clips are built from the same parts. Videos are uint8 RGB,
+cameras in OpenCV axes. What could not be estimated is NaN, infinite or None, never guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, no_type_check, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
+
+from egosim_jax.types import Cameras
+
+LEFT, RIGHT = 0, 1
+"""Index of a hand's side in `HandTracks`."""
+Rung = Literal["given", "static", "incremental", "focal", "global", "rotation", "refused"]
+"""Rung of the ladder of camera estimation, from the best known to none."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class HandTracks:
+    """Hands of a video: at most one left and one right hand of the wearer in each frame."""
+
+    joints_px: Float[np.ndarray, "f 2 21 2"]
+    """Columns and rows of the 21 keypoints in pixels, left then right; NaN where missing."""
+    joints_hand_m: Float[np.ndarray, "f 2 21 3"]
+    """Keypoints of a mean hand in meters, in camera axes, up to a translation."""
+    presence: Float[np.ndarray, "f 2"]
+    """Confidence from 0 to 1 that the hand is in the frame."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class SparsePoints:
+    """Triangulated points of a scene and the pixels that observe them."""
+
+    points_m: Float[np.ndarray, "p 3"]
+    """Positions in the world of the cameras, in meters or in their unknown unit."""
+    error_px: Float[np.ndarray, " p"]
+    """Mean reprojection error of each point, in pixels."""
+    frames: Int32[np.ndarray, " o"]
+    """Frame of each observation."""
+    indices: Int32[np.ndarray, " o"]
+    """Point of each observation."""
+    pixels_px: Float[np.ndarray, "o 2"]
+    """Column and row of each observation, in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Decision about estimated cameras, with its evidence."""
+
+    rung: Rung
+    """Method whose result was accepted, or `refused`."""
+    reason: str
+    """Reason in words, for the report."""
+    figures: Mapping[str, float]
+    """Measured figures by name, such as median triangulation angle in degrees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraEstimate:
+    """Cameras of a video, or the reason why there are none."""
+
+    cameras: Cameras | None
+    """Camera of every frame; None if refused."""
+    metric: bool
+    """True if the unit is the meter; False if the scale is unknown."""
+    verdict: Verdict
+    points: SparsePoints | None = None
+    """Triangulated points, if the method has any."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class DepthEstimate:
+    """Depth of some frames of a video."""
+
+    frames: Int32[np.ndarray, " k"]
+    """Frames that the maps belong to."""
+    depth_m: Float32[np.ndarray, "k h w"]
+    """Depth along the camera's z axis, in the unit of the cameras; infinite where unknown."""
+    confident: Bool[np.ndarray, "k h w"]
+    """Pixels that were measured; the others were completed from them."""
+    metric: bool
+    """True if the depth is in meters by itself, as of a metric network."""
+
+
+@runtime_checkable
+class HandEstimator(Protocol):
+    """Estimator of the wearer's hands."""
+
+    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
+        """Return the hands of a video."""
+        ...
+
+
+@runtime_checkable
+class CameraEstimator(Protocol):
+    """Estimator of camera poses and intrinsics."""
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        moving: Bool[np.ndarray, "f h w"],
+        *,
+        focal_px: float | None = None,
+    ) -> CameraEstimate:
+        """Return the cameras of a video; pixels in `moving` (hands, arms) are not used."""
+        ...
+
+
+@runtime_checkable
+class DepthEstimator(Protocol):
+    """Estimator of depth maps."""
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        moving: Bool[np.ndarray, "f h w"],
+        estimate: CameraEstimate,
+        wanted: Sequence[int],
+    ) -> DepthEstimate:
+        """Return depth maps of the wanted frames, given estimated cameras."""
+        ...
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Segmentation and tracking of what phrases name."""
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        phrases: Sequence[str],
+        hands: HandTracks | None = None,
+    ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
+        """Return instance ids of all pixels (0: none, negative: hands and arms) and their names."""
+        ...
+
+
+@runtime_checkable
+class Captioner(Protocol):
+    """Captions and names of objects."""
+
+    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> tuple[str, tuple[str, ...]]:
+        """Return the caption of a video and the names of the objects that are moved in it."""
+        ...
