@@ -121,7 +121,7 @@ class BatchJob:
     model: ModelConfig
     """Config of the model."""
     out: Path
-    """Folder to write to."""
+    """Folder of the generated clips and results.jsonl."""
     weights: Path | None
     """Folder of weights; None for random weights of `seed`."""
     lora: Path | None = None

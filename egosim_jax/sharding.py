@@ -58,12 +58,12 @@ def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(arranged, axes, axis_types=(AxisType.Auto,) * 3)
 
 
-def check_batch(size: int, mesh: Mesh | AbstractMesh, accumulate: int = 1) -> None:
-    """Raise `InputError` unless data x fsdp x `accumulate` divides a batch."""
+def check_batch(size: int, mesh: Mesh | AbstractMesh, grad_accum_steps: int = 1) -> None:
+    """Raise `InputError` unless data x fsdp x `grad_accum_steps` divides a batch."""
     groups = parts("batch", mesh)
-    unit = groups * accumulate
+    unit = groups * grad_accum_steps
     if size % unit:
-        in_turn = f", each in {accumulate} micro-batches" if accumulate > 1 else ""
+        in_turn = f", each in {grad_accum_steps} micro-batches" if grad_accum_steps > 1 else ""
         fix = f"Nearest: {-(-size // unit) * unit}."
         if size % groups == 0:
             fix = f"{fix} Or a number of micro-batches that divides {size // groups}."

@@ -12,7 +12,7 @@ class ModelExperiment:
     """Settings of every experiment with a trained model."""
 
     out: Path
-    """Folder to write to."""
+    """Folder of the report and the pictures of the experiment."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -14,6 +15,7 @@ DEPTH_M = (0.05, 50.0)
 """Smallest and largest median depth in meters that is accepted."""
 
 
+@no_type_check  # shapes and dtypes are checked with messages for users
 def state_from_depth(
     image: UInt8[np.ndarray, "_ _ 3"],
     depth_m: Float[np.ndarray, "h w"],

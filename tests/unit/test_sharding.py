@@ -56,4 +56,4 @@ def test_a_batch_that_a_mesh_does_not_divide_is_refused():
     with pytest.raises(
         InputError, match=r"Nearest: 16\. Or a number of micro-batches that divides 2"
     ):
-        check_batch(8, mesh, accumulate=4)
+        check_batch(8, mesh, grad_accum_steps=4)

@@ -42,7 +42,7 @@ class Grip:
     pitch: float
     """Downward pitch of the fingers in radians."""
     closure: float
-    """Closure from open (0) to closed (1)."""
+    """Closure of the hand, from open (0) to closed (1)."""
 
     def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Return joints in the world, and the unit vector of the back of the hand."""

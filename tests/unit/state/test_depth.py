@@ -45,3 +45,17 @@ def test_an_image_or_depth_that_makes_no_sense_is_refused(change, message):
     image, depth_m = change(*image_and_depth())
     with pytest.raises(InputError, match=message):
         state_from_depth(image, np.nan_to_num(depth_m), INTRINSICS, POSE)
+
+
+@pytest.mark.parametrize(
+    ("image", "depth_m", "message"),
+    [
+        (np.zeros((4, 6, 3), np.uint8), np.ones((1, 4, 6)), r"depth_m is float64 \(1, 4, 6\)"),
+        (np.zeros((4, 6, 3), np.float32), np.ones((4, 6)), "image is float32"),
+        (np.zeros((4, 6), np.uint8), np.ones((4, 6)), r"image is uint8 \(4, 6\)"),
+        (np.zeros((8, 6, 3), np.uint8), np.ones((4, 6)), "must be of the same image"),
+    ],
+)
+def test_images_and_depth_of_other_shapes_or_dtypes_are_refused(image, depth_m, message):
+    with pytest.raises(InputError, match=message):
+        state_from_depth(image, depth_m, INTRINSICS, POSE)
