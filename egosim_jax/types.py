@@ -178,7 +178,7 @@ class Cameras:
                     f"{name} is {dtype or type(value).__name__} {have}: it must be an array of "
                     "numbers, with at least one frame of poses."
                 )
-        rigid = _rigid(self.world_from_camera)
+        rigid = is_rigid(self.world_from_camera)
         if not rigid.all():
             frame = int(np.argmin(rigid))
             raise InputError(
@@ -211,7 +211,7 @@ class Cameras:
             )
 
 
-def _rigid(poses: Float[np.ndarray, "f 4 4"]) -> Bool[np.ndarray, " f"]:
+def is_rigid(poses: Float[np.ndarray, "f 4 4"]) -> Bool[np.ndarray, " f"]:
     """Return which poses are rigid transforms."""
     rigid = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     poses = np.where(rigid[:, None, None], poses, np.eye(4))
@@ -480,7 +480,7 @@ class GroundTruth:
                 "the camera's z axis, and infinite where it is unknown."
             )
         for number, motion in (self.motions or {}).items():
-            if np.shape(motion) != (shape[0], 4, 4) or not _rigid(np.asarray(motion)).all():
+            if np.shape(motion) != (shape[0], 4, 4) or not is_rigid(np.asarray(motion)).all():
                 raise InputError(
                     f"The ground-truth motion of object {number} is of shape {np.shape(motion)}: "
                     f"it must be one finite rigid transform per frame, ({shape[0]}, 4, 4)."

@@ -108,7 +108,7 @@ def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
 
     Raises `InputError` for a file that is missing, unreadable, empty, or above the caps.
     """
-    with _open_file(path) as file:
+    with open_file(path) as file:
         return _probe(file, quote_path(path), damage)
 
 
@@ -133,7 +133,7 @@ def read_video(
     that ends before `stop` gives the frames it has. Raises `InputError` for a file that is
     missing, unreadable, damaged, above the caps, or that has no frame in that range.
     """
-    with _open_file(path) as file:
+    with open_file(path) as file:
         return _decode(
             file,
             quote_path(path),
@@ -241,7 +241,7 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
 
 def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
     frames, size = 0, None
-    with _open_video(file, name, MAX_FRAMES) as container:
+    with open_video(file, name, MAX_FRAMES) as container:
         stream = container.streams.video[0]
         try:
             for packet in _packets(container, name, MAX_FRAMES):
@@ -249,8 +249,8 @@ def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
                 if size is None:
                     size = next(
                         (
-                            _upright(p, np.empty((p.height, p.width))).shape
-                            for p in _decoded(stream, packet, name)
+                            upright(p, np.empty((p.height, p.width))).shape
+                            for p in decode_packet(stream, packet, name)
                         ),
                         None,
                     )
@@ -259,7 +259,7 @@ def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
                 raise
         if size is None:
             raise InputError(f"{name} holds no frames.")
-        return VideoInfo(frames=frames, height=size[0], width=size[1], fps=_rate(stream, name))
+        return VideoInfo(frames=frames, height=size[0], width=size[1], fps=frame_rate(stream, name))
 
 
 def _decode(
@@ -274,23 +274,23 @@ def _decode(
 ) -> Video:
     kept = np.empty((0,), np.uint8)
     start, stop, count = frames.start, frames.stop, 0
-    with _open_video(file, name, max_frames) as container:
+    with open_video(file, name, max_frames) as container:
         try:
             for index, picture in enumerate(_pictures(container, name, max_frames)):
                 if stop is not None and index >= stop:
                     break
                 if index < start:
                     continue
-                frame = _rgb(picture, decoding)
+                frame = to_rgb(picture, decoding)
                 frame = frame if each is None else each(frame)
                 if count == len(kept):
-                    kept = _grown(kept, frame, name)
+                    kept = enlarge(kept, frame, name)
                 kept[count] = frame
                 count += 1
         except DamagedError:
             if damage == "refuse" or not count:
                 raise
-        fps = _rate(container.streams.video[0], name)
+        fps = frame_rate(container.streams.video[0], name)
     if not count:
         wanted = f" from frame {start} on" if start else ""
         raise InputError(f"{name} holds no frames{wanted}.")
@@ -298,7 +298,7 @@ def _decode(
     return Video(frames=kept, fps=fps)
 
 
-def _grown(kept: np.ndarray, frame: np.ndarray, name: str) -> np.ndarray:
+def enlarge(kept: np.ndarray, frame: np.ndarray, name: str) -> np.ndarray:
     """Double the capacity for frames without a copy."""
     room = min(max(16, 2 * len(kept)), MAX_KEPT // frame.nbytes)
     if room <= len(kept):
@@ -310,12 +310,13 @@ def _grown(kept: np.ndarray, frame: np.ndarray, name: str) -> np.ndarray:
     return kept
 
 
-def _rgb(picture: VideoFrame, decoding: Decoding) -> np.ndarray:
+def to_rgb(picture: VideoFrame, decoding: Decoding) -> np.ndarray:
+    """Return a decoded frame as upright RGB `h w 3`."""
     picture_rgb = picture.reformat(format="rgb24", interpolation=_SCALERS[decoding])
-    return _upright(picture, picture_rgb.to_ndarray())
+    return upright(picture, picture_rgb.to_ndarray())
 
 
-def _upright(picture: VideoFrame, pixels: np.ndarray) -> np.ndarray:
+def upright(picture: VideoFrame, pixels: np.ndarray) -> np.ndarray:
     """Rotate and mirror frames by the display matrix (a b u, c d v, x y w).
 
     A point (x, y) is shown at (a x + c y, b x + d y), y downward.
@@ -336,18 +337,19 @@ def _pictures(container: InputContainer, name: str, max_frames: int) -> Iterator
     shown = given = 0
     for packet in _packets(container, name, max_frames):
         shown += packet is not None and not packet.is_discard
-        for picture in _decoded(stream, packet, name):
+        for picture in decode_packet(stream, packet, name):
             size = size or (picture.height, picture.width)
             if picture.is_corrupt or size != (picture.height, picture.width):
                 raise DamagedError(f"{name} is damaged at frame {given}.")
             given += 1
-            _check_size(name, given, size[0] * size[1], max_frames)
+            check_size(name, given, size[0] * size[1], max_frames)
             yield picture
     if given != shown:
         raise DamagedError(f"{name} is damaged: {given} of its {shown} frames can be decoded.")
 
 
-def _decoded(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
+def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
+    """Decode a packet, or with None what remains. Raises `DamagedError`."""
     with _refusing(f"{name} is damaged", DamagedError):
         return stream.decode(packet)
 
@@ -361,7 +363,7 @@ def _packets(container: InputContainer, name: str, max_frames: int) -> Iterator[
     try:
         with _refusing(f"{name} is damaged", DamagedError):
             for number, packet in enumerate(container.demux(stream)):
-                _check_size(name, number // 2, 0, max_frames)  # empty ones count, too
+                check_size(name, number // 2, 0, max_frames)  # empty ones count, too
                 if packet.is_corrupt:
                     raise DamagedError(f"{name} is cut off after {read} frames.")
                 if packet.size:
@@ -377,7 +379,7 @@ def _packets(container: InputContainer, name: str, max_frames: int) -> Iterator[
 
 
 @contextmanager
-def _open_file(path: Path) -> Iterator[File]:
+def open_file(path: Path) -> Iterator[File]:
     """Open a file here, so that no video library resolves a name."""
     with open_regular(path) as file:
         if not os.fstat(file.fileno()).st_size:
@@ -386,8 +388,8 @@ def _open_file(path: Path) -> Iterator[File]:
 
 
 @contextmanager
-def _open_video(file: File, name: str, max_frames: int) -> Iterator[InputContainer]:
-    """Open a container with a video stream of an allowed size."""
+def open_video(file: File, name: str, max_frames: int | None) -> Iterator[InputContainer]:
+    """Open a container with a video stream of an allowed size, and length unless that is None."""
     check_boxes(file, name)
     with _refusing(f"{name} is not a readable video"):
         container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
@@ -401,7 +403,7 @@ def _open_video(file: File, name: str, max_frames: int) -> Iterator[InputContain
             stream.codec_context.options = _OPTIONS
             stream.thread_type = "AUTO"
             area = stream.height * stream.width
-        _check_size(name, stream.frames, area, max_frames)
+        check_size(name, stream.frames if max_frames else 1, area, max_frames or 1)
         yield container
 
 
@@ -417,7 +419,8 @@ def _refusing(what: str, kind: type[InputError] = InputError) -> Iterator[None]:
         raise kind(f"{what}: {quote_text(reason or type(error).__name__)}.") from error
 
 
-def _check_size(name: str, frames: int, area: int, max_frames: int) -> None:
+def check_size(name: str, frames: int, area: int, max_frames: int) -> None:
+    """Raise `InputError` if so many frames of so many pixels are not read at once."""
     if frames > max_frames:
         raise InputError(f"{name} is longer than {max_frames} frames, the most that is read.")
     if frames * area > MAX_PIXELS:
@@ -426,7 +429,8 @@ def _check_size(name: str, frames: int, area: int, max_frames: int) -> None:
         )
 
 
-def _rate(stream: VideoStream, name: str) -> Fraction:
+def frame_rate(stream: VideoStream, name: str) -> Fraction:
+    """Return the average frame rate of a stream."""
     rate = stream.average_rate or stream.guessed_rate
     if not rate:
         raise InputError(f"{name} does not say its frame rate.")

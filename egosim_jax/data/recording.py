@@ -1,0 +1,411 @@
+"""Recordings: a stretch of a video and all that a dataset or device knows of it.
+
+    recording.json    video and frames in it, rate, size, caption, names, depth files, provenance
+    arrays.npz        where known: world_from_camera `f 4 4`, intrinsics_px `3 3`, joints_m
+                      `f n j 3`, and what is known of the scene's points
+
+    {"format": "egosim_jax.recording", "version": 1, "recording_id": "fold_12",
+     "video": "/data/fold/12.mp4", "start": 0, "frames": 240, "fps": "30", "height": 1080, ...
+     "sha256": "9a..."}
+
+Conventions are those of the project: OpenCV axes (x right, y down, z forward), pixel centers at
+integer coordinates, joints in the world of the cameras. Poses and points are in meters if `metric`,
+else in an unknown unit, in which no hand is given. What is unknown is None, never guessed.
+Paths inside the folder are stored relative to it, all others absolute. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from egosim_jax.data.metadata import SAFE_IDS, is_safe_id
+from egosim_jax.data.scene_points import ScenePoints
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.depth_images import read_depth_image
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.run import write_json
+from egosim_jax.io.segments import read_segment
+from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
+from egosim_jax.io.video import Video
+from egosim_jax.types import (
+    HAND_SIZE_M,
+    JOINTS,
+    Action,
+    Cameras,
+    InputError,
+    Kind,
+    check_counts,
+    is_rigid,
+)
+
+FORMAT, VERSION = "egosim_jax.recording", 1
+DESCRIPTION, ARRAYS = "recording.json", "arrays.npz"
+MAX_FRAMES = 1 << 20
+"""Longest recording in frames: about ten hours."""
+MAX_BYTES = 1 << 28
+"""Largest description in bytes."""
+MAX_FPS = 1000
+"""Highest frame rate that is accepted."""
+MAX_TEXT = 10_000
+"""Longest caption, name or entry of the provenance, in characters."""
+_DTYPES = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64",
+           "points_m": "float32", "colors": "uint8", "error_px": "float32",
+           "frames": "int32", "indices": "int32", "pixels_px": "float32"}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFiles:
+    """Measured depth: one file per frame, of the picture's aspect but maybe another size."""
+
+    paths: tuple[Path | None, ...]
+    """PNG of 16 bits or npy of each frame; None where a frame has none."""
+    unit_m: float
+    """Length of one unit of the files in meters: 0.001 for millimeters."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A stretch of a video with what is known of its cameras, hands, scene and content."""
+
+    recording_id: str
+    """Unique id, which names the outputs."""
+    video: Path
+    """Video file."""
+    start: int = 0
+    """First frame of the recording in the video."""
+    frames: int
+    """Number of frames."""
+    fps: Fraction
+    """Frames per second."""
+    height: int
+    """Rows of a frame in pixels, as displayed."""
+    width: int
+    """Columns of a frame in pixels, as displayed."""
+    world_from_camera: Float[np.ndarray, "f 4 4"] | None = None
+    """Camera poses in OpenCV axes."""
+    intrinsics_px: Float[np.ndarray, "3 3"] | None = None
+    """Pinhole intrinsics of all frames; None also for a lens that is not a pinhole."""
+    metric: bool = False
+    """True if poses, joints and points are in meters; False if their unit is unknown."""
+    joints_m: Float[np.ndarray, "f n j 3"] | None = None
+    """Joints of n hands in the world, left before right; a missing hand is NaN."""
+    kind: Kind = "human"
+    """Kind of hands: human with 21 keypoints, or robot grippers with 3."""
+    depth: DepthFiles | None = None
+    """Measured depth of the frames."""
+    points: ScenePoints | None = None
+    """Points of the scene."""
+    caption: str | None = None
+    """What happens in the video, in a sentence."""
+    names: tuple[str, ...] = ()
+    """Names of objects that are acted on; empty if unknown."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Dataset, files and decisions of the reader, as free key-value pairs."""
+
+    def __post_init__(self) -> None:
+        """Check everything that can be checked without decoding; raise `InputError`."""
+        if not is_safe_id(self.recording_id):
+            raise InputError(
+                f"recording_id {quote(self.recording_id)} is not a valid file name; use {SAFE_IDS}."
+            )
+        counts = ("frames", "height", "width")
+        check_counts({name: getattr(self, name) for name in counts})
+        if self.start < 0 or self.start + self.frames > MAX_FRAMES:
+            raise InputError(
+                f"Frames {self.start} to {self.start + self.frames - 1} of a video: frames are "
+                f"counted from 0 and must be below {MAX_FRAMES:,}. Split the video."
+            )
+        if not (isinstance(self.fps, Fraction) and 0 < self.fps <= MAX_FPS):
+            raise InputError(
+                f"fps is {quote(str(self.fps))}: it must be a fraction above 0 and at most "
+                f"{MAX_FPS}."
+            )
+        self._check_texts()
+        self._check_cameras()
+        self._check_hands()
+        if self.depth is not None:
+            self._check_depth(self.depth)
+        seen = None if self.points is None else self.points.frames
+        if seen is not None and len(seen) and not (0 <= seen.min() <= seen.max() < self.frames):
+            raise InputError(
+                f"Points are observed in frames {seen.min()} to {seen.max()}: the recording has "
+                f"{self.frames}, counted from 0."
+            )
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """Cameras, if poses and intrinsics are known; in an unknown unit unless `metric`."""
+        if self.world_from_camera is None or self.intrinsics_px is None:
+            return None
+        return Cameras(
+            world_from_camera=self.world_from_camera,
+            intrinsics_px=self.intrinsics_px,
+            height=self.height,
+            width=self.width,
+        )
+
+    def read_frames(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        *,
+        each: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> Video:
+        """Decode frames `start` to `stop` (exclusive; the end if None) of the recording.
+
+        Raises `InputError` unless all of them are there, and as large as the recording says.
+        """
+        stop = self.frames if stop is None else stop
+        size, name = (self.height, self.width), quote_path(self.video)
+
+        def checked(frame: np.ndarray) -> np.ndarray:
+            if frame.shape[:2] != size:
+                raise InputError(
+                    f"{name} has frames of {frame.shape[1]}x{frame.shape[0]}: the recording says "
+                    f"{self.width}x{self.height}. Import it again."
+                )
+            return frame if each is None else each(frame)
+
+        video = read_segment(self.video, start=self.start + start, count=stop - start, each=checked)
+        return Video(frames=video.frames, fps=self.fps)
+
+    def read_depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
+        """Return measured depth in meters at the picture's size, infinite where unknown, or None.
+
+        A smaller map is enlarged by repeating the nearest value, so that edges stay sharp.
+        """
+        path = None if self.depth is None else self.depth.paths[frame]
+        if path is None:
+            return None
+        values = read_depth_image(path) * np.float32(self.depth.unit_m)
+        rows, columns = (
+            np.minimum((np.arange(size) + 0.5) * have / size, have - 1).astype(int)
+            for size, have in zip((self.height, self.width), values.shape, strict=True)
+        )
+        values = values[rows[:, None], columns]
+        return np.where(np.isfinite(values) & (values > 0), values, np.float32(np.inf))
+
+    def clip(self, start: int, stop: int) -> Recording:
+        """Return the recording of frames `start` to `stop` (exclusive), with the same id."""
+        if not 0 <= start < stop <= self.frames:
+            raise InputError(
+                f"Frames {start} to {stop} of recording {self.recording_id}: it has {self.frames}, "
+                "and a clip needs at least one."
+            )
+        per_frame = {
+            name: value[start:stop]
+            for name in ("world_from_camera", "joints_m")
+            if (value := getattr(self, name)) is not None
+        }
+        depth = self.depth and replace(self.depth, paths=self.depth.paths[start:stop])
+        return replace(
+            self,
+            start=self.start + start,
+            frames=stop - start,
+            depth=depth,
+            points=self.points and self.points.within(start, stop),
+            **per_frame,
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the two files of a recording, each atomically; replaces earlier ones."""
+        folder = folder.resolve()
+        arrays: dict[str, Any] = {
+            name: np.ascontiguousarray(value, dtype)
+            for name, dtype in _DTYPES.items()
+            if (value := _array(self, name)) is not None
+        }
+        with atomic_write(folder / ARRAYS) as temporary:
+            np.savez(temporary, **arrays)
+        depth = self.depth and {
+            "unit_m": self.depth.unit_m,
+            "paths": [path and _stored_path(path, folder) for path in self.depth.paths],
+        }
+        description = {
+            "format": FORMAT,
+            "version": VERSION,
+            "recording_id": self.recording_id,
+            "video": _stored_path(self.video, folder),
+            "start": int(self.start),
+            "frames": int(self.frames),
+            "fps": str(self.fps),
+            "height": int(self.height),
+            "width": int(self.width),
+            "metric": bool(self.metric),
+            "kind": self.kind,
+            "caption": self.caption,
+            "names": list(self.names),
+            "depth": depth,
+            "provenance": dict(self.provenance),
+            "sha256": sha256(folder / ARRAYS),
+        }
+        write_json(folder / DESCRIPTION, description)
+
+    @classmethod
+    def load(cls, folder: Path) -> Recording:
+        """Read a recording. Raises `InputError` for what is damaged or not valid."""
+        folder = folder.resolve()
+        try:
+            return _load(folder)
+        except InputError as error:
+            raise InputError(
+                f"{quote_path(folder)} is not a readable recording: {error}"
+            ) from error
+
+    def _check_texts(self) -> None:
+        texts = {
+            "caption": self.caption or "",
+            **{f"name {number}": name for number, name in enumerate(self.names)},
+            **{f"provenance {quote(key)}": value for key, value in self.provenance.items()},
+        }
+        for name, text in texts.items():
+            if not isinstance(text, str) or len(text) > MAX_TEXT:
+                raise InputError(
+                    f"The {name} of a recording is {quote(text)}: it must be text of at most "
+                    f"{MAX_TEXT:,} characters."
+                )
+
+    def _check_cameras(self) -> None:
+        poses = self.world_from_camera
+        if poses is not None:
+            if np.shape(poses) != (self.frames, 4, 4) or poses.dtype.kind != "f":
+                raise InputError(
+                    f"world_from_camera is {getattr(poses, 'dtype', '')} {np.shape(poses)}: it "
+                    f"must be floats ({self.frames}, 4, 4), one pose per frame, or None."
+                )
+            rigid = is_rigid(poses)
+            if not rigid.all():
+                raise InputError(
+                    f"Camera pose at frame {int(np.argmin(rigid))} is not a rigid transform: it "
+                    "must be finite, with a rotation of determinant 1 and the last row 0 0 0 1."
+                )
+        if self.intrinsics_px is not None:
+            Cameras(
+                world_from_camera=np.eye(4)[None],
+                intrinsics_px=self.intrinsics_px,
+                height=self.height,
+                width=self.width,
+            )
+
+    def _check_hands(self) -> None:
+        joints, cameras = self.joints_m, self.cameras
+        if joints is None:
+            return
+        if self.world_from_camera is None or not self.metric:
+            raise InputError(
+                "joints_m are given without camera poses in meters: joints are in the world of the "
+                "cameras and in meters. Give poses (world_from_camera) and metric=True, or None."
+            )
+        if cameras is not None:
+            Action(cameras=cameras, joints_m=joints, kind=self.kind, prompt="")
+            return
+        shape = (self.frames, *np.shape(joints)[1:2], JOINTS.get(self.kind, 0), 3)
+        finite = np.isfinite(joints) if np.shape(joints) == shape else np.zeros((1, 1, 1, 3), bool)
+        given = finite.all(axis=(2, 3))
+        hands = joints[given] if finite.shape == shape else np.zeros((0, 1, 3))
+        extent = np.linalg.norm(np.ptp(hands, axis=1), axis=-1)
+        low, high = HAND_SIZE_M
+        if (
+            finite.shape != shape
+            or (finite.any(axis=(2, 3)) != given).any()
+            or ((extent < low) | (extent > high)).any()
+        ):
+            raise InputError(
+                f"joints_m is {np.shape(joints)}: {quote(self.kind)} hands of {self.frames} frames "
+                f"must be ({self.frames}, hands, {JOINTS.get(self.kind)}, 3), each hand either "
+                f"all NaN or finite and {low} to {high} m large."
+            )
+
+    def _check_depth(self, depth: DepthFiles) -> None:
+        if len(depth.paths) != self.frames or not 0 < depth.unit_m < 1e3:
+            raise InputError(
+                f"depth has {len(depth.paths)} files of unit {depth.unit_m} m: it must have one "
+                f"path or None for each of the {self.frames} frames, and a unit above 0 and below "
+                "1000 m."
+            )
+
+
+def _array(recording: Recording, name: str) -> np.ndarray | None:
+    owner = recording if name in ("world_from_camera", "intrinsics_px", "joints_m") else (
+        recording.points
+    )  # fmt: skip
+    return None if owner is None else getattr(owner, name)
+
+
+def _stored_path(path: Path, folder: Path) -> str:
+    path = path.resolve()
+    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+
+def _found_path(text: Any, folder: Path) -> Path:
+    """Return the path of a file that a description names."""
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise InputError(f"{DESCRIPTION}: {quote(text)} is not a path.")
+    path = Path(text)
+    if ".." in path.parts:
+        raise InputError(
+            f"{DESCRIPTION}: the path {quote(text)} contains '..': paths are relative to the "
+            "folder and inside it, or absolute."
+        )
+    return folder / path
+
+
+def _load(folder: Path) -> Recording:
+    written = read_json(folder / DESCRIPTION, limit=MAX_BYTES)
+    if not isinstance(written, dict) or written.get("format") != FORMAT:
+        raise InputError(f"{DESCRIPTION} does not describe a recording ({FORMAT}).")
+    if type(written.get("version")) is not int or written["version"] != VERSION:
+        raise InputError(
+            f"it has version {quote(written.get('version'))}; this program reads {VERSION}."
+        )
+    for name, kind in {"recording_id": str, "start": int, "frames": int, "fps": str, "height": int,
+                       "width": int, "metric": bool, "kind": str, "names": list,
+                       "provenance": dict}.items():  # fmt: skip
+        if type(written.get(name)) is not kind:
+            raise InputError(
+                f"{DESCRIPTION}: {name} is {quote(written.get(name))}; expected {kind.__name__}."
+            )
+    if sha256(folder / ARRAYS) != written.get("sha256"):
+        raise InputError(
+            f"{ARRAYS} is damaged: it is not what {DESCRIPTION} was written for (SHA-256). Import "
+            "it again."
+        )
+    arrays = read_arrays(folder / ARRAYS, {}, optional=_DTYPES)
+    points: dict[str, Any] = {n: arrays.pop(n) for n in list(_DTYPES)[3:] if n in arrays}
+    if points and "points_m" not in points:
+        raise InputError(f"{ARRAYS} has {', '.join(points)}, but no points_m.")
+    try:
+        fps = Fraction(written["fps"])
+    except (ValueError, ZeroDivisionError) as error:
+        raise InputError(f"{DESCRIPTION}: fps is {quote(written['fps'])}.") from error
+    names = ("recording_id", "start", "frames", "height", "width", "metric", "kind", "caption",
+             "provenance")  # fmt: skip
+    return Recording(
+        **{name: written.get(name) for name in names},
+        **arrays,
+        video=_found_path(written.get("video"), folder),
+        fps=fps,
+        names=tuple(written["names"]),
+        depth=_found_depth(written.get("depth"), folder),
+        points=ScenePoints(**points) if points else None,
+    )
+
+
+def _found_depth(written: Any, folder: Path) -> DepthFiles | None:
+    if written is None:
+        return None
+    paths = written.get("paths") if isinstance(written, dict) else None
+    unit = written.get("unit_m") if isinstance(written, dict) else None
+    if not isinstance(paths, list) or not isinstance(unit, float):
+        raise InputError(f"{DESCRIPTION}: depth is {quote_text(str(written))}.")
+    found = tuple(None if path is None else _found_path(path, folder) for path in paths)
+    return DepthFiles(paths=found, unit_m=unit)

@@ -1,0 +1,76 @@
+"""Points of a scene as a capture knows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+from egosim_jax.types import InputError
+
+MAX_POINTS = 1 << 26
+"""Largest number of points, or of observations of them."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class ScenePoints:
+    """Points of the scene, with their colors and the pixels that observe them where known."""
+
+    points_m: Float32[np.ndarray, "p 3"]
+    """Positions in the world, in meters or in the unit of the cameras."""
+    colors: UInt8[np.ndarray, "p 3"] | None = None
+    """Colors of the points."""
+    error_px: Float32[np.ndarray, " p"] | None = None
+    """Mean reprojection error of each point, in pixels."""
+    frames: Int32[np.ndarray, " o"] | None = None
+    """Frame of each observation, counted from the recording's first."""
+    indices: Int32[np.ndarray, " o"] | None = None
+    """Point of each observation."""
+    pixels_px: Float32[np.ndarray, "o 2"] | None = None
+    """Column and row of each observation, in pixels."""
+
+    def __post_init__(self) -> None:
+        """Check dtypes, shapes, ranges and that all values are finite."""
+        count = (*np.shape(self.points_m), 0)[0]
+        seen = (*np.shape(self.frames), 0)[0]
+        for name, dtype, shape in (
+            ("points_m", "float32", (count, 3)), ("colors", "uint8", (count, 3)),
+            ("error_px", "float32", (count,)), ("frames", "int32", (seen,)),
+            ("indices", "int32", (seen,)), ("pixels_px", "float32", (seen, 2)),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is None and name != "points_m":
+                continue
+            have = f"{getattr(value, 'dtype', type(value).__name__)} {np.shape(value)}"
+            if have != f"{dtype} {shape}" or not np.isfinite(value).all():
+                raise InputError(
+                    f"{name} of the points is {have}: it must be finite {dtype} {shape}."
+                )
+        if not 0 < count <= MAX_POINTS or seen > MAX_POINTS:
+            raise InputError(
+                f"{count} points with {seen} observations: 1 to {MAX_POINTS:,} are accepted. Give "
+                "None if no point is known."
+            )
+        given = [getattr(self, name) is not None for name in ("frames", "indices", "pixels_px")]
+        if any(given) != all(given):
+            raise InputError("frames, indices and pixels_px of the points must be given together.")
+        if seen and not (self.indices.min() >= 0 and self.indices.max() < count):
+            raise InputError(
+                f"Observations name points {self.indices.min()} to {self.indices.max()}: there are "
+                f"{count}, counted from 0."
+            )
+
+    def within(self, start: int, stop: int) -> ScenePoints:
+        """Return the same points with the observations of some frames, which start at 0 then."""
+        if self.frames is None:
+            return self
+        kept = (self.frames >= start) & (self.frames < stop)
+        return replace(
+            self,
+            frames=self.frames[kept] - np.int32(start),
+            indices=self.indices[kept],
+            pixels_px=self.pixels_px[kept],
+        )

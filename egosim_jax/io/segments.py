@@ -1,0 +1,142 @@
+"""Segments of long videos, read without decoding what precedes them.
+
+The packets of a file are listed first, which decodes nothing, so that frames are counted exactly
+whatever the frame rate does; then decoding starts at the last key frame before the segment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+
+from egosim_jax.io.boxes import MAX_SAMPLES
+from egosim_jax.io.untrusted import quote_path, quote_text
+from egosim_jax.io.video import (
+    MAX_FRAMES,
+    DamagedError,
+    Decoding,
+    File,
+    Video,
+    VideoInfo,
+    check_size,
+    decode_packet,
+    enlarge,
+    frame_rate,
+    open_file,
+    open_video,
+    to_rgb,
+    upright,
+)
+from egosim_jax.types import InputError, check_counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Listing:
+    times: list[int]
+    """Presentation time of every frame, in order, in units of the stream."""
+    keys: list[tuple[int, int]]
+    """Presentation and decoding time of every key frame, in order."""
+
+
+def probe_long_video(path: Path) -> VideoInfo:
+    """Count the frames of a video of any length and read its size and rate.
+
+    Only the first frame is decoded. Raises `InputError` if it is not readable or damaged.
+    """
+    name = quote_path(path)
+    with open_file(path) as file:
+        listing = _list(file, name)
+        with open_video(file, name, None) as container:
+            picture = next(_pictures(container, name, listing.keys[0][1]))
+            height, width = upright(picture, np.empty((picture.height, picture.width))).shape
+            fps = frame_rate(container.streams.video[0], name)
+    return VideoInfo(frames=len(listing.times), height=height, width=width, fps=fps)
+
+
+def read_segment(
+    path: Path,
+    *,
+    start: int,
+    count: int,
+    decoding: Decoding = "accurate",
+    each: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Video:
+    """Decode `count` frames of a video of any length, from frame `start` on.
+
+    `each` is applied to every frame as it is decoded. Raises `InputError` if the file is not
+    readable or damaged, or ends before the segment does.
+    """
+    check_counts({"The number of frames": count})
+    name = quote_path(path)
+    kept, found = np.empty((0,), np.uint8), 0
+    with open_file(path) as file:
+        listing = _list(file, name)
+        if start < 0 or start + count > len(listing.times):
+            raise InputError(
+                f"Frames {start} to {start + count - 1} of {name} cannot be read: it has "
+                f"{len(listing.times)}, counted from 0."
+            )
+        first, last = listing.times[start], listing.times[start + count - 1]
+        with open_video(file, name, None) as container:
+            key = max((k for k in listing.keys if k[0] <= first), default=listing.keys[0])
+            for picture in _pictures(container, name, key[1]):
+                if picture.pts < first:
+                    continue
+                if picture.pts != listing.times[start + found]:
+                    break
+                frame = to_rgb(picture, decoding)
+                frame = frame if each is None else each(frame)
+                if found == len(kept):
+                    kept = enlarge(kept, frame, name)
+                kept[found] = frame
+                found += 1
+                if picture.pts >= last:
+                    break
+            fps = frame_rate(container.streams.video[0], name)
+    if found < count:
+        raise DamagedError(f"{name} is damaged: frame {start + found} cannot be decoded.")
+    kept.resize((count, *kept.shape[1:]), refcheck=False)
+    return Video(frames=kept, fps=fps)
+
+
+def _list(file: File, name: str) -> _Listing:
+    """List the frames of a video without decoding them."""
+    times, keys = list[int](), list[tuple[int, int]]()
+    with open_video(file, name, None) as container:
+        stream = container.streams.video[0]
+        try:
+            for packet in container.demux(stream):
+                if not packet.size:
+                    continue
+                if packet.is_corrupt or packet.pts is None or len(times) > MAX_SAMPLES:
+                    raise DamagedError(f"{name} is damaged after {len(times)} frames.")
+                if packet.is_keyframe:
+                    keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
+                if not packet.is_discard:
+                    times.append(packet.pts)
+        except OSError as error:  # as FFmpeg reports what it cannot parse
+            raise DamagedError(f"{name} is damaged: {quote_text(str(error))}.") from error
+    file.seek(0)
+    if not times or not keys or len(set(times)) != len(times):
+        raise DamagedError(f"{name} has no frames, no key frame, or two frames at one time.")
+    return _Listing(times=sorted(times), keys=sorted(keys))
+
+
+def _pictures(container: InputContainer, name: str, dts: int) -> Iterator[VideoFrame]:
+    """Yield decoded frames from a key frame on."""
+    stream = container.streams.video[0]
+    container.seek(dts, stream=stream, backward=True)
+    size, count = None, 0
+    for packet in container.demux(stream):
+        for picture in decode_packet(stream, packet if packet.size else None, name):
+            size = size or (picture.height, picture.width)
+            if picture.is_corrupt or size != (picture.height, picture.width):
+                raise DamagedError(f"{name} is damaged at {picture.time} s.")
+            count += 1
+            check_size(name, count, size[0] * size[1], MAX_FRAMES)
+            yield picture
