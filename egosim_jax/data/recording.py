@@ -105,7 +105,7 @@ class Recording:
     points: ScenePoints | None = None
     """Points of the scene."""
     caption: str | None = None
-    """What happens in the video, in a sentence."""
+    """Caption: a sentence about what happens in the video."""
     names: tuple[str, ...] = ()
     """Names of objects that are acted on; empty if unknown."""
     provenance: Mapping[str, str] = field(default_factory=dict)
@@ -183,8 +183,7 @@ class Recording:
 
         A smaller map is enlarged by repeating the nearest value, so that edges stay sharp.
         """
-        path = None if self.depth is None else self.depth.paths[frame]
-        if path is None:
+        if self.depth is None or (path := self.depth.paths[frame]) is None:
             return None
         values = read_depth_image(path) * np.float32(self.depth.unit_m)
         rows, columns = (
@@ -379,8 +378,8 @@ def _load(folder: Path) -> Recording:
             f"{ARRAYS} is damaged: it is not what {DESCRIPTION} was written for (SHA-256). Import "
             "it again."
         )
-    arrays = read_arrays(folder / ARRAYS, {}, optional=_DTYPES)
-    points: dict[str, Any] = {n: arrays.pop(n) for n in list(_DTYPES)[3:] if n in arrays}
+    arrays: dict[str, Any] = read_arrays(folder / ARRAYS, {}, optional=_DTYPES)
+    points = {n: arrays.pop(n) for n in list(_DTYPES)[3:] if n in arrays}
     if points and "points_m" not in points:
         raise InputError(f"{ARRAYS} has {', '.join(points)}, but no points_m.")
     try:

@@ -34,38 +34,41 @@ class ScenePoints:
 
     def __post_init__(self) -> None:
         """Check dtypes, shapes, ranges and that all values are finite."""
-        count = (*np.shape(self.points_m), 0)[0]
-        seen = (*np.shape(self.frames), 0)[0]
+        if np.ndim(self.points_m) != 2 or not 0 < len(self.points_m) <= MAX_POINTS:
+            raise InputError(
+                f"points_m has shape {np.shape(self.points_m)}: it must be (points, 3) with 1 to "
+                f"{MAX_POINTS:,} points. Give None if no point is known."
+            )
+        observations = self.frames, self.indices, self.pixels_px
+        given = [value is not None for value in observations]
+        if any(given) != all(given):
+            raise InputError("frames, indices and pixels_px of the points must be given together.")
+        count, seen = len(self.points_m), np.size(self.frames) if all(given) else 0
         for name, dtype, shape in (
             ("points_m", "float32", (count, 3)), ("colors", "uint8", (count, 3)),
             ("error_px", "float32", (count,)), ("frames", "int32", (seen,)),
             ("indices", "int32", (seen,)), ("pixels_px", "float32", (seen, 2)),
         ):  # fmt: skip
             value = getattr(self, name)
-            if value is None and name != "points_m":
+            if value is None:
                 continue
             have = f"{getattr(value, 'dtype', type(value).__name__)} {np.shape(value)}"
             if have != f"{dtype} {shape}" or not np.isfinite(value).all():
                 raise InputError(
                     f"{name} of the points is {have}: it must be finite {dtype} {shape}."
                 )
-        if not 0 < count <= MAX_POINTS or seen > MAX_POINTS:
-            raise InputError(
-                f"{count} points with {seen} observations: 1 to {MAX_POINTS:,} are accepted. Give "
-                "None if no point is known."
-            )
-        given = [getattr(self, name) is not None for name in ("frames", "indices", "pixels_px")]
-        if any(given) != all(given):
-            raise InputError("frames, indices and pixels_px of the points must be given together.")
-        if seen and not (self.indices.min() >= 0 and self.indices.max() < count):
-            raise InputError(
-                f"Observations name points {self.indices.min()} to {self.indices.max()}: there are "
-                f"{count}, counted from 0."
-            )
+        if seen > MAX_POINTS:
+            raise InputError(f"{seen:,} observations are more than {MAX_POINTS:,}, the most.")
+        if self.indices is not None and seen:
+            low, high = int(self.indices.min()), int(self.indices.max())
+            if not 0 <= low <= high < count:
+                raise InputError(
+                    f"Observations name points {low} to {high}: there are {count}, counted from 0."
+                )
 
     def within(self, start: int, stop: int) -> ScenePoints:
         """Return the same points with the observations of some frames, which start at 0 then."""
-        if self.frames is None:
+        if self.frames is None or self.indices is None or self.pixels_px is None:
             return self
         kept = (self.frames >= start) & (self.frames < stop)
         return replace(

@@ -85,9 +85,10 @@ def read_segment(
         with open_video(file, name, None) as container:
             key = max((k for k in listing.keys if k[0] <= first), default=listing.keys[0])
             for picture in _pictures(container, name, key[1]):
-                if picture.pts < first:
+                time = first - 1 if picture.pts is None else picture.pts
+                if time < first:
                     continue
-                if picture.pts != listing.times[start + found]:
+                if time != listing.times[start + found]:
                     break
                 frame = to_rgb(picture, decoding)
                 frame = frame if each is None else each(frame)
@@ -95,7 +96,7 @@ def read_segment(
                     kept = enlarge(kept, frame, name)
                 kept[found] = frame
                 found += 1
-                if picture.pts >= last:
+                if time >= last:
                     break
             fps = frame_rate(container.streams.video[0], name)
     if found < count:

@@ -109,7 +109,8 @@ def test_depth_is_enlarged_and_unknown_depth_is_infinite(tmp_path):
     np.save(path, values)
     depth = recording.read_depth(1)
     assert depth.shape == (HEIGHT, WIDTH)
-    assert depth[0, 0] == depth[11, 15] == 1 and depth[12, 0] == 2
+    assert depth[0, 0] == depth[11, 15] == 1
+    assert depth[12, 0] == 2
     assert depth[-1, -1] == pytest.approx(3)
     assert np.isinf(depth[0, 16])
     assert recording.read_depth(0) is None
@@ -119,7 +120,8 @@ def test_a_clip_keeps_what_belongs_to_its_frames(tmp_path):
     clip = make_recording(tmp_path).clip(1, 6)
     assert (clip.start, clip.frames, len(clip.depth.paths)) == (4, 5, 5)
     assert np.isfinite(clip.joints_m[:, 1]).all()
-    assert clip.points.frames.tolist() == [4] and clip.points.indices.tolist() == [3]
+    assert clip.points.frames.tolist() == [4]
+    assert clip.points.indices.tolist() == [3]
 
 
 @pytest.mark.parametrize(
