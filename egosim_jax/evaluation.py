@@ -1,4 +1,4 @@
-"""Evaluation of generated clips: PSNR and SSIM against the ground truth, along with baselines.
+"""Evaluation of generated clips: PSNR, SSIM and LPIPS against the ground truth, with baselines.
 
 Every {id}.mp4 is compared with the recorded video of its metadata row over the same frames, both at
 one size; so are the prior, the prior with a least-squares color fit, the first frame of the ground
@@ -23,6 +23,7 @@ from egosim_jax.data.metadata import ClipFiles
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.io.run import write_json, write_text
 from egosim_jax.io.video import probe_video, read_video
+from egosim_jax.metrics import lpips
 from egosim_jax.metrics.image import fit_colors
 from egosim_jax.metrics.report import DEFINITIONS, print_table, score, summarize
 from egosim_jax.progress import track
@@ -36,7 +37,7 @@ METHODS = {
     "vae": "ground truth through the autoencoder",
 }
 """Compared videos, and their names in tables."""
-MEASURES = {"psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.4f}")}
+MEASURES = {"psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), **lpips.MEASURE}
 
 Scores = dict[str, dict[str, float]]
 """Measures of one clip by method."""
@@ -55,7 +56,7 @@ class Evaluation(NamedTuple):
         for split, methods in self.report["splits"].items():
             count = max(row["clips"] for row in methods.values())
             rows = {
-                title: {measure: methods[name][measure] for measure in MEASURES}
+                title: {key: methods[name][key] for key in MEASURES if key in methods[name]}
                 for name, title in METHODS.items()
                 if name in methods
             }
@@ -64,6 +65,7 @@ class Evaluation(NamedTuple):
         first, last = protocol["frames"]
         sizes = ", ".join(protocol["pixels"])
         print(f"frames {first} to {last} at the size of the {protocol['size']}: {sizes}")
+        print(f"lpips_alex: {protocol['lpips_alex']}")
 
 
 def evaluate(
@@ -105,6 +107,7 @@ def evaluate(
             "pixels": sorted(sizes),
             "frames": [1, frames - 1],
             "resize": "Pillow LANCZOS, to the size of the comparison",
+            "lpips_alex": lpips.protocol(),
         },
         "splits": _summarize([(window.split, scores) for window, scores in compared]),
     }
@@ -175,7 +178,10 @@ def _scores(generated: Path, window: Window, size: str) -> tuple[Scores, int, in
     vae = path.with_name(f"{path.stem}_vae.mp4")
     if vae.exists():
         videos["vae"] = _read_at(vae, shape, 0)
-    scores = {method: score(video[1:], target[1:]) for method, video in videos.items()}
+    scores = {
+        method: {**score(video[1:], target[1:]), **lpips.score(video[1:], target[1:])}
+        for method, video in videos.items()
+    }
     return scores, like.height, like.width
 
 

@@ -1,4 +1,4 @@
-"""`egosim evaluate`: PSNR and SSIM of generated clips."""
+"""`egosim evaluate`: PSNR, SSIM and LPIPS of generated clips."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from egosim_jax.command import ExitCode
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Compare generated clips with the recorded ones by PSNR and SSIM.
+    """Compare generated clips with the recorded ones by PSNR, SSIM and LPIPS.
 
     Every {id}.mp4 is compared with the ground truth of its metadata row over the same frames, both
     at one size; so are the prior, the prior with a least-squares color fit, the first frame of the
     ground truth repeated and, if there is an {id}_vae.mp4, the ground truth through the
     autoencoder. Frame 0 is excluded, because there the repeated frame is the ground truth. A clip
-    of another length than most is skipped (exit code 3). Prints a table; writes metrics.jsonl (one
-    line per clip) and report.json, which names the protocol.
+    of another length than most is skipped (exit code 3). LPIPS needs the extra `metrics`. Prints a
+    table; writes metrics.jsonl (one line per clip) and report.json, which names the protocol.
     """
 
     generated: Path

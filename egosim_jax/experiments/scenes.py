@@ -10,7 +10,7 @@ import numpy as np
 
 from egosim_jax.data.sheet import SheetClip
 from egosim_jax.generator import Generator, batches
-from egosim_jax.metrics import region
+from egosim_jax.metrics import lpips, region
 from egosim_jax.metrics.report import score
 from egosim_jax.types import Kind, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
@@ -20,12 +20,14 @@ DroppedCondition = Literal["prior", "mask", "hands"]
 MEASURES = {
     "psnr": ("PSNR dB", "{:.2f}"),
     "ssim": ("SSIM", "{:.3f}"),
+    **lpips.MEASURE,
     "region_psnr": ("region PSNR dB", "{:.2f}"),
     "hand_iou": ("hand IoU", "{:.3f}"),
     "object_error": ("object error %", "{:.2f}"),
 }
 DEFINITIONS = {
     "psnr, ssim": "as in evaluate, frames 1 to the last",
+    "lpips_alex": f"{lpips.DEFINITION}; frames 1 to the last",
     "region_psnr": "dB over the hand+object region of the ground truth, all frames of a clip "
     "together",
     "hand_iou": "silhouette of hands and arms, segmented by color and opened by 3 x 3, against the "
@@ -67,6 +69,7 @@ class HeldOutClip:
         errors = region.centroid_errors(seen == number, body)
         return {
             **score(video[1:], target),
+            **lpips.score(video[1:], target),
             "region_psnr": region.region_psnr(video[1:], target, hands | body),
             "hand_iou": region.silhouette_iou(region.open_mask(seen >= FIRST_HAND), hands),
             "object_error": 100 * float(np.mean(errors)) / ids.shape[2] if len(errors) else np.nan,

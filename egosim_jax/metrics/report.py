@@ -42,9 +42,11 @@ def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
 def summarize(
     scores: Sequence[Mapping[str, float]], measures: Iterable[str]
 ) -> dict[str, dict[str, float]]:
-    """Return mean and spread of each measure over scores."""
+    """Return mean and spread of each measure over scores, without those that no score has."""
     summary = {}
     for name in measures:
+        if not any(name in score for score in scores):
+            continue
         mean, spread = mean_and_spread(score[name] for score in scores)
         summary[name] = {"mean": mean, "spread": spread}
     return summary

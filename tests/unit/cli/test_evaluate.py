@@ -1,13 +1,16 @@
 """`egosim evaluate`: the compared videos, frames and sizes."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
+from flax import nnx
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.command import ExitCode
 from egosim_jax.io.video import read_video, write_video
+from egosim_jax.metrics import lpips
 from egosim_jax.metrics.image import psnr, ssim
 from egosim_jax.types import InputError
 
@@ -19,6 +22,16 @@ def run(clips, tmp_path):
     for name in ("clip0", "clip1"):
         write_video(folder / f"{name}.mp4", target_of(clips, name) // 2 + 50, 16)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def network(monkeypatch):
+    """Return a network of LPIPS, of few channels; the code of the tests is not optimized."""
+    stage = (lpips.Convolution(features=4),)
+    alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
+    found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
+    monkeypatch.setattr(lpips, "alex_if_installed", lambda: found)
+    return found
 
 
 def target_of(clips, name):
@@ -37,6 +50,28 @@ def test_a_clip_is_compared_with_its_ground_truth_from_frame_1_on(clips, run):
     assert scores["generated"]["psnr"] == pytest.approx(psnr(generated, reference)[1:].mean())
     assert scores["generated"]["ssim"] == pytest.approx(ssim(generated, reference)[1:].mean())
     assert scores["split"] == "test"
+
+
+def test_lpips_is_a_column_with_its_protocol(clips, run, network, capsys):
+    Evaluate(generated=run, metadata=clips).run()
+    generated, reference = read_video(run / "clip1.mp4").frames, target_of(clips, "clip1")
+    expected = lpips.frame_distances(network, generated, reference)[1:].mean()
+    assert metrics(run)["clip1"]["generated"]["lpips_alex"] == pytest.approx(expected, abs=1e-6)
+    protocol = json.loads((run / "report.json").read_text())["protocol"]["lpips_alex"]
+    assert protocol == lpips.DEFINITION
+    printed = capsys.readouterr().out
+    assert "LPIPS-Alex" in printed
+    assert lpips.DEFINITION in printed
+
+
+def test_without_the_extra_the_column_is_absent_and_the_report_says_so(
+    clips, run, monkeypatch, capsys
+):
+    monkeypatch.setattr(lpips, "alex_if_installed", lambda: None)
+    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
+    assert set(metrics(run)["clip1"]["generated"]) == {"psnr", "ssim"}
+    assert "lpips_alex" not in json.loads((run / "report.json").read_text())["splits"]["test"]
+    assert "Install egosim-jax[metrics]" in capsys.readouterr().out
 
 
 def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):

