@@ -1,9 +1,9 @@
-"""Perception stages with network weights, which may import jax or torch.
+"""Networks of perception, each of them in a worker process, so that torch is never imported here.
 
-Nothing else in perception does. A module here holds the stage of one network, a frozen dataclass as
-`pipeline.Stage` describes, and a config that `registry.register` adds by name; `registry` imports
-the module when that name is asked for, so that perception without networks imports neither library.
-A stage has the path of its weights and their SHA-256 among its fields, checks the file against it
-before it loads it, and its method `fingerprint` leaves the path out: a run is resumed when the file
-has moved, and refused with other weights.
+A module holds one network from both sides: a frozen dataclass of its parameters, which satisfies a
+Protocol of `perception.estimates`, and the function `load`, which runs in the worker and may import
+torch or jax. `worker` has the processes, `checkpoint` the folders of weights, and `pipeline` the
+closed loop's pipeline that is made of networks. A network's `fingerprint` has the SHA-256 of its
+files and not their path: a run is resumed when the folder has moved, and refused with other
+weights.
 """
