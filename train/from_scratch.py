@@ -19,13 +19,16 @@ from typing import TYPE_CHECKING
 from egosim_jax import configs
 from egosim_jax.command import ExitCode
 from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.models.layers import Products
 from egosim_jax.progress import track
 from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.update import Stage
+from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.models.wan.vae import WanVAE
+    from egosim_jax.networks import ModelConfig
 
 ENCODE_BATCH = 8
 """Clips that are encoded together."""
@@ -60,6 +63,8 @@ class FromScratch(Recipe):
     It differs at hands, at what they move and in unobserved regions."""
     weights_dtype: str = "float32"
     """Dtype of the weights that are written."""
+    products: Products | None = None
+    """Dtype to which the denoiser's training rounds the factors of products; None: the model's."""
     weights: Path | None = None
     """Weights folder to start from: its autoencoder is kept, its denoiser is trained further."""
 
@@ -72,7 +77,7 @@ class FromScratch(Recipe):
         from egosim_jax.train.tasks.autoencoding import Autoencoding
         from egosim_jax.train.tasks.denoising import Denoising
 
-        model = configs.get(self.config)
+        model = self.trained_model()
         # Crops as long as the model's clips: a VAE trained on shorter ones drifts afterwards.
         vae = Autoencoding(vae=model.vae, video=model.video, crop=self.crop)
         denoiser = Denoising(
@@ -83,6 +88,21 @@ class FromScratch(Recipe):
         stages = {"vae": Stage(vae, self.vae), "denoiser": Stage(denoiser, self.denoiser)}
         return {name: stages[name] for name in stages if name == "denoiser" or not self.weights}
 
+    def trained_model(self) -> ModelConfig:
+        """Return the model's config with the numerics of this training.
+
+        Raises `InputError` if its denoiser has no option `products`.
+        """
+        model = configs.get(self.config)
+        if self.products is None:
+            return model
+        if "products" not in model.dit.numerics_only:
+            raise InputError(
+                f"The denoiser of {model.name} has no --products, which must be omitted, not "
+                f"{self.products}."
+            )
+        return replace(model, dit=replace(model.dit, products=self.products))
+
     def train(self) -> int:
         """Make the clips, train stage after stage, and write the weights."""
         (out,) = self.require("out")
@@ -91,7 +111,7 @@ class FromScratch(Recipe):
         from egosim_jax.train.loop import train
 
         require_single_process(self.config)
-        mutable = [*resume_mutable("vae", "denoiser"), "preflight", "json", "search"]
+        mutable = [*resume_mutable("vae", "denoiser"), "products", "preflight", "json", "search"]
         open_folder(out, self, mutable=mutable)
         frames = self.frames(out)
         networks = Networks.random(configs.get(self.config), seed=0)

@@ -1,7 +1,9 @@
 """Layers shared by the networks.
 
 Precision: parameters keep the dtype they were given (float32 by default); `Linear` and `Embed`
-compute in their `dtype`; norms compute and return float32, and the next `Linear` casts down.
+compute in their `dtype`; norms compute and return float32, and the next `Linear` casts down. With
+`products="bfloat16"` a float32 `Linear` rounds the factors of its products, which processors
+with instructions for them compute up to twice as fast, and nothing else (`rounded_product`).
 
 Every parameter names its logical axes (`axes=`), which `sharding.py` maps to the mesh:
 `embed` the model width, `mlp` the hidden width, `heads` heads x head size, `vocab`, `layers` the
@@ -11,7 +13,7 @@ stacked blocks, None an axis that is never sharded.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,8 @@ from jaxtyping import Array, Float, Int
 Axes = tuple[str | None, ...]
 Initializer = Callable[..., jax.Array]
 Block = TypeVar("Block", bound=nnx.Module)
+Products = Literal["bfloat16"]
+"""Dtype to which the factors of matrix products are rounded, if not the compute dtype."""
 
 lecun_normal = nnx.initializers.lecun_normal()
 zeros = nnx.initializers.zeros_init()
@@ -44,6 +48,35 @@ class LowRank(nnx.Module):
         return x @ self.down[...].astype(x.dtype) @ self.up[...].astype(x.dtype)
 
 
+@jax.custom_vjp
+def rounded_product(x: Float[Array, "*b i"], kernel: Float[Array, "i o"]) -> Float[Array, "*b o"]:
+    """Return `x @ kernel` of factors rounded to bfloat16, with float32 sums.
+
+    In both products of the gradient the factors are rounded, too. Reverse mode only.
+    """
+    return _round_and_dot(x, kernel, (x.ndim - 1,), (0,))
+
+
+def _product_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+    return rounded_product(x, kernel), (x, kernel)
+
+
+def _product_backward(saved: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
+    x, kernel = saved
+    rows = tuple(range(x.ndim - 1))
+    dx = _round_and_dot(g, kernel, (g.ndim - 1,), (1,))
+    return dx.astype(x.dtype), _round_and_dot(x, g, rows, rows).astype(kernel.dtype)
+
+
+rounded_product.defvjp(_product_forward, _product_backward)
+
+
+def _round_and_dot(a: Array, b: Array, a_axes: tuple[int, ...], b_axes: tuple[int, ...]) -> Array:
+    a, b = a.astype(jnp.bfloat16), b.astype(jnp.bfloat16)
+    axes = ((a_axes, b_axes), ((), ()))
+    return jax.lax.dot_general(a, b, axes, preferred_element_type=jnp.float32)
+
+
 class Linear(nnx.Module):
     """Linear layer `x @ kernel + bias`, kernel `[in, out]`, computed in `dtype`."""
 
@@ -58,18 +91,20 @@ class Linear(nnx.Module):
         axes: Axes,
         bias: bool = True,
         dtype: str = "float32",
+        products: Products | None = None,
         kernel_init: Initializer = lecun_normal,
         rngs: nnx.Rngs,
     ):
-        self.dtype = jnp.dtype(dtype)
+        self.dtype, self.products = jnp.dtype(dtype), products
         self.kernel = nnx.Param(kernel_init(rngs.params(), (in_dim, out_dim)), axes=axes)
         self.bias = nnx.Param(jnp.zeros(out_dim), axes=axes[1:]) if bias else None
         self.low_rank = nnx.data(None)
 
     def __call__(self, x: Float[Array, "*b i"]) -> Float[Array, "*b o"]:
         """Project the last axis."""
-        x = x.astype(self.dtype)
-        y = x @ self.kernel[...].astype(self.dtype)
+        x, kernel = x.astype(self.dtype), self.kernel[...].astype(self.dtype)
+        y = rounded_product(x, kernel) if self.products else x @ kernel
+        y = y.astype(self.dtype)
         if self.low_rank is not None:
             y = y + self.low_rank(x)
         return y if self.bias is None else y + self.bias[...].astype(self.dtype)

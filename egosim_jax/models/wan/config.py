@@ -10,6 +10,7 @@ from flax import nnx
 
 from egosim_jax.models import Flops
 from egosim_jax.models.attention import Kernel
+from egosim_jax.models.layers import Products
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ class WanDiTConfig:
 
     table: ClassVar[str] = "egosim_jax.convert.tables.wan_dit"
     """Module of the conversion table."""
-    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "attention", "remat")
+    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "products", "attention", "remat")
     """Fields that change only how values are computed, which a resumed training may change."""
     remat_levels: ClassVar[tuple[str, ...]] = (
         "offload", "full", "attention", "projections", "products", "none",
@@ -59,6 +60,10 @@ class WanDiTConfig:
     """Epsilon of the norms."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products and the residual stream."""
+    products: Products | None = None
+    """Dtype of the factors of matrix products, attention's included; None: that of the others.
+
+    With bfloat16 sums and all else stay in `dtype`."""
     attention: Kernel = "auto"
     """Attention kernel."""
     remat: Remat = "none"
@@ -130,6 +135,11 @@ class WanDiTConfig:
     def head_dim(self) -> int:
         """Size of an attention head."""
         return self.dim // self.heads
+
+    @property
+    def attention_dtype(self) -> str:
+        """Dtype of queries, keys and values."""
+        return self.products or self.dtype
 
     @property
     def condition_channels(self) -> int:

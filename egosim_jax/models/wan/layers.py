@@ -11,7 +11,7 @@ with RMS norm of queries and keys over the full width, rotary positions in self-
 query for two cross-attentions, to the text and to the image, whose outputs are summed.
 
 Norms, modulation, gates and rotations are float32; matrix products and the residual stream are in
-the config's `dtype`.
+the config's `dtype`, or the products' factors alone in bfloat16 (`products`).
 """
 
 from __future__ import annotations
@@ -62,7 +62,14 @@ def linear(
     init: Initializer = xavier,
 ) -> Linear:
     """Make a linear layer in the compute dtype."""
-    return Linear(*sizes, axes=axes, dtype=config.dtype, kernel_init=init, rngs=rngs)
+    return Linear(
+        *sizes,
+        axes=axes,
+        dtype=config.dtype,
+        products=config.products,
+        kernel_init=init,
+        rngs=rngs,
+    )
 
 
 def checkpoint_proj(x: jax.Array) -> jax.Array:
@@ -160,7 +167,7 @@ class KeyValue(nnx.Module):
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         sizes, axes = (config.dim, config.dim), ("embed", "heads")
-        self.heads, self.dtype = config.heads, jnp.dtype(config.dtype)
+        self.heads, self.dtype = config.heads, jnp.dtype(config.attention_dtype)
         self.k = linear(config, sizes, axes, rngs)
         self.v = linear(config, sizes, axes, rngs)
         self.norm_k = RMSNorm(config.dim, eps=config.eps, axes=("heads",))
@@ -170,11 +177,11 @@ class KeyValue(nnx.Module):
         return self._by_head(self.norm_k(checkpoint_proj(self.k(tokens))))
 
     def values(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
-        """Return the values, in the compute dtype."""
-        return self._by_head(checkpoint_proj(self.v(tokens)))
+        """Return the values, in the dtype of the attention's products."""
+        return self._by_head(checkpoint_proj(self.v(tokens))).astype(self.dtype)
 
     def keys_values(self, tokens: Float[Array, "b m d"]) -> KeysValues:
-        """Return keys and values, both in the compute dtype."""
+        """Return keys and values, both in the dtype of the attention's products."""
         return self.keys(tokens).astype(self.dtype), self.values(tokens)
 
     def _by_head(self, x: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
@@ -203,7 +210,7 @@ class Attention(KeyValue):
         v: Float[Array, "b m h k"],
         over: Literal["heads", "queries"],
     ) -> Float[Array, "b n d"]:
-        """Attend in the compute dtype and join the heads."""
+        """Attend in the dtype of the attention's products and join the heads."""
         q, k = q.astype(self.dtype), k.astype(self.dtype)
         out = attention(q, k, v, kernel=self.kernel, over=over)
         return rearrange(out, "b n h k -> b n (h k)")

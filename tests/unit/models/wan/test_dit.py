@@ -157,6 +157,15 @@ def test_bfloat16_stays_near_float32_and_answers_in_float32():
     assert have.dtype == jnp.float32
     # bfloat16 keeps 8 bits: 4e-3 a rounding.
     assert relative(have, want) < 3e-2
+    rounded = compiled(replace(TINY, products="bfloat16"))(weights(), *inputs(TINY))
+    assert 0 < relative(rounded, want) < relative(have, want)
+
+
+@pytest.mark.parametrize("remat", ["none", "products"])
+def test_gradients_of_rounded_products_stay_near_those_of_float32(remat):
+    rounded = gradients(replace(TINY, products="bfloat16", remat=remat))
+    both = [np.concatenate([np.ravel(x) for x in leaves]) for leaves in (rounded, gradients(TINY))]
+    assert 0 < relative(*both) < 3e-2
 
 
 @pytest.mark.parametrize(
