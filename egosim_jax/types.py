@@ -323,6 +323,21 @@ REACH_M = 3.0
 """Largest distance in front of a camera at which a joint counts as near the view, in meters."""
 
 
+def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[np.ndarray, "f n"]:
+    """Return which hands have a joint within reach of the camera and in or near its picture."""
+    poses = cameras.world_from_camera
+    given = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
+    where = np.where(given[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
+    x, y, z = np.moveaxis(np.einsum("fnjc,fcd->fnjd", where, poses[:, :3, :3]), -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
+        v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
+    near_u, near_v = NEAR_PICTURE * cameras.width, NEAR_PICTURE * cameras.height
+    seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
+    seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
+    return np.asarray(seen.any(axis=2))
+
+
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Action:
@@ -391,17 +406,8 @@ class Action:
 
         Each hand that is given in any frame is checked separately.
         """
-        cameras, poses = self.cameras, self.cameras.world_from_camera
-        where = np.where(given[:, :, None, None], joints, 0.0) - poses[:, None, None, :3, 3]
-        rotations = poses[:, :3, :3]
-        x, y, z = np.moveaxis(np.einsum("fnjc,fcd->fnjd", where, rotations), -1, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
-            v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
-        near_u, near_v = NEAR_PICTURE * cameras.width, NEAR_PICTURE * cameras.height
-        seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
-        seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
-        lost = given.any(axis=0) & ~seen.any(axis=(0, 2))
+        seen = near_view(self.cameras, joints)
+        lost = given.any(axis=0) & ~seen.any(axis=0)
         if lost.any():
             raise InputError(
                 f"No joint of hand {int(np.argmax(lost))} comes near the view of the cameras, at "

@@ -1,4 +1,4 @@
-"""`egosim data`: make, pack, encode, draw, check and describe shards."""
+"""`egosim data`: import recordings; make, pack, encode, draw, check and describe shards."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from egosim_jax.cli.imports import Import
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
 from egosim_jax.types import WAN_GRID, VideoGrid, VideoSpec, check_counts
@@ -304,10 +305,11 @@ class Stats:
 
 @dataclass(frozen=True, kw_only=True)
 class Data:
-    """Prepare data: clips of a procedural world, shards of videos, frames or latents."""
+    """Prepare data: recordings, clips of a procedural world, shards of videos or latents."""
 
     command: (
-        Annotated[Make, tyro.conf.subcommand("make")]
+        Annotated[Import, tyro.conf.subcommand("import")]
+        | Annotated[Make, tyro.conf.subcommand("make")]
         | Annotated[Pack, tyro.conf.subcommand("pack")]
         | Annotated[Encode, tyro.conf.subcommand("encode")]
         | Annotated[Look, tyro.conf.subcommand("look")]

@@ -43,7 +43,8 @@ class ScenePoints:
         given = [value is not None for value in observations]
         if any(given) != all(given):
             raise InputError("frames, indices and pixels_px of the points must be given together.")
-        count, seen = len(self.points_m), np.size(self.frames) if all(given) else 0
+        count = len(self.points_m)
+        seen = 0 if self.frames is None else int(np.size(self.frames))
         for name, dtype, shape in (
             ("points_m", "float32", (count, 3)), ("colors", "uint8", (count, 3)),
             ("error_px", "float32", (count,)), ("frames", "int32", (seen,)),

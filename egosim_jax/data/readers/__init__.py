@@ -1,0 +1,88 @@
+"""Readers of datasets and captures, each of which finds recordings and reads them one by one.
+
+A reader is a frozen dataclass: where the data is, and the choices that a user may make. `find`
+lists what is there without reading it, so that an interrupted import resumes quickly; an entry's
+`read` checks everything and raises `InputError` for what it cannot use, and the others are read
+nevertheless. Cameras, units, joint order and pixel centers of each format are stated in its module.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Protocol, runtime_checkable
+
+from egosim_jax.data.recording import Recording
+from egosim_jax.io.untrusted import quote
+from egosim_jax.types import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A recording that a reader found, and how to read it."""
+
+    recording_id: str
+    """Unique id, which names the folder."""
+    read: Callable[[Path], Recording]
+    """Function that reads it, given the folder for what it has to write."""
+    source: Path
+    """File or folder that it is read from."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Choices of the user that its content depends on, by option."""
+
+
+@runtime_checkable
+class Reader(Protocol):
+    """Reader of one dataset or format."""
+
+    dataset: ClassVar[str]
+    """Name of the dataset on the command line."""
+
+    def find(self) -> Iterable[Entry]:
+        """List what is there. Raises `InputError` if the source is not such a dataset."""
+        ...
+
+
+def make_id(parts: Sequence[str]) -> str:
+    """Return a valid id made of names, joined by underscores."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", "_".join(parts)).lstrip(".")[-200:]
+
+
+def inside(root: Path, name: object, *, what: str) -> Path:
+    """Return the path of a file that an untrusted file names, which must be below `root`."""
+    path = Path(name) if isinstance(name, str) and name and "\0" not in name else None
+    if path is None or path.is_absolute() or ".." in path.parts:
+        raise InputError(
+            f"{what} is {quote(name)}: it must be a path inside the dataset's folder, without '..'."
+        )
+    return root / path
+
+
+def require(module: str) -> None:
+    """Raise `InputError` unless an optional library is installed."""
+    from importlib.util import find_spec
+
+    if find_spec(module) is None:
+        raise InputError(
+            f"Reading this dataset needs {module}, which is not installed: "
+            "pip install 'egosim-jax[video]'."
+        )
+
+
+def find_files(source: Path, pattern: str, *, what: str) -> list[Path]:
+    """Return the files below a folder that match, or the file itself, in natural order."""
+    found = [source] if source.is_file() else sorted(source.rglob(pattern), key=natural_order)
+    if not found:
+        raise InputError(
+            f"{source} holds no {what}: it must be a folder with {pattern} at any depth, or one "
+            "such file."
+        )
+    return found
+
+
+def natural_order(path: Path) -> list[tuple[int, int, str]]:
+    """Return a sort key that orders numbers in names by value."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(int(p.isdecimal()), int(p[:18]) if p.isdecimal() else 0, p) for p in parts]

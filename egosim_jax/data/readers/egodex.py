@@ -1,0 +1,138 @@
+"""EgoDex: videos of a headset with poses of the camera and of both hands, from ARKit.
+
+    <split>/<task>/<id>.hdf5 and .mp4, 1920x1080, 30 frames per second
+        camera/intrinsic          3 3, pixels
+        transforms/<name>         f 4 4, `name` to world, meters: camera and 68 joints
+        confidences/<joint>       f, 0 to 1; the group may be absent
+        attributes                llm_description, llm_description2, which_llm_description,
+                                  llm_type, llm_objects
+
+The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary origin. Of the 25
+joints of a hand the four metacarpals are not used: our 21 are the wrist (`Hand`), the thumb from
+Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of index, middle, ring and
+little finger. Columns and rows count from the corner of the picture (its center is at 960, 540), so
+that half a pixel is subtracted. Followed: Apple's loader of the set as of 2025.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from egosim_jax.data.readers import Entry, find_files, make_id, require
+from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.readers.hdf5 import Hdf5, open_hdf5
+from egosim_jax.data.recording import Recording
+from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.types import Cameras, InputError
+
+_SEGMENTS = ("Knuckle", "IntermediateBase", "IntermediateTip", "Tip")
+_FINGERS = ("Thumb", "IndexFinger", "MiddleFinger", "RingFinger", "LittleFinger")
+JOINT_NAMES = ("Hand", *(finger + segment for finger in _FINGERS for segment in _SEGMENTS))
+"""Names of our 21 keypoints in the set, without the side."""
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EgoDex:
+    """Apple's EgoDex: hdf5 and mp4 per episode, with cameras and hands."""
+
+    dataset: ClassVar[str] = "egodex"
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of the set, of a split or of a task, or one .hdf5 file."""
+    min_confidence: float = 0.1
+    """Median confidence of a hand's joints below which it is missing from a frame."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the .hdf5 files."""
+        require("h5py")
+        root = self.source if self.source.is_dir() else self.source.parent
+        for path in find_files(self.source, "*.hdf5", what="episode of EgoDex"):
+            yield Entry(
+                recording_id=make_id(path.relative_to(root).with_suffix("").parts),
+                read=partial(self._read, path),
+                source=path,
+                options={"--min-confidence": str(self.min_confidence)},
+            )
+
+    def _read(self, path: Path, folder: Path) -> Recording:
+        video = path.with_suffix(".mp4")
+        info = probe_long_video(video)
+        with open_hdf5(path) as file:
+            poses = file.array("transforms/camera", (None, 4, 4))
+            intrinsics = file.array("camera/intrinsic", (3, 3))
+            frames = len(poses)
+            if frames != info.frames:
+                raise InputError(
+                    f"{quote_path(path)} has {frames} camera poses, and {video.name} "
+                    f"{info.frames} frames: each frame must have one. Get both files again."
+                )
+            joints = np.stack([self._hand(file, side, frames) for side in SIDES], axis=1)
+            caption, names = _texts(file)
+        cameras = Cameras(
+            world_from_camera=poses,
+            intrinsics_px=_fit_intrinsics(intrinsics, info.height, info.width),
+            height=info.height,
+            width=info.width,
+        )
+        joints, counts = clean_joints(joints, cameras)
+        return Recording(
+            recording_id=make_id([path.stem]),
+            video=video,
+            frames=frames,
+            fps=info.fps,
+            height=info.height,
+            width=info.width,
+            world_from_camera=cameras.world_from_camera,
+            intrinsics_px=cameras.intrinsics_px,
+            metric=True,
+            joints_m=joints,
+            caption=caption or None,
+            names=names,
+            provenance=counts,
+        )
+
+    def _hand(self, file: Hdf5, side: str, frames: int) -> Float[np.ndarray, "f 21 3"]:
+        names = [side + name for name in JOINT_NAMES]
+        poses = [file.array(f"transforms/{name}", (frames, 4, 4)) for name in names]
+        joints = np.stack(poses, axis=1)[:, :, :3, 3]
+        if file.has("confidences"):
+            certain = [file.array(f"confidences/{name}", (frames,)) for name in names]
+            joints[np.median(certain, axis=0) < self.min_confidence] = np.nan
+        return joints
+
+
+def _fit_intrinsics(
+    intrinsics: Float[np.ndarray, "3 3"], height: int, width: int
+) -> Float[np.ndarray, "3 3"]:
+    """Return intrinsics of pixel centers at integers, for a video that may have been resized.
+
+    The principal point is the center of the picture, from which its size follows.
+    """
+    columns, rows = 2 * intrinsics[0, 2], 2 * intrinsics[1, 2]
+    if not (columns > 0 and rows > 0 and abs(columns * height - rows * width) < 2 * columns):
+        raise InputError(
+            f"camera/intrinsic is for a picture of {columns:g}x{rows:g}, the video has "
+            f"{width}x{height}: it must have the same aspect. Use the video that belongs to it."
+        )
+    fitted = intrinsics.copy()
+    fitted[:2] *= width / columns
+    fitted[:2, 2] -= 0.5
+    return fitted
+
+
+def _texts(file: Hdf5) -> tuple[str, tuple[str, ...]]:
+    """Return the caption and the names of objects.
+
+    Of a task that can be reversed, `which_llm_description` names the one that was done.
+    """
+    second = file.text("llm_type") == "reversible" and file.text("which_llm_description") == "2"
+    return file.text("llm_description2" if second else "llm_description"), file.texts("llm_objects")

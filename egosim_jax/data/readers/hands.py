@@ -1,0 +1,38 @@
+"""Joints of hands as datasets give them, made fit for a recording."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.types import HAND_SIZE_M, Cameras, InputError, near_view
+
+
+def clean_joints(
+    joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras
+) -> tuple[Float[np.ndarray, "f n j 3"], dict[str, str]]:
+    """Return joints with NaN for hands that are implausible or never near the view, and the counts.
+
+    Raises `InputError` if hands are given and none ever comes near the view: then joints and
+    cameras are not in one world.
+    """
+    joints = np.array(joints_m, float)
+    finite = np.isfinite(joints).all(axis=(2, 3))
+    joints[~finite] = np.nan
+    extent = np.linalg.norm(np.ptp(joints, axis=2), axis=-1)
+    low, high = HAND_SIZE_M
+    odd = finite & ~((extent >= low) & (extent <= high))
+    joints[odd] = np.nan
+    seen = near_view(cameras, joints).any(axis=0)
+    given = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
+    if given.any() and not seen.any():
+        raise InputError(
+            "No joint of its hands comes near the view of the camera in any frame: joints and "
+            "camera poses must be in one world, in meters. The recording is of no use for hands."
+        )
+    joints[:, ~seen] = np.nan
+    counts = {
+        "hands_implausible": int(odd.sum()),
+        "hands_never_in_view": int((given & ~seen).sum()),
+    }
+    return joints, {name: str(count) for name, count in counts.items() if count}

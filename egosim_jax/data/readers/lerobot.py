@@ -1,0 +1,273 @@
+"""LeRobot datasets, versions 2.0, 2.1 and 3.0: one camera's video of each episode, and its task.
+
+    v2   meta/info.json, meta/episodes.jsonl, one video per episode and camera
+    v3   meta/info.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet, and videos that
+         hold several episodes each: one is from `from_timestamp` to `to_timestamp` in seconds
+
+Paths come from the templates in info.json, in which only the fields of the format are filled.
+Cameras, hands and their units are not part of the format (a robot's state has no common meaning),
+so they stay unknown. Videos may be of any codec that FFmpeg reads, as AV1. Followed: huggingface's
+`lerobot` of 2026, `dataset_metadata.py` and `io_utils.py`; tasks.parquet is a pandas file whose
+index is the text, or has a column `task`.
+"""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import tyro
+
+from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
+from egosim_jax.data.readers.parquet import read_columns
+from egosim_jax.data.recording import MAX_FRAMES, Recording
+from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text, read_json, read_lines
+from egosim_jax.io.video import VideoInfo
+from egosim_jax.types import InputError
+
+EGOCENTRIC = ("ego", "head", "top")
+"""Parts of camera names that are preferred if there are several cameras."""
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+MAX_EPISODES = 1_000_000
+"""Largest number of episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Episode:
+    index: int
+    video: Path
+    start_s: float
+    length: int
+    tasks: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeRobot:
+    """LeRobot dataset, v2.0 to v3.0: video and task of each episode."""
+
+    dataset: ClassVar[str] = "lerobot"
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset, with meta/info.json."""
+    camera: str | None = None
+    """Key of the camera, such as observation.images.head; by default the only or egocentric one."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the episodes."""
+        info = read_json(self.source / "meta" / "info.json")
+        if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
+            raise InputError(f"{self.source}/meta/info.json is not that of a LeRobot dataset.")
+        version = info.get("codebase_version")
+        if version not in VERSIONS:
+            raise InputError(
+                f"{self.source} is of LeRobot version {quote(version)}; {', '.join(VERSIONS)} are "
+                "read. Convert it with LeRobot's own script."
+            )
+        camera = _choose_camera(info["features"], self.camera)
+        fps = info.get("fps")
+        if not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
+            raise InputError(f"{self.source}/meta/info.json: fps is {quote(fps)}, not a rate.")
+        episodes = _episodes_v3 if version == "v3.0" else _episodes_v2
+        probe = _Probe()
+        for episode in episodes(self.source, info, camera):
+            if isinstance(episode, str):
+                index, _, problem = episode.partition(": ")
+                read = partial(_fail, problem)
+                yield Entry(
+                    recording_id=make_id([f"episode_{index}"]), read=read, source=self.source
+                )
+                continue
+            yield Entry(
+                recording_id=f"episode_{episode.index:06d}",
+                read=partial(self._read, episode, Fraction(fps).limit_denominator(1001), probe),
+                source=episode.video,
+                options={"camera": camera},
+            )
+
+    def _read(self, episode: _Episode, fps: Fraction, probe: _Probe, folder: Path) -> Recording:
+        info = probe(episode.video)
+        start = round(episode.start_s * fps)
+        if start + episode.length > info.frames:
+            raise InputError(
+                f"Episode {episode.index} has frames {start} to {start + episode.length - 1} of "
+                f"{quote_path(episode.video)}, which has {info.frames}: the video is not the one "
+                "that the metadata describe. Download both again."
+            )
+        return Recording(
+            recording_id=f"episode_{episode.index:06d}",
+            video=episode.video,
+            start=start,
+            frames=episode.length,
+            fps=fps,
+            height=info.height,
+            width=info.width,
+            caption="; ".join(episode.tasks) or None,
+        )
+
+
+class _Probe:
+    """Probing of videos, of which the last is remembered: several episodes share one."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._info: VideoInfo | None = None
+
+    def __call__(self, path: Path) -> VideoInfo:
+        if self._info is None or path != self._path:
+            self._path, self._info = path, probe_long_video(path)
+        return self._info
+
+
+def _fail(problem: str, folder: Path) -> Recording:
+    raise InputError(problem)
+
+
+def _choose_camera(features: Mapping[str, Any], wanted: str | None) -> str:
+    """Return the key of the camera to read. Raises `InputError` if it is not clear."""
+    dtypes = {k: f.get("dtype") for k, f in features.items() if isinstance(f, dict)}
+    videos = [
+        key for key, dtype in dtypes.items() if dtype == "video" and not _is_depth(features[key])
+    ]
+    if wanted is not None:
+        videos = [key for key in videos if key == wanted or key.rpartition(".")[2] == wanted]
+    preferred = [key for key in videos if any(part in key.lower() for part in EGOCENTRIC)]
+    chosen = videos if len(videos) == 1 else preferred
+    if len(chosen) == 1:
+        return chosen[0]
+    if not videos and wanted is None and "image" in dtypes.values():
+        raise InputError(
+            "The dataset stores pictures in its tables, not videos, which is not read. Convert it "
+            "with LeRobot's own script."
+        )
+    keys = listing([quote_text(key) for key, dtype in dtypes.items() if dtype == "video"], most=20)
+    raise InputError(
+        f"The camera to read is not clear: the dataset has the videos {keys or '(none)'}. Choose "
+        "one. (--camera)"
+    )
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    infos = [feature.get("info"), feature.get("video_info")]
+    names = ("is_depth_map", "video.is_depth_map")
+    return any(bool(info.get(n)) for info in infos if isinstance(info, dict) for n in names)
+
+
+def _episodes_v2(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_Episode | str]:
+    chunk = info.get("chunks_size", 1000)
+    if type(chunk) is not int or chunk < 1:
+        raise InputError(f"meta/info.json: chunks_size is {quote(chunk)}, not a positive number.")
+    for line, row in read_lines(root / "meta" / "episodes.jsonl", last="read"):
+        if not isinstance(row, dict):
+            raise InputError(f"meta/episodes.jsonl, line {line} is not a JSON object.")
+        index = row.get("episode_index")
+        try:
+            number = _count(index, "episode_index")
+            fields = {"episode_chunk": number // chunk, "episode_index": number}
+            yield _Episode(
+                index=number,
+                video=_video_path(root, info, camera, fields),
+                start_s=0.0,
+                length=_count(row.get("length"), "length", least=1),
+                tasks=_texts(row.get("tasks")),
+            )
+        except InputError as error:
+            yield f"{line}: {error}"
+
+
+def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_Episode | str]:
+    require("pyarrow")
+    paths = sorted((root / "meta" / "episodes").glob("*/*.parquet"), key=natural_order)
+    if not paths:
+        raise InputError(f"{root} has no meta/episodes/chunk-*/file-*.parquet.")
+    place = {n: f"videos/{camera}/{n}" for n in ("chunk_index", "file_index", "from_timestamp")}
+    for path in paths:
+        table = read_columns(
+            path,
+            ["episode_index", "length", *place.values()],
+            optional=["tasks", "data/chunk_index", "data/file_index"],
+        )
+        for number in range(len(table["episode_index"])):
+            row = {name: values[number] for name, values in table.items()}
+            try:
+                index = _count(row["episode_index"], "episode_index")
+                fields = {n: _count(row[place[n]], n) for n in ("chunk_index", "file_index")}
+                start = row[place["from_timestamp"]]
+                if not isinstance(start, float) or not 0 <= start < 1e6:
+                    raise InputError(f"from_timestamp is {quote(start)}, not a time in seconds.")
+                yield _Episode(
+                    index=index,
+                    video=_video_path(root, info, camera, fields),
+                    start_s=start,
+                    length=_count(row["length"], "length", least=1),
+                    tasks=_texts(row["tasks"]) if "tasks" in row else _tasks(root, info, row),
+                )
+            except InputError as error:
+                yield f"{row['episode_index']!s:.20}: {error}"
+
+
+def _tasks(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the tasks of an episode whose row does not name them, from the rows of its frames."""
+    fields = {n: _count(row.get(f"data/{n}"), n) for n in ("chunk_index", "file_index")}
+    path = _fill(root, info.get("data_path"), fields, what="data_path")
+    frames = read_columns(path, ["episode_index", "task_index"])
+    pairs = zip(frames["episode_index"], frames["task_index"], strict=True)
+    used = dict.fromkeys(task for episode, task in pairs if episode == row["episode_index"])
+    texts = read_tasks(root)
+    return tuple(texts[task] for task in used if task in texts)
+
+
+def read_tasks(root: Path) -> dict[int, str]:
+    """Return the texts of tasks by index, from either form of meta/tasks.parquet."""
+    names = ("task", "__index_level_0__")
+    table = read_columns(root / "meta" / "tasks.parquet", ["task_index"], optional=names)
+    texts = next((table[name] for name in names if name in table), None)
+    if texts is None:
+        raise InputError("meta/tasks.parquet has neither an index of texts nor a column task.")
+    pairs = zip(table["task_index"], texts, strict=True)
+    return {index: text for index, text in pairs if isinstance(text, str)}
+
+
+def _video_path(
+    root: Path, info: Mapping[str, Any], camera: str, fields: Mapping[str, int]
+) -> Path:
+    return _fill(root, info.get("video_path"), {**fields, "video_key": camera}, what="video_path")
+
+
+def _fill(root: Path, template: object, fields: Mapping[str, int | str], *, what: str) -> Path:
+    """Fill a path template of info.json, in which nothing but plain fields is allowed."""
+    parts = []
+    try:
+        for text, name, form, conversion in string.Formatter().parse(str(template)):
+            parts.append(text)
+            if name is None:
+                continue
+            width = (form or "").removesuffix("d")
+            if (
+                name not in fields
+                or conversion
+                or (width and not width.isdecimal())
+                or len(width) > 2
+            ):
+                raise ValueError(f"field {quote(name)}")
+            parts.append(format(fields[name], form) if form else str(fields[name]))
+    except ValueError as error:
+        raise InputError(
+            f"meta/info.json: {what} is {quote(template)}, of which {quote_text(str(error))} "
+            f"cannot be filled; fields are {', '.join(fields)}."
+        ) from error
+    return inside(root, "".join(parts), what=f"meta/info.json: {what}")
+
+
+def _count(value: Any, name: str, *, least: int = 0) -> int:
+    if type(value) is not int or not least <= value < max(MAX_EPISODES, MAX_FRAMES):
+        raise InputError(f"{name} is {quote(value)}, not a whole number of at least {least}.")
+    return value
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    return tuple(text for text in value if isinstance(text, str)) if isinstance(value, list) else ()
