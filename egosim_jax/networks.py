@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from flax import nnx
 from jax.sharding import Mesh
@@ -44,6 +44,8 @@ NAMES: tuple[Name, ...] = ("dit", "vae", "text", "image")
 class ModelConfig:
     """Config of a model: its networks, its conditioning and its sampling."""
 
+    numerics_only: ClassVar[tuple[str, ...]] = ("steps",)
+    """Fields that may change when a training is resumed: it draws no samples with them."""
     name: str
     """Name of the model on the command line."""
     video: VideoSpec

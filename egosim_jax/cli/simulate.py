@@ -47,6 +47,8 @@ class Simulate:
     """Number of clips; all of the episode, or 3 of the tabletop world, if not given."""
     seed: int = 0
     """Seed of the noise, and of scene and actions in the tabletop world."""
+    steps: int | None = None
+    """Denoising steps, instead of the model's."""
     perception: str = "classical"
     """Perception pipeline by name, with its options: classical, oracle, or a registered one."""
     update: Literal["full", "none"] = "full"
@@ -77,10 +79,11 @@ class Simulate:
         from egosim_jax.rollout import OUTPUTS, Rollout
         from egosim_jax.simulator import Simulator
 
-        check_counts({"--clips": self.clips})
+        check_counts({"--clips": self.clips, "--steps": self.steps})
         check_seed(self.seed)
         share_with_jax()
         config = configs.get(self.config)
+        config = replace(config, steps=self.steps or config.steps)
         weights = configs.weights_of(self.config, self.weights)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
         episode = self._episode(config.video)

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, no_type_check
 
-import ftfy
 import numpy as np
 from jaxtyping import Bool, Int32
 
@@ -96,6 +95,8 @@ class PromptTokenizer:
 
 def clean_prompt(text: str) -> str:
     """Repair broken encodings, resolve HTML entities twice, make every white space one blank."""
+    import ftfy
+
     text = html.unescape(html.unescape(ftfy.fix_text(text)))
     return re.sub(r"\s+", " ", text).strip()
 

@@ -31,5 +31,5 @@ CONFIG = ModelConfig(
     tokenizer=PromptTokenizer(kind="byt5", max_tokens=96),
     encoders="joint",
     process=RectifiedFlow(shift=3.0),
-    steps=10,
+    steps=4,
 )

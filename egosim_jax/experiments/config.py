@@ -17,6 +17,8 @@ class ModelExperiment:
     """Name of the model."""
     weights: Path | None = None
     """Folder of weights, by default those that ship with the package."""
+    steps: int | None = None
+    """Denoising steps, instead of the model's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +125,8 @@ class Embodiment:
     """Rank of the LoRA."""
     dropout: float = 0.15
     """Probability with which each condition is dropped in training."""
+    steps: int = 10
+    """Denoising steps of the generated clips."""
     batch_size: int = 8
     """Clips encoded, and generated, together."""
 

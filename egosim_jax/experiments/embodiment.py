@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -74,6 +75,7 @@ def run(settings: Embodiment) -> None:
             "--held-out": settings.held_out,
             "--rank": settings.rank,
             "--batch-size": settings.batch_size,
+            "--steps": settings.steps,
         }
     )
     for stage in (settings.human, settings.full, settings.lora, settings.scratch):
@@ -126,7 +128,8 @@ class _Experiment:
     def __init__(self, settings: Embodiment):
         self.settings, self.out = settings, settings.out
         self.origin = configs.weights_of(settings.config, settings.weights)
-        self.model: ModelConfig = configs.get(settings.config).at(self.origin)
+        model: ModelConfig = configs.get(settings.config).at(self.origin)
+        self.model = replace(model, steps=settings.steps)
         first = settings.first_scene + settings.human_scenes
         self.human = range(settings.first_scene, first)
         self.robot = range(first, first + settings.robot_scenes)

@@ -17,6 +17,7 @@ from egosim_jax.cli import doctor
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
 from egosim_jax.io.video import probe_video
+from egosim_jax.metrics import lpips
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
@@ -215,12 +216,14 @@ def test_without_metadata_a_scene_is_drawn_by_seed(tmp_path):
 
 
 def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
-    weights, tmp_path, capsys
+    weights, tmp_path, capsys, monkeypatch
 ):
+    monkeypatch.setattr(lpips, "alex_if_installed", lambda: None)  # slow in the tests' code
     out = tmp_path / "out"
-    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
+    fixed = ["--steps", "2", "--config", "debug", "--weights", str(weights), "--out", str(out)]
     counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2"]
     assert main(["experiment", "tabletop", *fixed, *counts]) == 0
+    assert json.loads((out / "config.json").read_text("utf-8"))["model"]["steps"] == 2
     tables = json.loads((out / "report.json").read_text("utf-8"))["tables"]
     assert tables.keys() == {"human", "robot"}
     human = tables["human"]

@@ -70,8 +70,9 @@ def test_the_same_command_again_makes_nothing_new(simulated, weights):
 
 
 def test_a_folder_of_another_run_is_refused(simulated, weights, capsys):
-    assert simulate(weights, simulated, "--seed", "7") == 2
-    assert "seed" in capsys.readouterr().err
+    for option, named in (("--seed", "seed"), ("--steps", "model.steps")):
+        assert simulate(weights, simulated, option, "7") == 2
+        assert named in capsys.readouterr().err
 
 
 def test_without_update_the_state_stays(weights, tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.renamed import upgrade
 from egosim_jax.io.run import open_folder
-from egosim_jax.train.config import resume_mutable
+from egosim_jax.train.config import numerics_only, resume_mutable
 from egosim_jax.train.loop import train
 from egosim_jax.train.recipes import DEBUG
 from egosim_jax.types import InputError
@@ -94,6 +94,13 @@ def test_the_configs_of_an_old_run_are_those_of_today(tmp_path):
         folder.mkdir()
         (folder / "config.json").write_text(json.dumps(OLD_RUN[name]))
         open_folder(folder, {"task": task, "training": config, "weights": None})
+
+
+def test_a_training_resumes_though_its_model_samples_in_other_steps(tmp_path):
+    task = DEBUG.stages()["denoiser"].task
+    open_folder(tmp_path, {"task": task})
+    fewer = replace(task, model=replace(task.model, steps=2))
+    open_folder(tmp_path, {"task": fewer}, mutable=list(numerics_only(task, "task")))
 
 
 def test_a_difference_from_an_old_run_is_named_as_today(tmp_path):
