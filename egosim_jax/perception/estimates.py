@@ -65,6 +65,16 @@ class Verdict:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Radial distortion of recorded frames: x (1 + `radial` r²), as COLMAP's SIMPLE_RADIAL."""
+
+    focal_px: float
+    """Focal length of the recorded frames in pixels; the principal point is their center."""
+    radial: float
+    """Coefficient of r², the squared distance from the axis at depth 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CameraEstimate:
     """Cameras of a video, or the reason why there are none."""
 
@@ -75,6 +85,11 @@ class CameraEstimate:
     verdict: Verdict
     points: SparsePoints | None = None
     """Triangulated points, if the method has any."""
+    lens: Lens | None = None
+    """Lens of the recorded frames, if it distorts them.
+
+    `cameras` and `points` are then those of undistorted frames (`cameras.lens.undistort`).
+    """
 
 
 @no_type_check

@@ -1,0 +1,140 @@
+"""Sparse optical flow of the background: pyramidal Lucas-Kanade, checked forward and backward."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+WORKING_PX = 960
+"""Longest side of the pictures that are tracked; larger ones are reduced."""
+MIN_CORNERS = 20
+"""Fewest background corners of a picture with enough texture."""
+MAX_RETURN_PX = 0.7
+"""Largest distance from a corner to where its track returns when followed backward."""
+_CORNERS, _QUALITY, _APART_PX = 600, 0.003, 8
+_WINDOW, _LEVELS = (21, 21), 4
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Background:
+    """Gray frames of a video at working size, and the pixels of them that do not move."""
+
+    gray: Sequence[UInt8[np.ndarray, "h w"]]
+    """Gray frames with equalized contrast."""
+    still: Sequence[UInt8[np.ndarray, "h w"]]
+    """Masks: 255 where the background may be seen, 0 at hands, arms and their surroundings."""
+    reduction: float
+    """Input pixels per working pixel."""
+
+    def corners(self, frame: int) -> Float32[np.ndarray, "n 2"]:
+        """Return corners of the background of a frame; few if it is black, blurred or blank."""
+        import cv2
+
+        found = cv2.goodFeaturesToTrack(
+            self.gray[frame], _CORNERS, _QUALITY, _APART_PX, mask=self.still[frame]
+        )
+        if found is None or float(self.gray[frame].std()) < 2:
+            return np.zeros((0, 2), np.float32)
+        return found.reshape(-1, 2)
+
+    def follow(
+        self,
+        first: int,
+        second: int,
+        points: Float32[np.ndarray, "n 2"],
+        guess: Float[np.ndarray, "n 2"] | None = None,
+    ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+        """Return where points of one frame are in another, and which were found there."""
+        import cv2
+
+        if not len(points):
+            return points, np.zeros(0, bool)
+        options = {"winSize": _WINDOW, "maxLevel": _LEVELS}
+        flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+        start = None if guess is None else guess.astype(np.float32)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(
+            self.gray[first], self.gray[second], points, start, flags=flags, **options
+        )
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+            self.gray[second], self.gray[first], there, points.copy(),
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options,
+        )  # fmt: skip
+        good = (found[:, 0] > 0) & (returned[:, 0] > 0)
+        good &= np.linalg.norm(back - points, axis=1) < MAX_RETURN_PX
+        height, width = self.gray[second].shape
+        column, row = np.rint(np.nan_to_num(there)).astype(int).T
+        good &= (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        good[good] = self.still[second][row[good], column[good]] > 0
+        return there, good
+
+
+def background(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    moving: Bool[np.ndarray, "f h w"],
+    *,
+    margin: float = 0.015,
+) -> Background:
+    """Return the background of a video: all but what moves and a margin, in image widths."""
+    import cv2
+
+    height, width = frames.shape[1:3]
+    reduction = max(1.0, max(height, width) / WORKING_PX)
+    size = round(width / reduction), round(height / reduction)
+    equalize = cv2.createCLAHE(clipLimit=2.0, tileGridSize=(8, 8))
+    wide = 2 * max(1, round(margin * max(size))) + 1
+    kernel = np.ones((wide, wide), np.uint8)
+    gray, still = [], []
+    for frame, mask in zip(frames, moving, strict=True):
+        picture = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        mask = mask.astype(np.uint8)
+        if reduction > 1:
+            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+        gray.append(equalize.apply(picture) if picture.std() >= 2 else picture)
+        still.append(255 * (1 - cv2.dilate(mask, kernel)))
+    return Background(gray=gray, still=still, reduction=max(frames.shape[1:3]) / max(size))
+
+
+@dataclass(frozen=True)
+class Breaks:
+    """Frames of a video that are not connected to those before them."""
+
+    blank: tuple[int, ...]
+    """Frames without texture: black, blurred or covered."""
+    cuts: tuple[int, ...]
+    """Frames that share no background with the frames before them."""
+    survival: tuple[float, ...]
+    """Share of the corners of each frame, but the last, that are found in the next."""
+
+
+def find_breaks(video: Background, *, min_survival: float = 0.1, bridge: int = 5) -> Breaks:
+    """Find blank frames and cuts; at most `bridge` bad frames between connected ones are no cut."""
+    count = len(video.gray)
+    corners = [video.corners(frame) for frame in range(count)]
+    blank = [frame for frame in range(count) if len(corners[frame]) < MIN_CORNERS]
+
+    def survival(first: int, second: int) -> float:
+        if len(corners[first]) < MIN_CORNERS or len(corners[second]) < MIN_CORNERS:
+            return 0.0
+        return float(np.mean(video.follow(first, second, corners[first])[1]))
+
+    shares = [survival(frame, frame + 1) for frame in range(count - 1)]
+    cuts: list[int] = []
+    reached = 0
+    for frame in range(1, count):
+        if shares[frame - 1] >= min_survival and reached == frame - 1:
+            reached = frame
+            continue
+        if survival(reached, frame) >= min_survival:
+            reached = frame
+        elif frame - reached > bridge and frame not in blank:
+            cuts.append(frame if reached + 1 in blank else reached + 1)
+            reached = frame
+    if after := [frame for frame in range(reached + 1, count) if frame not in blank]:
+        cuts.append(after[0])
+    return Breaks(tuple(blank), tuple(cuts), tuple(shares))

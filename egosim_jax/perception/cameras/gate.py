@@ -1,0 +1,186 @@
+"""Gate of reconstructions: figures that separate true camera paths from degenerate ones.
+
+Registered frames and the reprojection error alone do not: a camera that barely moves can be
+reconstructed in all frames, at an error of a pixel, with depths that spread over many orders of
+magnitude. So the gate also asks for depths, angles, steps and a lens as a head-mounted or
+hand-held camera has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from egosim_jax.types import InputError
+
+UNBOUNDED = 1e12
+"""Figure for ratios that are larger, or infinite."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """Cameras and points of structure from motion, with pixel centers at integer coordinates."""
+
+    frames: Int32[np.ndarray, " r"]
+    """Registered frames, ascending."""
+    camera_from_world: Float[np.ndarray, "r 3 4"]
+    """Pose of each registered frame, in an unknown unit."""
+    focal_px: float
+    radial: float
+    """Radial coefficient of the lens, as in `estimates.Lens`."""
+    points: Float[np.ndarray, "p 3"]
+    """Triangulated points, in the same unit."""
+    error_px: Float[np.ndarray, " p"]
+    """Mean reprojection error of each point."""
+    observed_in: Int32[np.ndarray, " o"]
+    """Registered frame of each observation, as an index of `frames`."""
+    observed: Int32[np.ndarray, " o"]
+    """Point of each observation."""
+    pixels_px: Float[np.ndarray, "o 2"]
+    """Recorded column and row of each observation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateConfig:
+    """Thresholds that the rungs of the ladder must meet."""
+
+    max_shift_px: float = 1.0
+    """Largest median shift of the background in a still frame, in pixels at working size."""
+    min_still: float = 0.9
+    """Least share of still frames of a static camera."""
+    max_residual_px: float = 1.5
+    """Largest median residual of a camera that only turns, in pixels at working size."""
+
+    max_depth_spread: float = 20.0
+    """Largest ratio of the 95th to the 5th percentile of depth."""
+    max_radial: float = 0.1
+    """Largest absolute radial coefficient."""
+    min_angle_deg: float = 1.0
+    """Least median triangulation angle, in degrees."""
+    max_step: float = 20.0
+    """Longest step between frames, in median steps."""
+    min_view_deg: float = 50.0
+    """Narrowest self-calibrated view along the longer side, in degrees."""
+    max_view_deg: float = 115.0
+    """Widest self-calibrated view along the longer side, in degrees."""
+    min_registered: float = 0.9
+    """Least share of the frames that are registered."""
+    max_gap: int = 5
+    """Most missing frames in a row between registered ones; they are interpolated."""
+    min_shared: int = 15
+    """Fewest points that two neighboring registered frames share."""
+
+    def __post_init__(self) -> None:
+        """Check that no threshold refuses or accepts everything."""
+        if not (
+            min(self.max_shift_px, self.max_residual_px) > 0
+            and 0 < self.min_still <= 1
+            and self.max_depth_spread > 1
+            and self.max_radial > 0
+            and 0 < self.min_angle_deg < 180
+            and self.max_step > 1
+            and 0 < self.min_view_deg < self.max_view_deg < 180
+            and 0 < self.min_registered <= 1
+            and self.max_gap >= 0
+            and self.min_shared >= 1
+        ):
+            raise InputError(
+                f"The gate's thresholds contradict each other: {self}. Ratios must be above 1, "
+                "angles within 0 and 180 degrees, shares within 0 and 1."
+            )
+
+
+def measure(found: Reconstruction, *, frames: int, height: int, width: int) -> dict[str, float]:
+    """Return the figures that the gate compares, of a reconstruction of a video of `frames`."""
+    registered = len(found.frames)
+    figures = {
+        "registered": registered / frames,
+        "points": float(len(found.points)),
+        "focal_px": found.focal_px,
+        "radial": found.radial,
+        "view_deg": float(np.degrees(2 * np.arctan2(max(height, width) / 2, found.focal_px))),
+        "gap": float(_longest_gap(found.frames, frames)),
+    }
+    if registered < 2 or not len(found.points):
+        return figures
+    rotation, offset = found.camera_from_world[:, :, :3], found.camera_from_world[:, :, 3]
+    centers = -np.einsum("fji,fj->fi", rotation, offset)
+    points, viewers = found.points[found.observed], found.observed_in
+    depth = np.einsum("oj,oj->o", rotation[viewers, 2], points) + offset[viewers, 2]
+    near, far = np.percentile(depth, [5, 95])
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) / np.diff(found.frames)
+    figures |= {
+        "error_px": float(np.mean(found.error_px)),
+        "depth_spread": float(min(far / near, UNBOUNDED)) if near > 0 else UNBOUNDED,
+        "angle_deg": float(np.median(_angles_deg(found, centers))),
+        "step": float(min(steps.max() / max(np.median(steps), 1e-12), UNBOUNDED)),
+        "shared": float(_least_shared(found)),
+    }
+    return figures
+
+
+def refusals(
+    figures: Mapping[str, float], config: GateConfig, *, calibrated: bool = False
+) -> tuple[str, ...]:
+    """Return why figures of `measure` do not pass the gate; nothing if they do.
+
+    The field of view of a camera that was `calibrated` by other means is not judged.
+    """
+    if "angle_deg" not in figures:
+        return (f"only {figures['registered']:.0%} of the frames were registered",)
+    rules = [
+        (figures["registered"] >= config.min_registered,
+         f"{figures['registered']:.0%} of the frames were registered, below "
+         f"{config.min_registered:.0%}"),
+        (figures["gap"] <= config.max_gap,
+         f"{figures['gap']:.0f} frames in a row, or at an end, were not registered"),
+        (figures["depth_spread"] < config.max_depth_spread,
+         f"depth spreads by a factor of {figures['depth_spread']:.3g}, above "
+         f"{config.max_depth_spread:g}"),
+        (abs(figures["radial"]) < config.max_radial,
+         f"radial distortion is {figures['radial']:.2f}, above {config.max_radial:g}"),
+        (figures["angle_deg"] > config.min_angle_deg,
+         f"the median triangulation angle is {figures['angle_deg']:.2f} degrees, below "
+         f"{config.min_angle_deg:g}"),
+        (figures["step"] < config.max_step,
+         f"the longest step is {figures['step']:.3g} median steps, above {config.max_step:g}"),
+        (calibrated or config.min_view_deg <= figures["view_deg"] <= config.max_view_deg,
+         f"the view is {figures['view_deg']:.0f} degrees wide, not {config.min_view_deg:g} to "
+         f"{config.max_view_deg:g}"),
+        (figures["shared"] >= config.min_shared,
+         f"two neighboring frames share {figures['shared']:.0f} points, fewer than "
+         f"{config.min_shared}"),
+    ]  # fmt: skip
+    return tuple(reason for passed, reason in rules if not passed)
+
+
+def _longest_gap(registered: Int32[np.ndarray, " r"], frames: int) -> int:
+    """Return the most missing frames in a row; `frames` if the first or last one is missing."""
+    if not len(registered) or registered[0] != 0 or registered[-1] != frames - 1:
+        return frames
+    return int(np.diff(registered).max(initial=1)) - 1
+
+
+def _angles_deg(
+    found: Reconstruction, centers: Float[np.ndarray, "r 3"]
+) -> Float[np.ndarray, " p"]:
+    """Return the largest angle between two rays to each point, in degrees."""
+    rays = centers[found.observed_in] - found.points[found.observed]
+    rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
+    order = np.argsort(found.observed, kind="stable")
+    ends = np.cumsum(np.bincount(found.observed, minlength=len(found.points)))
+    groups = np.split(rays[order], ends[:-1])
+    least = [float((group @ group.T).min()) if len(group) else 1.0 for group in groups]
+    return np.degrees(np.arccos(np.clip(least, -1, 1)))
+
+
+def _least_shared(found: Reconstruction) -> int:
+    """Return the fewest points that two neighboring registered frames both observe."""
+    seen = np.zeros((len(found.frames), len(found.points)), bool)
+    seen[found.observed_in, found.observed] = True
+    return int((seen[1:] & seen[:-1]).sum(axis=1).min())

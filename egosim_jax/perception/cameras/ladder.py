@@ -1,0 +1,319 @@
+"""Cameras of a recorded video by the first method of a ladder whose result can be trusted.
+
+    given        cameras of the data set, or from elsewhere
+    static       the background does not move
+    incremental  structure from motion, self-calibrated
+    focal        the same with the focal length of the device
+    global       global structure from motion
+    rotation     the camera turns without moving: there is no depth from parallax then
+    refused      none of them, with the reasons
+
+What structure from motion finds must pass the gate (`gate.py`), whichever rung was asked for. The
+first frame's camera is the frame of the world; the unit is unknown, and the median depth in the
+first frame is 1 where there are points. Given cameras stay as they are.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from egosim_jax.perception.cameras.colmap import ColmapConfig, ColmapError, Scene, open_scene
+from egosim_jax.perception.cameras.flow import Background, Breaks, background, find_breaks
+from egosim_jax.perception.cameras.gate import GateConfig, measure, refusals
+from egosim_jax.perception.cameras.path import complete_path, estimate_from, pinhole
+from egosim_jax.perception.cameras.rotation import follow_corners, solve_rotations
+from egosim_jax.perception.cameras.static import still_share
+from egosim_jax.perception.estimates import CameraEstimate, Rung, Verdict
+from egosim_jax.progress import track
+from egosim_jax.types import Cameras, InputError, check_video
+
+_LADDER: tuple[Rung, ...] = ("static", "incremental", "focal", "global", "rotation")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraLadder:
+    """Estimator of cameras that climbs down from the best known method to refusal."""
+
+    cameras: Cameras | None = None
+    """Known cameras of the video; nothing is estimated then."""
+    metric: bool = True
+    """True if the known cameras are in meters."""
+    focal_px: float | None = None
+    """Known focal length in pixels, which replaces self-calibration and the device's."""
+    rung: Rung | None = None
+    """Only this method is tried, None: all. A static or turning camera is then taken as given."""
+    assumed_view_deg: float = 90.0
+    """Width of the view if nothing gives the focal length of a static or turning camera."""
+    max_pictures: int = 240
+    """Most frames that are matched; of longer videos every second to sixth frame is."""
+    gate: GateConfig = field(default_factory=GateConfig)
+    colmap: ColmapConfig = field(default_factory=ColmapConfig)
+
+    def __post_init__(self) -> None:
+        """Check that the options fit together."""
+        problem = None
+        if self.rung == "refused":
+            problem = "the rung refused cannot be forced. Choose another one"
+        elif (self.rung == "given") != (self.cameras is not None) and self.rung is not None:
+            problem = "the rung given, and no other, goes with known cameras. Give both or neither"
+        elif not 10 <= self.assumed_view_deg <= 150:
+            problem = f"the assumed view must be 10 to 150 degrees, not {self.assumed_view_deg:g}"
+        elif self.max_pictures < 3:
+            problem = f"at least 3 pictures are needed, not {self.max_pictures}"
+        if problem:
+            raise InputError(f"Cameras cannot be estimated so: {problem}. (cameras, rung)")
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        moving: Bool[np.ndarray, "f h w"],
+        *,
+        focal_px: float | None = None,
+    ) -> CameraEstimate:
+        """Return the cameras of a video; `focal_px` is the focal length of its device, if known.
+
+        Raises `InputError` for bad input, and if pycolmap is needed but not installed.
+        """
+        check_video("The video", frames)
+        if moving.shape != frames.shape[:3] or moving.dtype != bool:
+            raise InputError(
+                f"The mask of what moves is {moving.dtype} {moving.shape}: it must be bool "
+                f"{frames.shape[:3]}, as the video."
+            )
+        if self.cameras is not None:
+            return _given(self.cameras, frames, metric=self.metric)
+        if self.rung == "focal" and self.focal_px is None and focal_px is None:
+            raise InputError(
+                "The rung focal needs a focal length, and none is known. Give one. (focal_px)"
+            )
+        for known in (self.focal_px, focal_px):
+            _check_focal(known, frames)
+        with ExitStack() as stack:
+            return _Climb(self, frames, moving, focal_px, stack).run()
+
+
+def _given(cameras: Cameras, frames: np.ndarray, *, metric: bool) -> CameraEstimate:
+    """Return known cameras. Raises `InputError` unless they are those of the video."""
+    have = (len(cameras.world_from_camera), cameras.height, cameras.width)
+    if have != frames.shape[:3]:
+        raise InputError(
+            f"The given cameras have {have[0]} frames of {have[2]} x {have[1]} pixels, and the "
+            f"video {frames.shape[0]} of {frames.shape[2]} x {frames.shape[1]}: they must be the "
+            "same. Cut and scale the cameras as the video."
+        )
+    verdict = Verdict(rung="given", reason="the cameras were given", figures={})
+    return CameraEstimate(cameras=cameras, metric=metric, verdict=verdict)
+
+
+def _check_focal(focal_px: float | None, frames: np.ndarray) -> None:
+    """Raise `InputError` for a focal length that no camera of this video has."""
+    if focal_px is None:
+        return
+    size = max(frames.shape[1:3])
+    if not 0.1 * size <= focal_px <= 20 * size:
+        raise InputError(
+            f"A focal length of {focal_px:g} pixels is implausible for frames of "
+            f"{frames.shape[2]} x {frames.shape[1]}: it must be {0.1 * size:g} to {20 * size:g}. "
+            "Scale it to the size of the video. (focal_px)"
+        )
+
+
+@no_type_check
+@dataclass
+class _Climb:
+    """One video's way down the ladder: figures and reasons are collected on the way."""
+
+    config: CameraLadder
+    frames: UInt8[np.ndarray, "f h w 3"]
+    moving: Bool[np.ndarray, "f h w"]
+    device_focal_px: float | None
+    stack: ExitStack
+    figures: dict[str, float] = field(default_factory=dict)
+    reasons: list[str] = field(default_factory=list)
+
+    def run(self) -> CameraEstimate:
+        """Return the result of the first rung that is accepted."""
+        if problem := self._unusable():
+            self.reasons.append(problem)
+            return self._refused()
+        methods = {
+            "static": self._static,
+            "incremental": lambda: self._reconstruct("incremental"),
+            "focal": lambda: self._reconstruct("focal"),
+            "global": lambda: self._reconstruct("global"),
+            "rotation": self._rotation,
+        }
+        rungs = [rung for rung in _LADDER if self.config.rung in (None, rung)]
+        if self.config.rung is None and self.known_focal_px is not None:
+            if self.config.focal_px is not None:
+                rungs.remove("incremental")
+        elif self.config.rung is None:
+            rungs.remove("focal")
+        for rung in track(rungs, "trying cameras", total=len(rungs)):
+            if (estimate := methods[rung]()) is not None:
+                return estimate
+        return self._refused()
+
+    @property
+    def known_focal_px(self) -> float | None:
+        """Focal length from the user, else from the device."""
+        return self.config.focal_px or self.device_focal_px
+
+    @cached_property
+    def video(self) -> Background:
+        """Gray frames and masks at working size."""
+        return background(self.frames, self.moving)
+
+    @cached_property
+    def breaks(self) -> Breaks:
+        """Blank frames and cuts."""
+        return find_breaks(self.video, bridge=self.config.gate.max_gap)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Pictures with matched features; raises `ColmapError`."""
+        size = {"height": self.frames.shape[1], "width": self.frames.shape[2]}
+        scene = self.stack.enter_context(
+            open_scene(self.video, self._pictures(), config=self.config.colmap, **size)
+        )
+        scene.match()
+        return scene
+
+    def _pictures(self) -> tuple[int, ...]:
+        """Return the frames that are matched, with the first and the last one."""
+        last = len(self.frames) - 1
+        number = min(last + 1, self.config.max_pictures)
+        return tuple(int(i) for i in np.rint(np.linspace(0, last, number)))
+
+    def _unusable(self) -> str | None:
+        """Return why nothing can be estimated, or None."""
+        count = len(self.frames)
+        blank, cuts = self.breaks.blank, self.breaks.cuts
+        self.figures |= {"blank_frames": float(len(blank)), "cuts": float(len(cuts))}
+        if self.breaks.survival:
+            self.figures["tracked"] = float(np.median(self.breaks.survival))
+        if cuts:
+            shown = ", ".join(map(str, cuts[:5]))
+            return (
+                f"a cut: frame {shown} shares no background with the frames before it. Cut the "
+                "video there"
+            )
+        if len(blank) > (1 - self.config.gate.min_registered) * count or 0 in blank:
+            return (
+                f"{len(blank)} of {count} frames, from frame {blank[0]} on, have too little "
+                "texture outside of the hands: they are dark, blurred, blank or covered"
+            )
+        return None
+
+    def _static(self) -> CameraEstimate | None:
+        gate = self.config.gate
+        forced = self.config.rung == "static"
+        share, shift = still_share(
+            self.video, max_shift_px=gate.max_shift_px, stop_below=0 if forced else gate.min_still
+        )
+        self.figures |= {"static_still": share, "static_shift_px": min(shift, 1e12)}
+        reason = f"the background is where frame 0 has it in {share:.0%} of the frames"
+        if forced or share >= gate.min_still:
+            poses = np.tile(np.eye(4), (len(self.frames), 1, 1))
+            return self._pinhole("static", poses, self._focal("static"), reason)
+        return self._fail("static", "the background moves")
+
+    def _reconstruct(self, rung: Rung) -> CameraEstimate | None:
+        """Return the reconstruction of a rung if it passes the gate."""
+        if len(self.frames) < 3:
+            return self._fail(rung, "it needs at least 3 frames")
+        if len(self.frames) > (self.config.gate.max_gap + 1) * self.config.max_pictures:
+            return self._fail(
+                rung,
+                f"{len(self.frames)} frames are too many to reconstruct: cut the video into clips "
+                "first",
+            )
+        focal = None if rung == "incremental" else self.known_focal_px
+        try:
+            mapper = "global" if rung == "global" else "incremental"
+            found = self.scene.reconstruct(mapper, focal_px=focal)
+        except ColmapError as error:
+            return self._fail(rung, str(error))
+        count, height, width = self.frames.shape[:3]
+        figures = measure(found, frames=len(self.scene.frames), height=height, width=width)
+        self.figures |= {f"{rung}_{name}": value for name, value in figures.items()}
+        if problems := refusals(figures, self.config.gate, calibrated=focal is not None):
+            return self._fail(rung, ", ".join(problems))
+        reason = (
+            f"{figures['registered']:.0%} of the frames registered at an error of "
+            f"{figures['error_px']:.2f} pixels, triangulation angle {figures['angle_deg']:.1f} "
+            f"degrees, {count - len(found.frames)} frames interpolated"
+        )
+        verdict = self._verdict(rung, reason)
+        return estimate_from(found, verdict, frames=count, height=height, width=width)
+
+    def _rotation(self) -> CameraEstimate | None:
+        gate = self.config.gate
+        tracks = follow_corners(self.video, bridge=gate.max_gap)
+        height, width = self.video.gray[0].shape
+        focal = self._focal("rotation")
+        intrinsics = pinhole(focal / self.video.reduction, height=height, width=width)
+        found = solve_rotations(tracks, intrinsics)
+        tracked = np.flatnonzero(~np.isnan(found.residual_px))
+        residual = float(np.median(found.residual_px[tracked[1:]])) if len(tracked) > 1 else 0.0
+        self.figures |= {
+            "rotation_tracked": len(tracked) / len(self.frames),
+            "rotation_residual_px": residual,
+            "rotation_turn_deg": found.turn_deg,
+        }
+        if tracked[-1] != len(self.frames) - 1:
+            return self._fail("rotation", f"the background is lost after frame {tracked[-1]}")
+        if self.config.rung is None and residual > gate.max_residual_px:
+            return self._fail(
+                "rotation",
+                f"turning alone leaves {residual:.2f} pixels, above {gate.max_residual_px:g}",
+            )
+        poses = np.tile(np.eye(4), (len(tracked), 1, 1))
+        poses[:, :3, :3] = found.world_from_camera[tracked]
+        poses = complete_path(tracked, poses, len(self.frames))
+        reason = (
+            f"the camera turns by {found.turn_deg:.1f} degrees, which leaves {residual:.2f} pixels"
+        )
+        return self._pinhole("rotation", poses, focal, reason)
+
+    def _focal(self, rung: str) -> float:
+        """Return the known focal length, or the one assumed, and record which."""
+        if self.known_focal_px is not None:
+            return self.known_focal_px
+        self.figures[f"{rung}_assumed_view_deg"] = self.config.assumed_view_deg
+        half = np.radians(self.config.assumed_view_deg / 2)
+        return float(max(self.frames.shape[1:3]) / 2 / np.tan(half))
+
+    def _pinhole(
+        self, rung: Rung, poses: Float[np.ndarray, "f 4 4"], focal_px: float, reason: str
+    ) -> CameraEstimate:
+        """Return an accepted estimate without points."""
+        height, width = self.frames.shape[1:3]
+        if self.known_focal_px is None:
+            reason += f"; the view is assumed to be {self.config.assumed_view_deg:g} degrees wide"
+        cameras = Cameras(
+            world_from_camera=poses,
+            intrinsics_px=pinhole(focal_px, height=height, width=width),
+            height=height,
+            width=width,
+        )
+        verdict = self._verdict(rung, reason)
+        return CameraEstimate(cameras=cameras, metric=False, verdict=verdict)
+
+    def _fail(self, rung: str, reason: str) -> None:
+        """Record why a rung was not accepted."""
+        self.reasons.append(f"{rung}: {reason}")
+
+    def _verdict(self, rung: Rung, reason: str) -> Verdict:
+        """Return a verdict with the reasons of the rungs before it."""
+        return Verdict(rung=rung, reason="; ".join([reason, *self.reasons]), figures=self.figures)
+
+    def _refused(self) -> CameraEstimate:
+        verdict = Verdict(rung="refused", reason="; ".join(self.reasons), figures=self.figures)
+        return CameraEstimate(cameras=None, metric=False, verdict=verdict)

@@ -1,0 +1,89 @@
+"""Radial distortion: undistorted frames, masks and pixels of a `CameraEstimate`.
+
+A lens takes a point at (x, y, 1) to the recorded pixel c + f (1 + k r²) (x, y), with r² = x² + y²,
+f its focal length, k its radial coefficient and c the center of the picture. The undistorted
+picture has the same size and center, and the least focal length F that shows no pixel which was
+not recorded: with R the distance from the center to the corner (k > 0) or to the nearest border
+(k < 0), F = f (1 + k R² / F²).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from egosim_jax.perception.estimates import CameraEstimate, Lens
+from egosim_jax.types import InputError
+
+
+def pinhole_focal(lens: Lens, *, height: int, width: int) -> float:
+    """Return the focal length of the undistorted frames, in pixels."""
+    reach = np.hypot(height, width) / 2 if lens.radial > 0 else min(height, width) / 2
+    focal = lens.focal_px
+    for _ in range(60):
+        focal = lens.focal_px * (1 + lens.radial * (reach / focal) ** 2)
+    return float(focal)
+
+
+def undistort(
+    frames: Shaped[np.ndarray, "f h w *c"], estimate: CameraEstimate
+) -> Shaped[np.ndarray, "f h w *c"]:
+    """Return the frames that the cameras of an estimate show; masks by their nearest pixels.
+
+    Frames of an estimate without a lens are returned as they are.
+    """
+    if estimate.lens is None or estimate.cameras is None:
+        return frames
+    import cv2
+
+    cameras, lens = estimate.cameras, estimate.lens
+    if frames.shape[1:3] != (cameras.height, cameras.width):
+        raise InputError(
+            f"Frames of {frames.shape[2]} x {frames.shape[1]} pixels cannot be undistorted by "
+            f"cameras of {cameras.width} x {cameras.height}: the sizes must be the same."
+        )
+    rows, columns = np.mgrid[: cameras.height, : cameras.width].astype(np.float64)
+    rays = _rays(np.stack([columns, rows], axis=-1), cameras.intrinsics_px)
+    recorded = _recorded(rays, lens, cameras.intrinsics_px).astype(np.float32)
+    picture = frames.dtype == np.uint8 and frames.ndim == 4
+    method = cv2.INTER_LINEAR if picture else cv2.INTER_NEAREST
+    source = frames.astype(np.uint8) if frames.dtype == bool else frames
+    remapped = [
+        cv2.remap(f, recorded, None, method, borderMode=cv2.BORDER_REPLICATE) for f in source
+    ]
+    return np.stack(remapped).reshape(frames.shape).astype(frames.dtype)
+
+
+def undistort_pixels(
+    pixels_px: Float[np.ndarray, "*b 2"], estimate: CameraEstimate
+) -> Float[np.ndarray, "*b 2"]:
+    """Return where recorded pixels are in the frames that `undistort` makes; NaN stays NaN."""
+    if estimate.lens is None or estimate.cameras is None:
+        return pixels_px
+    return to_pinhole(pixels_px, estimate.lens, estimate.cameras.intrinsics_px)
+
+
+def to_pinhole(
+    pixels_px: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*b 2"]:
+    """Return recorded pixels as a pinhole camera with the same center sees them."""
+    center = intrinsics_px[:2, 2]
+    distorted = (pixels_px - center) / lens.focal_px
+    straight = distorted
+    for _ in range(30):
+        squared = (straight**2).sum(axis=-1, keepdims=True)
+        straight = distorted / (1 + lens.radial * squared)
+    return straight * intrinsics_px[0, 0] + center
+
+
+def _rays(
+    pixels_px: Float[np.ndarray, "*b 2"], intrinsics_px: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*b 2"]:
+    return (pixels_px - intrinsics_px[:2, 2]) / intrinsics_px[0, 0]
+
+
+def _recorded(
+    rays: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*b 2"]:
+    squared = (rays**2).sum(axis=-1, keepdims=True)
+    return lens.focal_px * (1 + lens.radial * squared) * rays + intrinsics_px[:2, 2]

@@ -1,0 +1,127 @@
+"""Cameras that turn without moving: rotations by robust least squares on tracked corners.
+
+The corners of a key frame are followed through the frames after it, from where the last rotation
+sends them, until too few are left; then the next key frame begins. The rotation R of a frame
+minimizes the soft L1 loss of K R K⁻¹ x - y over the tracks (x, y), by Gauss-Newton steps with
+weights 1 / sqrt(1 + r²). If the camera moves, parallax remains: the residual is the evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from egosim_jax.perception.cameras.flow import MIN_CORNERS, Background
+
+MIN_SHARE = 0.4
+"""Share of a key frame's corners below which the next key frame begins."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Tracks:
+    """Corners of key frames and where later frames show them, at working size."""
+
+    keys: tuple[int, ...]
+    """Key frame of each frame; itself in the first frame, -1 where tracking failed."""
+    starts: tuple[Float32[np.ndarray, "n 2"], ...]
+    """Corners in the key frame, for each frame."""
+    ends: tuple[Float32[np.ndarray, "n 2"], ...]
+    """The same corners in the frame."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Rotations:
+    """Rotations of a camera, and how well they explain the tracks."""
+
+    world_from_camera: Float[np.ndarray, "f 3 3"]
+    """Rotation of each frame; NaN where tracking failed."""
+    residual_px: Float[np.ndarray, " f"]
+    """Median residual of each frame, in pixels at working size."""
+    turn_deg: float
+    """Largest angle between the first frame and another."""
+
+
+def follow_corners(video: Background, *, bridge: int = 5) -> Tracks:
+    """Follow corners through a video; at most `bridge` frames in a row may fail."""
+    keys, starts, ends = [0], [video.corners(0)], [video.corners(0)]
+    key, corners = 0, starts[0]
+    guess, last = corners, 0
+    for frame in range(1, len(video.gray)):
+        there, good = video.follow(key, frame, corners, guess)
+        if good.sum() < max(MIN_CORNERS / 2, MIN_SHARE * len(corners)) and last != key:
+            key, corners = last, video.corners(last)
+            guess = corners
+            there, good = video.follow(key, frame, corners, guess)
+        keep = good.sum() >= MIN_CORNERS / 2 and frame - last <= bridge + 1
+        keys.append(key if keep else -1)
+        starts.append(corners[good] if keep else corners[:0])
+        ends.append(there[good] if keep else corners[:0])
+        if keep:
+            last = frame
+            shift = np.median(there[good] - guess[good], axis=0)
+            guess = np.where(good[:, None], there, guess + shift).astype(np.float32)
+    return Tracks(keys=tuple(keys), starts=tuple(starts), ends=tuple(ends))
+
+
+def solve_rotations(tracks: Tracks, intrinsics_px: Float[np.ndarray, "3 3"]) -> Rotations:
+    """Return the rotations that explain the tracks best, for known intrinsics at working size."""
+    count = len(tracks.keys)
+    poses = np.full((count, 3, 3), np.nan)
+    poses[0] = np.eye(3)
+    residual = np.full(count, np.nan)
+    residual[0] = 0
+    last = np.eye(3)
+    for frame in range(1, count):
+        key = tracks.keys[frame]
+        if key < 0:
+            continue
+        first = poses[key].T @ last
+        turned, residual[frame] = _solve(
+            tracks.starts[frame], tracks.ends[frame], intrinsics_px, first.T
+        )
+        poses[frame] = last = poses[key] @ turned.T
+    known = poses[~np.isnan(poses[:, 0, 0])]
+    cosine = (np.trace(known, axis1=1, axis2=2) - 1) / 2
+    turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max())
+    return Rotations(world_from_camera=poses, residual_px=residual, turn_deg=turn)
+
+
+def _solve(
+    starts: Float32[np.ndarray, "n 2"],
+    ends: Float32[np.ndarray, "n 2"],
+    intrinsics_px: Float[np.ndarray, "3 3"],
+    rotation: Float[np.ndarray, "3 3"],
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """Return the rotation from the key frame's axes to the frame's, and the median residual."""
+    import cv2
+
+    focal, center = intrinsics_px[0, 0], intrinsics_px[:2, 2]
+    rays = np.concatenate([(starts - center) / focal, np.ones((len(starts), 1))], axis=1)
+    for _ in range(20):
+        u, v = _shown(rays, rotation)
+        gap = np.stack([u, v], axis=1) * focal + center - ends
+        weight = (1 + (gap**2).sum(axis=1)) ** -0.25
+        columns = np.stack([-u * v, 1 + u * u, -v], axis=1)
+        rows = np.stack([-1 - v * v, u * v, u], axis=1)
+        jacobian = focal * np.stack([columns, rows], axis=1) * weight[:, None, None]
+        target = (gap * weight[:, None]).reshape(-1)
+        step = np.linalg.lstsq(jacobian.reshape(-1, 3), -target, rcond=None)[0]
+        rotation = cv2.Rodrigues(step)[0] @ rotation
+        if np.abs(step).max() < 1e-8:
+            break
+    gap = np.stack(_shown(rays, rotation), axis=1) * focal + center - ends
+    return rotation, float(np.median(np.linalg.norm(gap, axis=1)))
+
+
+def _shown(
+    rays: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the rays' image coordinates, at focal length 1, after a rotation."""
+    x, y, z = rotation @ rays.T
+    z = np.maximum(z, 1e-6)
+    return x / z, y / z
