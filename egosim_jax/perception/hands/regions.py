@@ -1,0 +1,104 @@
+"""Square regions of hands: from a palm or from earlier keypoints, their crops and the way back.
+
+A region is turned so that the middle finger points up in its crop, as the landmark network was
+trained (MediaPipe Hands, Zhang et al. 2020). Pixel centers are at integer coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+PALM_KEYPOINTS = 7
+"""Number of keypoints of a detected palm: wrist, four knuckles, two of the thumb."""
+CROP = 224
+"""Height and width of the landmark network's input in pixels."""
+_SIZED_BY = np.array([0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18])
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Regions:
+    """Turned squares in pictures."""
+
+    center_px: Float[np.ndarray, "n 2"]
+    """Columns and rows of the centers in pixels."""
+    size_px: Float[np.ndarray, " n"]
+    """Lengths of the sides in pixels."""
+    angle: Float[np.ndarray, " n"]
+    """Angles in radians by which a crop is turned clockwise into the picture."""
+
+
+def regions_of_palms(
+    boxes_px: Float[np.ndarray, "n 4"], keypoints_px: Float[np.ndarray, "n 7 2"]
+) -> Regions:
+    """Return the regions of hands whose palms were detected; boxes are center and size."""
+    angle = _upright(keypoints_px[:, 0], keypoints_px[:, 2])
+    return _enlarged(boxes_px[:, :2], boxes_px[:, 2:], angle, shift=-0.5, scale=2.6)
+
+
+def regions_of_joints(joints_px: Float[np.ndarray, "n 21 2"]) -> Regions:
+    """Return the regions of hands from their keypoints, in this frame or in the one next to it."""
+    knuckles = (joints_px[:, 5] + joints_px[:, 13] + 2 * joints_px[:, 9]) / 4
+    angle = _upright(joints_px[:, 0], knuckles)
+    palm = joints_px[:, _SIZED_BY]
+    middle = (palm.min(1) + palm.max(1)) / 2
+    inside = np.einsum("nij,nkj->nki", _turn(-angle), palm - middle[:, None])
+    low, high = inside.min(1), inside.max(1)
+    center = middle + np.einsum("nij,nj->ni", _turn(angle), (low + high) / 2)
+    return _enlarged(center, high - low, angle, shift=-0.1, scale=2.0)
+
+
+def crop_region(
+    frame: UInt8[np.ndarray, "h w 3"], regions: Regions, index: int
+) -> UInt8[np.ndarray, "224 224 3"]:
+    """Cut one region out of a frame, upright; zero outside the picture."""
+    to_picture = regions.size_px[index] / CROP * _turn(regions.angle[index : index + 1])[0]
+    center = regions.center_px[index] - to_picture @ np.full(2, (CROP - 1) / 2)
+    matrix = np.concatenate([to_picture, center[:, None]], axis=1)
+    return cv2.warpAffine(
+        frame,
+        matrix,
+        (CROP, CROP),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+    )
+
+
+def joints_in_picture(
+    regions: Regions, joints_crop: Float[np.ndarray, "n 21 2"]
+) -> Float[np.ndarray, "n 21 2"]:
+    """Return keypoints in pixels of the picture from those in the crop, 0 to 224 edge to edge."""
+    inside = (joints_crop / CROP - 0.5) * regions.size_px[:, None, None]
+    return regions.center_px[:, None] + np.einsum("nij,nkj->nki", _turn(regions.angle), inside)
+
+
+def turned_back(
+    regions: Regions, joints_m: Float[np.ndarray, "n 21 3"]
+) -> Float[np.ndarray, "n 21 3"]:
+    """Return keypoints in camera axes from those in the axes of the upright crop."""
+    turned = np.einsum("nij,nkj->nki", _turn(regions.angle), joints_m[..., :2])
+    return np.concatenate([turned, joints_m[..., 2:]], axis=-1)
+
+
+def _upright(wrist_px: np.ndarray, knuckle_px: np.ndarray) -> np.ndarray:
+    """Return the clockwise angle from up, in the picture, of the direction wrist to knuckle."""
+    right, down = (knuckle_px - wrist_px).T
+    return np.arctan2(right, -down)
+
+
+def _turn(angle: np.ndarray) -> np.ndarray:
+    """Return matrices `n 2 2` that turn clockwise in a picture, whose rows go down."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+
+
+def _enlarged(
+    center: np.ndarray, size: np.ndarray, angle: np.ndarray, *, shift: float, scale: float
+) -> Regions:
+    moved = np.einsum("nij,j->ni", _turn(angle), [0, shift]) * size[:, 1:]
+    return Regions(center_px=center + moved, size_px=scale * size.max(1), angle=angle)

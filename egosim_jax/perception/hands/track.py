@@ -1,0 +1,154 @@
+"""Tracks of at most one left and one right hand, chosen among the candidates of all frames.
+
+A state of a frame is a pair: the candidate of the left hand and that of the right one, either of
+which may be missing, and which are not the same hand. A dynamic program finds the sequence of
+states of least cost. The cost of a frame is that of the network's doubt in presence and side, of a
+missing hand, and of two hands that are nearly in the same place; from frame to frame, that of the
+distance a hand has moved, in hand sizes, or of its appearance or disappearance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from egosim_jax.perception.estimates import LEFT, RIGHT
+from egosim_jax.perception.hands.detect import Candidates, relative_distance
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackConfig:
+    """Costs of tracking, in nats where a probability is behind them."""
+
+    side: float = 0.7
+    """Weight of the doubt in the side."""
+    presence: float = 1.0
+    """Weight of the doubt in presence."""
+    missing: float = 2.5
+    """Cost of a frame without the hand of a side."""
+    change: float = 2.0
+    """Cost of the appearance or disappearance of a hand."""
+    overlap: float = 3.0
+    """Cost of two hands at the same place; it falls to zero at a distance of one hand size."""
+    motion: float = 3.0
+    """Cost of a motion by one hand size from one frame to the next."""
+    max_motion: float = 1.0
+    """Largest motion in hand sizes; beyond it a hand disappears and another one appears."""
+    min_frames: int = 3
+    """Minimum number of frames of a track; shorter ones are false detections."""
+    most: int = 6
+    """Maximum number of candidates of a frame, the most confident ones."""
+
+
+def choose_tracks(
+    candidates: Candidates, frames: int, config: TrackConfig, *, same_hand: float
+) -> Int[np.ndarray, "f 2"]:
+    """Return the index of the candidate of the left and right hand in each frame, or -1."""
+    per_frame = [_best(candidates, frame, config.most) for frame in range(frames)]
+    states = [_pairs(candidates, there, same_hand) for there in per_frame]
+    cost = _state_cost(candidates, states[0], config)
+    back: list[np.ndarray] = []
+    for before, now in pairwise(states):
+        step = sum(
+            _step_cost(candidates, before[:, side], now[:, side], config) for side in (LEFT, RIGHT)
+        )
+        total = cost[:, None] + step
+        back.append(total.argmin(0))
+        cost = total.min(0) + _state_cost(candidates, now, config)
+    chosen = [int(cost.argmin())]
+    for pointers in reversed(back):
+        chosen.append(int(pointers[chosen[-1]]))
+    path = np.array([s[i] for s, i in zip(states, reversed(chosen), strict=True)])
+    return _without_short(candidates, path, config)
+
+
+def _best(candidates: Candidates, frame: int, most: int) -> np.ndarray:
+    there = np.flatnonzero(candidates.frame == frame)
+    return there[np.argsort(-candidates.presence[there], kind="stable")][:most]
+
+
+def _pairs(candidates: Candidates, there: np.ndarray, same_hand: float) -> np.ndarray:
+    """Return the states of a frame: pairs of candidates, -1 for a missing hand."""
+    joints = candidates.joints_px[there]
+    same = relative_distance(joints[:, None], joints[None]) < same_hand
+    pairs = [(-1, -1)]
+    for i, one in enumerate(there):
+        pairs += [(one, -1), (-1, one)]
+        pairs += [(one, other) for j, other in enumerate(there) if not same[i, j] and i != j]
+    return np.array(pairs)
+
+
+def _state_cost(candidates: Candidates, states: np.ndarray, config: TrackConfig) -> np.ndarray:
+    cost = np.zeros(len(states))
+    for side in (LEFT, RIGHT):
+        there = states[:, side] >= 0
+        chosen = states[there, side]
+        right = candidates.right[chosen]
+        doubt = _nats(right if side == RIGHT else 1 - right)
+        cost[there] += config.side * doubt + config.presence * _nats(candidates.presence[chosen])
+        cost[~there] += config.missing
+    both = (states >= 0).all(1)
+    cost[both] += config.overlap * _overlap(candidates, states[both])
+    return cost
+
+
+def _overlap(candidates: Candidates, pairs: np.ndarray) -> np.ndarray:
+    """Return the nearness of two hands: 1 at the same place, 0 beyond one hand size."""
+    middle = candidates.joints_px.mean(1)
+    apart = np.linalg.norm(middle[pairs[:, LEFT]] - middle[pairs[:, RIGHT]], axis=-1)
+    size = candidates.size_px[pairs].max(1)
+    return np.clip(1 - apart / np.maximum(size, 1e-6), 0, None)
+
+
+def _step_cost(
+    candidates: Candidates, before: np.ndarray, now: np.ndarray, config: TrackConfig
+) -> np.ndarray:
+    """Return the cost of each step from a state to a state of the next frame, of one side."""
+    earlier, place = np.unique(before, return_inverse=True)
+    later, place_now = np.unique(now, return_inverse=True)
+    cost = config.change * ((earlier >= 0)[:, None] != (later >= 0)[None]).astype(float)
+    i, j = np.flatnonzero(earlier >= 0), np.flatnonzero(later >= 0)
+    moved = relative_distance(
+        candidates.joints_px[earlier[i], None], candidates.joints_px[None, later[j]]
+    )
+    jump = 2 * config.change + config.motion * config.max_motion
+    cost[np.ix_(i, j)] = np.where(moved > config.max_motion, jump, config.motion * moved)
+    return cost[place[:, None], place_now[None]]
+
+
+def _nats(probability: np.ndarray) -> np.ndarray:
+    return -np.log(np.clip(probability, 0.01, 1))
+
+
+def _without_short(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
+    """Return the path without tracks that are too short to be believed."""
+    path = path.copy()
+    for side in (LEFT, RIGHT):
+        for start, stop in runs(path[:, side] >= 0):
+            joints = candidates.joints_px[path[start:stop, side]]
+            moved = relative_distance(joints[1:], joints[:-1])
+            cuts = start + 1 + np.flatnonzero(moved > config.max_motion)
+            for first, last in zip([start, *cuts], [*cuts, stop], strict=True):
+                if last - first < min(config.min_frames, len(path)):
+                    path[first:last, side] = -1
+    return path
+
+
+def runs(mask: Bool[np.ndarray, " f"]) -> list[tuple[int, int]]:
+    """Return start and stop of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def smooth(joints: Float[np.ndarray, "f 2 21 c"]) -> Float[np.ndarray, "f 2 21 c"]:
+    """Return tracks smoothed by weights 1 2 1 within each run of frames that have the hand."""
+    result = joints.copy()
+    for side in (LEFT, RIGHT):
+        for start, stop in runs(np.all(np.isfinite(joints[:, side]), axis=(1, 2))):
+            run = joints[start:stop, side]
+            padded = np.concatenate([run[:1], run, run[-1:]])
+            result[start:stop, side] = (padded[:-2] + 2 * run + padded[2:]) / 4
+    return result

@@ -1,0 +1,174 @@
+"""Hands on real videos: found, doubled and jumping ones, and distances to published skeletons.
+
+    python -m tests.benchmarks.bench_hands DATA [--pictures DIR] [--only NAME ...]
+
+DATA has `raw_clips/lift_tumbler.mp4`, whose right hand is in frames 60 to 230, and `real_clips`
+with `metadata.csv` and, per clip, `video.mp4` and `hand_keypoint_video.mp4`. The published joints
+are the centers of the spheres in the latter, each known by the color of its finger. PCK15 is the
+share of them that have a joint of ours, of the same finger, within 15 pixels. They are not ground
+truth: some skeletons float next to the hand, and videos have crumbs of color. Hence also the
+distance the other way, from our joints to the nearest published pixel of the same finger.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from egosim_jax.io.video import read_video
+from egosim_jax.perception.estimates import RIGHT, HandTracks
+from egosim_jax.perception.hands import LandmarkHands
+from egosim_jax.rendering.skeleton import SKELETONS
+
+SPAN = slice(60, 231)
+"""Frames of lift_tumbler.mp4 that have a hand."""
+HUMAN = SKELETONS["human"]
+FINGERS = np.stack([HUMAN.colors[4 * finger + 1] for finger in range(5)]).astype(np.float32)
+PALETTE = np.concatenate([FINGERS, np.zeros((1, 3), np.float32)])
+JOINTS = [[1, 2, 3, 4], [5, 6, 7, 8], [0, 9, 10, 11, 12], [13, 14, 15, 16], [17, 18, 19, 20]]
+"""Joints that have the color of each finger: the wrist has that of the middle one."""
+
+
+def finger_masks(frame: np.ndarray) -> np.ndarray:
+    """Return the pixels of each finger's color, `5 h w`."""
+    masks = np.zeros((5, *frame.shape[:2]), bool)
+    bright = frame.max(-1) > 60
+    colors = frame[bright].astype(np.float32)
+    distance = np.linalg.norm(colors[:, None] - PALETTE, axis=-1)
+    nearest = distance.argmin(-1)
+    for finger in range(5):
+        masks[finger, bright] = (nearest == finger) & (distance[:, finger] < 60)
+    return masks
+
+
+def sphere_centers(masks: np.ndarray) -> list[np.ndarray]:
+    """Return centers of each finger's spheres, `n 2`: wide places of its mask, tubes are narrow."""
+    depths = [cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in masks]
+    radius = np.median([depth.max() for depth in depths if depth.max() > 2] or [np.inf])
+    centers = []
+    for depth in depths:
+        smooth = cv2.GaussianBlur(depth, (0, 0), 1)
+        window = np.ones((2 * round(1.2 * min(radius, 20)) + 1,) * 2, np.uint8)
+        peaks = (depth >= 0.75 * radius) & (smooth >= cv2.dilate(smooth, window))
+        centers.append(np.argwhere(peaks)[:, ::-1].astype(float))
+    return centers
+
+
+def compare(tracks: HandTracks, skeleton: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances from published joints to ours, and from ours to published pixels."""
+    to_ours, to_published = [], []
+    for joints, frame in zip(tracks.joints_px, skeleton, strict=True):
+        masks = finger_masks(frame)
+        centers = sphere_centers(masks)
+        for finger, mask in enumerate(masks):
+            ours = joints[:, JOINTS[finger]].reshape(-1, 2)
+            ours = ours[np.isfinite(ours).all(-1)]
+            away = np.linalg.norm(centers[finger][:, None] - ours[None], axis=-1)
+            to_ours.append(away.min(1, initial=np.inf))
+            if mask.any() and len(ours):
+                field = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+                column, row = np.clip(
+                    np.round(ours).astype(int), 0, np.array(field.shape)[::-1] - 1
+                ).T
+                to_published.append(field[row, column])
+    return np.concatenate(to_ours), np.concatenate([np.zeros(0), *to_published])
+
+
+def lift_tumbler(path: Path, estimator: LandmarkHands) -> None:
+    """Print how many frames have the hand, doubles, and jumps."""
+
+    def half(frame: np.ndarray) -> np.ndarray:
+        return cv2.resize(frame, (960, 540), interpolation=cv2.INTER_AREA)
+
+    frames = read_video(path, each=half).frames
+    start = time.perf_counter()
+    tracks = estimator(frames)
+    seconds = time.perf_counter() - start
+    there = np.isfinite(tracks.joints_px).all((-1, -2))
+    inside = there[SPAN]
+    middle = tracks.joints_px.mean(-2)
+    steps = np.linalg.norm(np.diff(middle, axis=0), axis=-1)
+    print(
+        f"lift_tumbler: {inside.any(1).sum()} of {len(inside)} frames, "
+        f"{inside[:, RIGHT].sum()} right, {inside.all(1).sum()} double, "
+        f"{(np.nan_to_num(steps) > 40).sum()} jumps over 40 px, "
+        f"{there.any(1).sum() - inside.any(1).sum()} frames outside f60..f230, "
+        f"{1000 * seconds / len(frames):.0f} ms a frame"
+    )
+
+
+def draw(frame: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Return a frame with our skeletons."""
+    picture = frame.copy()
+    for hand in joints[np.isfinite(joints).all((-1, -2))]:
+        at = [tuple(int(v) for v in np.round(p)) for p in hand]
+        for inner, outer in HUMAN.bones:
+            color = tuple(int(v) for v in HUMAN.colors[outer])
+            cv2.line(picture, at[inner], at[outer], color, 2, cv2.LINE_AA)
+            cv2.circle(picture, at[outer], 4, color, -1, cv2.LINE_AA)
+    return picture
+
+
+def write_sheet(path: Path, frames: np.ndarray, skeleton: np.ndarray, tracks: HandTracks) -> None:
+    """Write a picture of some frames: ours on the left, the published skeleton on the right."""
+    rows = []
+    for index in np.linspace(0, len(frames) - 1, 5).round().astype(int):
+        ours = draw(frames[index], tracks.joints_px[index])
+        drawn = finger_masks(skeleton[index]).any(0)[..., None]
+        published = np.where(drawn, skeleton[index], frames[index])
+        rows.append(np.concatenate([ours, published], axis=1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.concatenate(rows)[..., ::-1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--only", nargs="*", default=[])
+    args = parser.parse_args()
+    estimator = LandmarkHands(weights=args.weights)
+    if not args.only or "lift_tumbler" in args.only:
+        lift_tumbler(args.data / "raw_clips" / "lift_tumbler.mp4", estimator)
+    totals: dict[str, list[np.ndarray]] = defaultdict(list)
+    with (args.data / "real_clips" / "metadata.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["dataset"] != "agibot"]
+    for row in rows:
+        if args.only and not any(name in row["video_id"] for name in args.only):
+            continue
+        frames = read_video(args.data / "real_clips" / row["video"]).frames
+        skeleton = read_video(args.data / "real_clips" / row["hand_keypoint_video"]).frames
+        start = time.perf_counter()
+        tracks = estimator(frames)
+        seconds = time.perf_counter() - start
+        to_ours, to_published = compare(tracks, skeleton)
+        totals[row["dataset"]].append(to_ours)
+        there = np.isfinite(tracks.joints_px).all((-1, -2))
+        print(
+            f"{row['dataset']:7}{row['video_id'][:44]:45} left {there[:, 0].sum():2} right "
+            f"{there[:, 1].sum():2} of {len(frames)}, published joints {len(to_ours):5}, "
+            f"PCK15 {np.mean(to_ours < 15):.3f}, PCK25 {np.mean(to_ours < 25):.3f}, ours to "
+            f"published {np.median(to_published) if len(to_published) else np.nan:5.1f} px, "
+            f"{1000 * seconds / len(frames):.0f} ms a frame",
+            flush=True,
+        )
+        if args.pictures:
+            write_sheet(args.pictures / f"{row['video_id'][:60]}.jpg", frames, skeleton, tracks)
+    for dataset, found in totals.items():
+        joined = np.concatenate(found)
+        print(
+            f"{dataset}: {len(joined)} joints, PCK15 {np.mean(joined < 15):.3f}, "
+            f"PCK25 {np.mean(joined < 25):.3f}; mean over clips "
+            f"{np.mean([np.mean(f < 15) for f in found]):.3f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Metric hands from keypoints in pixels: exact on hands that are known."""
+
+import numpy as np
+
+from egosim_jax.perception.estimates import LEFT, RIGHT, HandTracks
+from egosim_jax.perception.hands import lift
+
+INTRINSICS_PX = np.array([[600.0, 0, 415.5], [0, 620.0, 239.5], [0, 0, 1]])
+
+
+def project(joints_m):
+    pixels = joints_m @ INTRINSICS_PX.T
+    return pixels[..., :2] / pixels[..., 2:]
+
+
+def hands(frames=5):
+    """Hands in meters at known places in front of the camera."""
+    rng = np.random.default_rng(0)
+    shape = rng.normal(0, 0.04, (frames, 2, 21, 3))
+    return shape, shape + rng.uniform([-0.3, -0.2, 0.3], [0.3, 0.2, 0.8], (frames, 2, 1, 3))
+
+
+def tracks_of(shape, joints_m):
+    return HandTracks(
+        joints_px=project(joints_m), joints_hand_m=shape, presence=np.ones(joints_m.shape[:2])
+    )
+
+
+def test_a_known_hand_is_put_back_exactly_where_it_was():
+    shape, joints_m = hands()
+    lifted = lift(tracks_of(shape - shape.mean((-2,), keepdims=True), joints_m), INTRINSICS_PX)
+    np.testing.assert_allclose(lifted, joints_m, atol=1e-9)
+
+
+def test_a_lifted_hand_projects_to_the_pixels_that_were_seen_even_if_its_shape_is_another():
+    shape, joints_m = hands()
+    tracks = tracks_of(shape * 1.2 + 0.005, joints_m)
+    np.testing.assert_allclose(project(lift(tracks, INTRINSICS_PX)), tracks.joints_px, atol=1e-6)
+
+
+def test_a_larger_hand_of_the_same_look_is_farther_away():
+    shape, joints_m = hands()
+    lifted = lift(tracks_of(1.1 * shape, joints_m), INTRINSICS_PX)
+    np.testing.assert_allclose(lifted, 1.1 * joints_m, rtol=1e-6)
+
+
+def test_a_missing_hand_stays_missing():
+    tracks = tracks_of(*hands())
+    tracks.joints_px[2, LEFT] = np.nan
+    lifted = lift(tracks, INTRINSICS_PX)
+    assert np.isnan(lifted[2, LEFT]).all()
+    assert np.isfinite(lifted[2, RIGHT]).all()
+
+
+def test_a_hand_that_would_be_behind_the_camera_is_missing():
+    shape, joints_m = hands()
+    tracks = tracks_of(-shape, joints_m)
+    assert np.isnan(lift(tracks, INTRINSICS_PX)).all()
