@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,8 +16,10 @@ from egosim_jax.convert.tables import (
     Reference,
     Table,
 )
+from egosim_jax.models.t5 import T5Sizes
 from egosim_jax.models.wan.umt5 import UMT5Config
 
+Sizes = TypeVar("Sizes", bound=T5Sizes)
 TOKENS = 128
 """Length of the prompt in a reference forward."""
 
@@ -35,7 +37,7 @@ def wan(config: UMT5Config) -> list[Rule]:
     ]
 
 
-def transformers(config: UMT5Config) -> list[Rule]:
+def transformers(config: T5Sizes) -> list[Rule]:
     """Return the rules for transformers' `UMT5EncoderModel`, the same for any size."""
     attention = "encoder.block.*.layer.0.SelfAttention"
     ffn = "encoder.block.*.layer.1.DenseReluDense"
@@ -50,12 +52,12 @@ def transformers(config: UMT5Config) -> list[Rule]:
     ]
 
 
-def ignored(config: UMT5Config) -> list[str]:
+def ignored(config: T5Sizes) -> list[str]:
     """Return the second name of the token table, which the rules read as `shared.weight`."""
     return ["encoder.embed_tokens.weight"]
 
 
-def arguments(config: UMT5Config) -> dict[str, Any]:
+def arguments(config: T5Sizes) -> dict[str, Any]:
     """Return the arguments of transformers' `UMT5Config`."""
     return {
         "vocab_size": config.vocab,
@@ -71,7 +73,7 @@ def arguments(config: UMT5Config) -> dict[str, Any]:
     }
 
 
-def shorten(config: UMT5Config) -> UMT5Config:
+def shorten(config: Sizes) -> Sizes:
     """Return a float32 config with fewer layers and a shorter token table."""
     layers, vocab = min(SHORT_LAYERS, config.layers), min(SHORT_VOCAB, config.vocab)
     return replace(config, dtype="float32", layers=layers, vocab=vocab)

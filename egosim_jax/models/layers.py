@@ -126,10 +126,10 @@ class Embed(nnx.Module):
 class LayerNorm(nnx.Module):
     """Layer norm over the last axis in float32, with or without a learned scale and bias."""
 
-    def __init__(self, dim: int, *, eps: float, affine: bool = True):
+    def __init__(self, dim: int, *, eps: float, affine: bool = True, axes: Axes = ("embed",)):
         self.eps = eps
-        self.scale = nnx.Param(jnp.ones(dim), axes=("embed",)) if affine else None
-        self.bias = nnx.Param(jnp.zeros(dim), axes=("embed",)) if affine else None
+        self.scale = nnx.Param(jnp.ones(dim), axes=axes) if affine else None
+        self.bias = nnx.Param(jnp.zeros(dim), axes=axes) if affine else None
 
     def __call__(self, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
         """Normalize; the result is float32."""

@@ -24,16 +24,25 @@ def pairs(head_dim: int) -> tuple[int, int, int]:
 
 
 def rotations(frames: int, rows: int, columns: int, head_dim: int) -> Float[Array, "n k 2"]:
+    """Return the rotations of tokens at whole positions, in the order (frame, row, column)."""
+    f, r, c = (np.arange(size, dtype=float) for size in (frames, rows, columns))
+    return rotations_at((f, r, c), pairs(head_dim))
+
+
+def rotations_at(
+    positions: tuple[np.ndarray, np.ndarray, np.ndarray], split: tuple[int, int, int]
+) -> Float[Array, "n k 2"]:
     """For every token, in the order (frame, row, column), what turns each channel of a head.
 
-    Channels x_2j and x_2j+1 have the same cosine c; their sines are -s and s, so that a turned
-    channel is its own value times the cosine plus the other's of the pair times the sine. Angles
-    are taken in float64 on the host; only one small table per axis enters the program.
+    `positions` are those of the frames, rows and columns, and `split` the numbers of pairs that
+    rotate with each. Channels x_2j and x_2j+1 have the same cosine c; their sines are -s and s, so
+    that a turned channel is its own value times the cosine plus the other's of the pair times the
+    sine. Angles are taken in float64 on the host; only one small table per axis enters the program.
     """
-    size = (frames, rows, columns)
+    size = tuple(len(p) for p in positions)
     parts = []
-    for axis, p in enumerate(pairs(head_dim)):
-        angle = np.arange(size[axis])[:, None] * THETA ** (-np.arange(p) / p)
+    for axis, p in enumerate(split):
+        angle = positions[axis][:, None] * THETA ** (-np.arange(p) / p)
         c, s = np.cos(angle), np.sin(angle)
         table = np.stack([c, -s, c, s], axis=-1).astype(np.float32)
         shape = [1, 1, 1, 2 * p, 2]

@@ -39,9 +39,9 @@ class Counts:
 
 
 def run(name: str, *, seed: int, cases: int, seconds: float | None = None) -> Counts:
-    """Fuzz a target; stops after `cases`, or after some seconds if they are given."""
+    """Fuzz a target; stops after `cases`, or some seconds after the first if they are given."""
     counts, number, kind = Counts(), 0, ""
-    until = None if seconds is None else time.monotonic() + seconds
+    until: float | None = None
     while number < cases:
         command = [sys.executable, "-m", "tests.fuzz.worker", name, str(seed), str(number)]
         environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
@@ -70,6 +70,8 @@ def run(name: str, *, seed: int, cases: int, seconds: float | None = None) -> Co
                     continue
                 under_way, number = False, record["case"] + 1
                 _count(counts, record, kind)
+                if until is None and seconds is not None:
+                    until = time.monotonic() + seconds
         if under_way:
             _count(counts, {"case": number, "outcome": f"died ({process.returncode})"}, kind)
             number += 1

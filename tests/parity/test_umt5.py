@@ -10,7 +10,8 @@ from transformers import UMT5EncoderModel
 
 from egosim_jax.convert.tables import umt5 as table
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.wan.umt5 import UMT5, UMT5Config, relative_buckets
+from egosim_jax.models.t5 import relative_buckets
+from egosim_jax.models.wan.umt5 import UMT5, UMT5Config
 from tests.translation import translate, translate_back
 
 # Heads x head_dim is not dim, and 40 tokens reach every bucket.

@@ -11,6 +11,7 @@ from flax import nnx
 from egosim_jax.models import Flops
 from egosim_jax.models.attention import Kernel
 from egosim_jax.models.layers import Products
+from egosim_jax.models.remat import LEVELS, Level
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 PATCH = 2
 """Latent rows and columns of a token; a token has one latent frame."""
-Remat = Literal["none", "products", "projections", "attention", "full", "offload"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +29,7 @@ class WanDiTConfig:
     """Module of the conversion table."""
     numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "products", "attention", "remat")
     """Fields that change only how values are computed, which a resumed training may change."""
-    remat_levels: ClassVar[tuple[str, ...]] = (
-        "offload", "full", "attention", "projections", "products", "none",
-    )  # fmt: skip
+    remat_levels: ClassVar[tuple[str, ...]] = LEVELS
     """Values of `remat`, by the memory that they take, ascending."""
     lora_targets: ClassVar[tuple[str, ...]] = ("blocks.*",)
     """Patterns of the linear layers that a LoRA adapts."""
@@ -66,13 +64,8 @@ class WanDiTConfig:
     With bfloat16 sums and all else stay in `dtype`."""
     attention: Kernel = "auto"
     """Attention kernel."""
-    remat: Remat = "none"
-    """Activations that the backward pass recomputes.
-
-    None; all but self-attention and products with weights; all but self-attention and attention's
-    linear layers (`PROJECTION`); all but self-attention; every block; or every block from its
-    input, which waits in the host's memory.
-    """
+    remat: Level = "none"
+    """Activations that the backward pass recomputes."""
 
     def __post_init__(self) -> None:
         """Check that the sizes fit each other and the kernel fits the dtype."""

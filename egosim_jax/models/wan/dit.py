@@ -11,31 +11,26 @@ depend on text and image only. `denoise` is what a solver calls at each step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import no_type_check
 
 import jax
 import jax.numpy as jnp
 from einops import rearrange
 from flax import nnx
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from egosim_jax.models import rope
-from egosim_jax.models.attention import keep_attention
+from egosim_jax.models import remat, rope
 from egosim_jax.models.layers import scan_blocks, stack
+from egosim_jax.models.patch import PatchEmbedding
 from egosim_jax.models.wan.config import PATCH, WanDiTConfig
 from egosim_jax.models.wan.layers import (
     MLP,
-    PROJECTION,
     Block,
     CrossAttention,
     Head,
     ImageEmbedding,
     KeysValues,
-    PatchEmbedding,
     TimeEmbedding,
     gelu_tanh,
     normal,
@@ -45,20 +40,6 @@ from egosim_jax.types import InputError
 
 TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
 """Logical axes of the residual stream, and of what is the same for all tokens."""
-
-keep_products = jax.checkpoint_policies.save_from_both_policies(
-    jax.checkpoint_policies.dots_with_no_batch_dims_saveable, keep_attention
-)
-keep_projections = jax.checkpoint_policies.save_from_both_policies(
-    jax.checkpoint_policies.save_only_these_names(PROJECTION), keep_attention
-)
-BLOCK_INPUT = "block_input"
-offload_inputs = jax.checkpoint_policies.save_and_offload_only_these_names(
-    names_which_can_be_saved=[],
-    names_which_can_be_offloaded=[BLOCK_INPUT],
-    offload_src="device",
-    offload_dst="pinned_host",
-)
 
 
 @no_type_check
@@ -80,7 +61,14 @@ class WanDiT(nnx.Module):
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         self.config = config
-        self.patch = PatchEmbedding(config, rngs=rngs)
+        self.patch = PatchEmbedding(
+            config.in_channels,
+            config.dim,
+            noisy_channels=config.out_channels,
+            patch=PATCH,
+            dtype=config.dtype,
+            rngs=rngs,
+        )
         self.time = TimeEmbedding(config, rngs=rngs)
         sizes = (config.text_dim, config.dim, config.dim)
         self.text = MLP(config, sizes, gelu_tanh, init=normal, rngs=rngs)
@@ -110,7 +98,9 @@ class WanDiT(nnx.Module):
             branches = zip(layer.branches, tokens, strict=True)
             return x, tuple(branch.keys_values(y) for branch, y in branches)
 
-        _, sources = scan_blocks(step, self.blocks.cross_attn, None, remat=self._remat)
+        _, sources = scan_blocks(
+            step, self.blocks.cross_attn, None, remat=remat.wrapper(self.config.remat)
+        )
         return DiTContext(
             patches=self.patch.condition(condition),
             sources=sources,
@@ -125,12 +115,14 @@ class WanDiT(nnx.Module):
         time, modulation = (constrain(x, VECTORS) for x in self.time(t))
 
         def step(block: Block, x: jax.Array, sources: tuple[KeysValues, ...]) -> tuple:
-            x = checkpoint_name(x, BLOCK_INPUT)
+            x = remat.name_input(x)
             x = block(x, modulation, context.rotation, sources)
             return constrain(x, TOKENS), None
 
         x = constrain(self.patch.noisy(noisy) + context.patches, TOKENS)
-        x, _ = scan_blocks(step, self.blocks, x, context.sources, remat=self._remat)
+        x, _ = scan_blocks(
+            step, self.blocks, x, context.sources, remat=remat.wrapper(self.config.remat)
+        )
         return rearrange(
             self.head(x, time),
             "b (f h w) (i j c) -> b f (h i) (w j) c",
@@ -150,18 +142,6 @@ class WanDiT(nnx.Module):
         """Return the velocity for noisy latents and condition in one array."""
         noisy, condition = jnp.split(latents, [self.config.out_channels], axis=-1)
         return self.denoise(noisy, t, self.prepare(condition, text, image))
-
-    @property
-    def _remat(self) -> Callable[[Callable], Callable] | None:
-        checkpoint = partial(jax.checkpoint, prevent_cse=False)
-        return {
-            "none": None,
-            "full": checkpoint,
-            "attention": partial(checkpoint, policy=keep_attention),
-            "products": partial(checkpoint, policy=keep_products),
-            "projections": partial(checkpoint, policy=keep_projections),
-            "offload": partial(checkpoint, policy=offload_inputs),
-        }[self.config.remat]
 
     def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
         _, _, h, w, channels = condition

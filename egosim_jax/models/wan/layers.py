@@ -24,17 +24,15 @@ import jax
 import jax.numpy as jnp
 from einops import rearrange
 from flax import nnx
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from egosim_jax.models import rope
 from egosim_jax.models.attention import Kernel, attention
 from egosim_jax.models.layers import Axes, Initializer, LayerNorm, Linear, RMSNorm, zeros
+from egosim_jax.models.remat import name_projection
 from egosim_jax.models.sinusoid import time_sinusoid
 from egosim_jax.models.wan.config import PATCH, WanDiTConfig
 
-PROJECTION = "projection"
-"""Checkpoint name of the outputs of the attention projections."""
 IMAGE_NORM_EPS = 1e-5
 """Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
 
@@ -72,42 +70,10 @@ def linear(
     )
 
 
-def checkpoint_proj(x: jax.Array) -> jax.Array:
-    """Name an output of an attention projection for checkpoint policies (`PROJECTION`)."""
-    return checkpoint_name(x, PROJECTION)
-
-
 def modulation_table(rows: int, dim: int, rngs: nnx.Rngs) -> nnx.Param:
     """Make learned shifts, scales and gates, which are added to those of the time."""
     table = jax.random.normal(rngs.params(), (rows, dim)) / dim**0.5
     return nnx.Param(table, axes=(None, "embed"))
-
-
-class PatchEmbedding(nnx.Module):
-    """Linear embedding of each patch, with a kernel `[channel, row, column, out]`."""
-
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
-        shape = (config.in_channels, PATCH, PATCH, config.dim)
-        init = nnx.initializers.xavier_uniform(in_axis=(0, 1, 2))
-        self.noisy_channels, self.dtype = config.out_channels, jnp.dtype(config.dtype)
-        self.kernel = nnx.Param(init(rngs.params(), shape), axes=(None, None, None, "embed"))
-        self.bias = nnx.Param(jnp.zeros(config.dim), axes=("embed",))
-
-    def noisy(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
-        """Return the contribution of the noisy channels."""
-        return self._project(latents, self.kernel[...][: self.noisy_channels])
-
-    def condition(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
-        """Return the contribution of the condition, with the bias."""
-        share = self._project(latents, self.kernel[...][self.noisy_channels :])
-        return share + self.bias[...].astype(self.dtype)
-
-    def _project(
-        self, latents: Float[Array, "b f h w c"], kernel: Float[Array, "c i j d"]
-    ) -> Float[Array, "b n d"]:
-        patches = rearrange(latents, "b f (h i) (w j) c -> b (f h w) (c i j)", i=PATCH, j=PATCH)
-        kernel = rearrange(kernel, "c i j d -> (c i j) d")
-        return patches.astype(self.dtype) @ kernel.astype(self.dtype)
 
 
 class MLP(nnx.Module):
@@ -174,11 +140,11 @@ class KeyValue(nnx.Module):
 
     def keys(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
         """Return the keys, in float32."""
-        return self._by_head(self.norm_k(checkpoint_proj(self.k(tokens))))
+        return self._by_head(self.norm_k(name_projection(self.k(tokens))))
 
     def values(self, tokens: Float[Array, "b m d"]) -> Float[Array, "b m h k"]:
         """Return the values, in the dtype of the attention's products."""
-        return self._by_head(checkpoint_proj(self.v(tokens))).astype(self.dtype)
+        return self._by_head(name_projection(self.v(tokens))).astype(self.dtype)
 
     def keys_values(self, tokens: Float[Array, "b m d"]) -> KeysValues:
         """Return keys and values, both in the dtype of the attention's products."""
@@ -201,7 +167,7 @@ class Attention(KeyValue):
 
     def queries(self, x: Float[Array, "b n d"]) -> Float[Array, "b n h k"]:
         """Return the normalized queries, in float32."""
-        return self._by_head(self.norm_q(checkpoint_proj(self.q(x))))
+        return self._by_head(self.norm_q(name_projection(self.q(x))))
 
     def attend(
         self,
@@ -224,7 +190,7 @@ class SelfAttention(Attention):
     ) -> Float[Array, "b n d"]:
         """Attend from all tokens to all tokens, with rotated queries and keys."""
         q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
-        return checkpoint_proj(self.o(self.attend(q, k, self.values(x), "heads")))
+        return name_projection(self.o(self.attend(q, k, self.values(x), "heads")))
 
 
 class CrossAttention(Attention):
@@ -245,7 +211,7 @@ class CrossAttention(Attention):
         """Attend to each source separately and add the results."""
         q = self.queries(x)
         attended = (self.attend(q, *keys_values, "queries") for keys_values in sources)
-        return checkpoint_proj(self.o(reduce(jnp.add, attended)))
+        return name_projection(self.o(reduce(jnp.add, attended)))
 
 
 class Block(nnx.Module):

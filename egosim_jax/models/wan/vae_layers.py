@@ -24,8 +24,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from egosim_jax.models.attention import attention
-from egosim_jax.models.causal_conv import convolve
-from egosim_jax.models.layers import Initializer, Linear, RMSNorm, lecun_normal
+from egosim_jax.models.conv import Conv
+from egosim_jax.models.layers import Initializer, Linear, RMSNorm
 
 Cache = Any
 """Last input frames of a layer: an array, a tuple of caches, or None."""
@@ -69,44 +69,6 @@ def init_constant_channels(conv: Conv) -> None:
 def norm(dim: int) -> RMSNorm:
     """Build an RMS norm over channels."""
     return RMSNorm(dim, eps=1e-12, axes=(None,))
-
-
-class Conv(nnx.Module):
-    """Convolution with bias; kernel `[h, w, in, out]` or, over time too, `[t, h, w, in, out]`."""
-
-    def __init__(
-        self,
-        size: tuple[int, ...],
-        in_dim: int,
-        out_dim: int,
-        *,
-        dtype: str,
-        kernel_init: Initializer = lecun_normal,
-        rngs: nnx.Rngs,
-    ):
-        self.dtype = jnp.dtype(dtype)
-        kernel = kernel_init(rngs.params(), (*size, in_dim, out_dim))
-        self.kernel = nnx.Param(kernel, axes=(*(None for _ in size), None, "mlp"))
-        self.bias = nnx.Param(jnp.zeros(out_dim), axes=("mlp",))
-
-    def __call__(self, x: Input) -> Float[Array, "b g h w o"]:
-        """Convolve, SAME in space and, with a kernel over time, VALID in time."""
-        kernel = self.kernel[...].astype(self.dtype)
-        y = convolve(x.astype(self.dtype), kernel if kernel.ndim == 5 else kernel[None])
-        return y + self.bias[...].astype(self.dtype)
-
-    def downsample2x(self, x: Input) -> Float[Array, "b f y x o"]:
-        """Convolve images with stride 2, padded by a row below and a column on the right."""
-        images = rearrange(x.astype(self.dtype), "b f h w i -> (b f) h w i")
-        y = jax.lax.conv_general_dilated(
-            images,
-            self.kernel[...].astype(self.dtype),
-            (2, 2),
-            ((0, 1), (0, 1)),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
-        y = rearrange(y, "(b f) h w o -> b f h w o", b=x.shape[0])
-        return y + self.bias[...].astype(self.dtype)
 
 
 def causal_conv(conv: Conv, x: Input, cache: Cache) -> Output:

@@ -10,7 +10,8 @@ from einops import rearrange
 from flax import nnx
 
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.wan.umt5 import UMT5, SelfAttention, UMT5Config, relative_buckets
+from egosim_jax.models.t5 import relative_buckets
+from egosim_jax.models.wan.umt5 import UMT5, SelfAttention, UMT5Config
 from egosim_jax.types import InputError
 
 SIZES = dict(vocab=40, dim=32, ffn_dim=48, heads=4, head_dim=8, layers=2)

@@ -1,0 +1,138 @@
+"""Conversion table of CogVideoX's transformer: diffusers' names, which CogVideoX-Fun shares."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from einops import rearrange
+
+from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
+from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
+
+TEXT_TOKENS = 226
+"""Text tokens of a reference forward."""
+
+
+def diffusers(config: CogVideoXDiTConfig) -> list[Rule]:
+    """Return the rules for diffusers' `CogVideoXTransformer3DModel`, for any input channels."""
+    theirs = "transformer_blocks.*"
+    rules = [
+        Rule("patch_embed.proj.weight", "patch.kernel", "o c i j -> c i j o"),
+        Rule("patch_embed.proj.bias", "patch.bias"),
+        *_linear("patch_embed.text_proj", "text"),
+        *_linear("time_embedding.linear_1", "time.up"),
+        *_linear("time_embedding.linear_2", "time.down"),
+        *_modulation(f"{theirs}.norm1", "blocks.modulation_a"),
+        *_modulation(f"{theirs}.norm2", "blocks.modulation_m"),
+        *_linear(f"{theirs}.ff.net.0.proj", "blocks.mlp.up"),
+        *_linear(f"{theirs}.ff.net.2", "blocks.mlp.down"),
+        *_linear(f"{theirs}.attn1.to_out.0", "blocks.attn.o"),
+        *_norm("norm_final", "norm"),
+        *_modulation("norm_out", "modulation"),
+        *_linear("proj_out", "out"),
+    ]
+    for name in "qkv":
+        rules += _linear(f"{theirs}.attn1.to_{name}", f"blocks.attn.{name}")
+    for name in ("norm_q", "norm_k"):
+        rules += _norm(f"{theirs}.attn1.{name}", f"blocks.attn.{name}")
+    return rules
+
+
+def arguments(config: CogVideoXDiTConfig) -> dict[str, Any]:
+    """Return the arguments of diffusers' `CogVideoXTransformer3DModel`."""
+    return {
+        "num_attention_heads": config.heads,
+        "attention_head_dim": config.head_dim,
+        "in_channels": config.in_channels,
+        "out_channels": config.out_channels,
+        "flip_sin_to_cos": True,
+        "freq_shift": 0,
+        "time_embed_dim": config.time_dim,
+        "text_embed_dim": config.text_dim,
+        "num_layers": config.layers,
+        "attention_bias": True,
+        "sample_width": config.base_columns * PATCH,
+        "sample_height": config.base_rows * PATCH,
+        "patch_size": PATCH,
+        "norm_eps": config.eps,
+        "use_rotary_positional_embeddings": True,
+        "use_learned_positional_embeddings": False,
+    }
+
+
+def shorten(config: CogVideoXDiTConfig) -> CogVideoXDiTConfig:
+    """Return a float32 config with fewer layers."""
+    return replace(config, dtype="float32", layers=min(SHORT_LAYERS, config.layers))
+
+
+def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Return both predictions for one small random clip."""
+    import torch
+    from diffusers import CogVideoXTransformer3DModel
+    from diffusers.models.embeddings import get_3d_rotary_pos_embed
+    from diffusers.pipelines.cogvideo.pipeline_cogvideox import get_resize_crop_region_for_grid
+
+    config, widening = comparison.config, comparison.widening
+    draw = np.random.default_rng(0).standard_normal
+    latents = draw((1, 3, 8, 12, config.in_channels), np.float32)
+    text = draw((1, TEXT_TOKENS, config.text_dim), np.float32)
+    t = np.full(1, 500, np.float32)
+    have = comparison.output(latents, t, text)
+    theirs = latents if widening is None else widening.narrow(latents)
+    module = CogVideoXTransformer3DModel(**arguments(replace(config, in_channels=theirs.shape[-1])))
+    _, frames, rows, columns, _ = theirs.shape
+    grid = rows // PATCH, columns // PATCH
+    region = get_resize_crop_region_for_grid(grid, config.base_columns, config.base_rows)
+    rotary = get_3d_rotary_pos_embed(config.head_dim, region, grid, frames)
+    with torch.no_grad():
+        prediction = comparison.load(module)(
+            torch.from_numpy(rearrange(theirs, "b f h w c -> b f c h w").copy()),
+            torch.from_numpy(text),
+            torch.from_numpy(t),
+            image_rotary_emb=rotary,
+            return_dict=False,
+        )[0]
+    return have, rearrange(prediction.numpy(), "b f c h w -> b f h w c")
+
+
+def _linear(theirs: str, ours: str) -> list[Rule]:
+    return [
+        Rule(f"{theirs}.weight", f"{ours}.kernel", "linear"),
+        Rule(f"{theirs}.bias", f"{ours}.bias"),
+    ]
+
+
+def _norm(theirs: str, ours: str) -> list[Rule]:
+    return [Rule(f"{theirs}.weight", f"{ours}.scale"), Rule(f"{theirs}.bias", f"{ours}.bias")]
+
+
+def _modulation(theirs: str, ours: str) -> list[Rule]:
+    return [
+        *_linear(f"{theirs}.linear", f"{ours}.linear"),
+        *_norm(f"{theirs}.norm", f"{ours}.norm"),
+    ]
+
+
+TABLE = Table(
+    namings={
+        "diffusers": Naming(
+            rules=diffusers,
+            signature="transformer_blocks.0.norm1.linear.weight",
+            layout="diffusers",
+            folder="transformer",
+            stem="diffusion_pytorch_model",
+        ),
+    },
+    reference=Reference(
+        naming="diffusers",
+        library="diffusers",
+        kind="CogVideoXTransformer3DModel",
+        arguments=arguments,
+        shorten=shorten,
+        outputs=outputs,
+    ),
+)
+"""Conversions of CogVideoX's transformer."""

@@ -1,0 +1,56 @@
+"""Conversion table of the T5 1.1 text encoder: transformers' names."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.tables import Comparison, Naming, Reference, Table, umt5
+from egosim_jax.models.cogvideox.t5 import T5Config
+
+
+def transformers(config: T5Config) -> list[Rule]:
+    """Return the rules for transformers' `T5EncoderModel`, the same for any size."""
+    bias = "relative_attention_bias.weight"
+    rules = [rule for rule in umt5.transformers(config) if not rule.source.endswith(bias)]
+    first = f"encoder.block.0.layer.0.SelfAttention.{bias}"
+    return [*rules, Rule(first, "position_bias")]
+
+
+def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
+    """Return both embeddings of random tokens."""
+    import torch
+    from transformers import T5Config as TorchConfig
+    from transformers import T5EncoderModel
+
+    config = comparison.config
+    ids = np.random.default_rng(0).integers(0, config.vocab, (1, umt5.TOKENS), np.int32)
+    have = comparison.output(ids, np.ones(ids.shape, bool))
+    with torch.no_grad():
+        module = comparison.load(T5EncoderModel(TorchConfig(**umt5.arguments(config))))
+        want = module(torch.from_numpy(ids).long())
+    return have, want.last_hidden_state.numpy()
+
+
+TABLE = Table(
+    namings={
+        "transformers": Naming(
+            rules=transformers,
+            signature="encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight",
+            layout="diffusers",
+            folder="text_encoder",
+            stem="model",
+        ),
+    },
+    ignored=umt5.ignored,
+    reference=Reference(
+        naming="transformers",
+        library="transformers",
+        kind="T5EncoderModel",
+        arguments=umt5.arguments,
+        shorten=umt5.shorten,
+        outputs=outputs,
+        model_type="t5",
+    ),
+)
+"""Conversions of the T5 encoder."""

@@ -1,0 +1,1 @@
+"""CogVideoX: video transformer, with the inputs of CogVideoX-Fun and DWM, VAE and text encoder."""

@@ -1,0 +1,50 @@
+"""Patch embedding of noisy latents and their condition.
+
+The embedding is linear, so that the contribution of the condition, which is the same at every
+denoising step, is computed once.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from einops import rearrange
+from flax import nnx
+from jaxtyping import Array, Float
+
+
+class PatchEmbedding(nnx.Module):
+    """Linear embedding of each patch, with a kernel `[channel, row, column, out]`."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        dim: int,
+        *,
+        noisy_channels: int,
+        patch: int,
+        dtype: str,
+        rngs: nnx.Rngs,
+    ):
+        shape = (in_channels, patch, patch, dim)
+        init = nnx.initializers.xavier_uniform(in_axis=(0, 1, 2))
+        self.noisy_channels, self.patch, self.dtype = noisy_channels, patch, jnp.dtype(dtype)
+        self.kernel = nnx.Param(init(rngs.params(), shape), axes=(None, None, None, "embed"))
+        self.bias = nnx.Param(jnp.zeros(dim), axes=("embed",))
+
+    def noisy(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
+        """Return the contribution of the noisy channels."""
+        return self._project(latents, self.kernel[...][: self.noisy_channels])
+
+    def condition(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
+        """Return the contribution of the condition, with the bias."""
+        share = self._project(latents, self.kernel[...][self.noisy_channels :])
+        return share + self.bias[...].astype(self.dtype)
+
+    def _project(
+        self, latents: Float[Array, "b f h w c"], kernel: Float[Array, "c i j d"]
+    ) -> Float[Array, "b n d"]:
+        patches = rearrange(
+            latents, "b f (h i) (w j) c -> b (f h w) (c i j)", i=self.patch, j=self.patch
+        )
+        kernel = rearrange(kernel, "c i j d -> (c i j) d")
+        return patches.astype(self.dtype) @ kernel.astype(self.dtype)
