@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
-from typing import Literal, no_type_check
+from typing import Any, Literal, no_type_check
 
 import av
 import numpy as np
@@ -191,7 +192,50 @@ def encode_video(
             "at least one frame and an even width and height."
         )
     buffer = io.BytesIO()
-    with av.open(buffer, "w", format="mp4") as container:
+    _encode(buffer, frames, height, width, fps, crf)
+    return buffer.getvalue()
+
+
+def write_frames(
+    path: Path, frames: Iterable[np.ndarray], fps: int | float | Fraction, *, crf: int = 10
+) -> tuple[int, int, int]:
+    """Write frames one by one as `write_video` does, and return their number, height and width.
+
+    All must be uint8 `h w 3` of the first one's size, of which an odd last row or column is cut
+    off. Raises `InputError` for none, or for other sizes.
+    """
+    rest = iter(frames)
+    first = next(rest, None)
+    if first is None or first.shape[0] < 2 or first.shape[1] < 2:
+        raise InputError(f"{quote_path(path)} cannot be written: there are no frames.")
+    size, count = first.shape, 0
+    height, width = size[0] // 2 * 2, size[1] // 2 * 2
+
+    def even() -> Iterator[np.ndarray]:
+        nonlocal count
+        for frame in chain([first], rest):
+            if frame.shape != size:
+                raise InputError(
+                    f"Picture {count} has {frame.shape[1]}x{frame.shape[0]} pixels, the first one "
+                    f"{size[1]}x{size[0]}: all pictures of a video must have one size."
+                )
+            count += 1
+            yield frame[:height, :width]
+
+    with atomic_write(path) as temporary, temporary.open("r+b") as file:
+        _encode(file, even(), height, width, fps, crf)
+    return count, height, width
+
+
+def _encode(
+    file: Any,
+    frames: Iterable[np.ndarray],
+    height: int,
+    width: int,
+    fps: int | float | Fraction,
+    crf: int,
+) -> None:
+    with av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         # x264's macroblock tree gives other bits at every run on some processors.
@@ -208,7 +252,6 @@ def encode_video(
             )
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
-    return buffer.getvalue()
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:

@@ -7,11 +7,12 @@
         attributes                llm_description, llm_description2, which_llm_description,
                                   llm_type, llm_objects
 
-The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary origin. Of the 25
-joints of a hand the four metacarpals are not used: our 21 are the wrist (`Hand`), the thumb from
-Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of index, middle, ring and
-little finger. Columns and rows count from the corner of the picture (its center is at 960, 540), so
-that half a pixel is subtracted. Followed: Apple's loader of the set as of 2025.
+EgoSim's cuts of such files, `<id>_<start>_<end>.hdf5` of 121 poses at 16 frames per second, have
+cameras alone. The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary origin.
+Of the 25 joints of a hand the four metacarpals are not used: our 21 are the wrist (`Hand`), the
+thumb from Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of index, middle,
+ring and little finger. Columns and rows count from the corner of the picture (its center is at
+960, 540), so that half a pixel is subtracted. Followed: Apple's loader of the set as of 2025.
 """
 
 from __future__ import annotations
@@ -75,7 +76,9 @@ class EgoDex:
                     f"{quote_path(path)} has {frames} camera poses, and {video.name} "
                     f"{info.frames} frames: each frame must have one. Get both files again."
                 )
-            joints = np.stack([self._hand(file, side, frames) for side in SIDES], axis=1)
+            joints = None
+            if any(file.has(f"transforms/{side}{name}") for side in SIDES for name in JOINT_NAMES):
+                joints = np.stack([self._hand(file, side, frames) for side in SIDES], axis=1)
             caption, names = _texts(file)
         cameras = Cameras(
             world_from_camera=poses,
@@ -83,7 +86,9 @@ class EgoDex:
             height=info.height,
             width=info.width,
         )
-        joints, counts = clean_joints(joints, cameras)
+        counts: dict[str, str] = {}
+        if joints is not None:
+            joints, counts = clean_joints(joints, cameras)
         return Recording(
             recording_id=make_id([path.stem]),
             video=video,

@@ -1,0 +1,338 @@
+"""AgiBot-World: head videos of a two-armed robot, with its cameras, flanges and grippers.
+
+    observations/<task>/<episode>/videos/head_color.mp4, depth/head_depth_*.png (millimeters)
+    parameters/<task>/<episode>/parameters/camera/head_intrinsic_params.json,
+                                                  head_extrinsic_params_aligned.json
+    proprio_stats/<task>/<episode>/proprio_stats.h5
+        state/end/position `n 2 3`, meters, and orientation `n 2 4`, x y z w: the flanges, left and
+        right; state/effector/position `n 2`, opening in millimeters
+    task_info/task_<task>.json: parts of each episode, with start, end and a sentence
+
+or, as in the challenges, the video, the two JSON and the h5 in one folder. A recording is a part
+of an episode, as in EgoSim's ids, or all of it where no parts are known. The world is the robot's
+base.
+
+Two readings of the extrinsics are in use, camera to base and base to camera. The points between
+the fingers are projected by both, and the reading that puts more of them into the picture is taken
+and recorded; with none or no difference the recording is refused unless the user decides.
+
+A gripper has three joints: the flange, and the tips of thumb and index finger, `TOOL_M` along the
+flange's z axis and half of the opening apart along its y axis. The set documents the opening as
+growing when the gripper opens, other users found the reverse; where the command (0 open, 1 closed)
+and the measured value change together, its sign decides. Intel's cameras have pixel centers at
+integers. A lens that is not a pinhole is remapped, which writes a video. Followed: the set's card
+of 2025 and the loaders of its challenges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from egosim_jax.data.readers import Entry, find_files, make_id, require
+from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.readers.hdf5 import Hdf5, open_hdf5
+from egosim_jax.data.readers.lenses import Lens, Remap
+from egosim_jax.data.readers.rotations import from_quaternions
+from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.geometry import invert, project, transform
+from egosim_jax.io.segments import probe_long_video, read_segment
+from egosim_jax.io.untrusted import quote, quote_path, read_json
+from egosim_jax.io.video import VideoInfo, write_frames
+from egosim_jax.types import Cameras, InputError
+
+TOOL_M = 0.23
+"""Distance from the flange to the fingertips along its z axis, in meters, as EnerVerse-AC draws."""
+OPEN_MM = 120.0
+"""Largest value of the opening in millimeters."""
+MAX_SURPLUS = 2
+"""Most frames by which video, poses and states of an episode may differ in number."""
+CHUNK = 64
+"""Frames that are remapped at a time."""
+Reading = Literal["camera_to_base", "base_to_camera"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    number: int
+    start: int
+    stop: int | None
+    caption: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Files:
+    task: str
+    episode: str
+    states: Path
+    camera: Path
+    video: Path
+    depth: Path
+    info: Path | None
+
+    @classmethod
+    def of(cls, states: Path) -> _Files:
+        """Return the files that belong to a proprio_stats.h5, in either layout."""
+        folder = states.parent
+        if (folder / "head_color.mp4").exists():
+            return cls(task=folder.parent.name, episode=folder.name, states=states, camera=folder,
+                       video=folder / "head_color.mp4", depth=folder, info=None)  # fmt: skip
+        root, task, episode = folder.parent.parent.parent, folder.parent.name, folder.name
+        observed = root / "observations" / task / episode
+        return cls(
+            task=task,
+            episode=episode,
+            states=states,
+            camera=root / "parameters" / task / episode / "parameters" / "camera",
+            video=observed / "videos" / "head_color.mp4",
+            depth=observed / "depth",
+            info=root / "task_info" / f"task_{task}.json",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgiBot:
+    """AgiBot-World: head camera, grippers and captions of each part of an episode."""
+
+    dataset: ClassVar[str] = "agibot"
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder with observations, parameters, proprio_stats and task_info."""
+    extrinsics: Reading | None = None
+    """Reading of the camera's extrinsics; by default decided by projecting the grippers."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the parts of all episodes."""
+        require("h5py")
+        infos: dict[str, Any] = {}
+        for path in find_files(self.source, "proprio_stats.h5", what="episode of AgiBot-World"):
+            files = _Files.of(path.resolve())
+            if files.task not in infos:
+                infos[files.task] = _read_info(files.info)
+            for part in _parts(infos[files.task].get(files.episode)):
+                yield Entry(
+                    recording_id=make_id([files.task, files.episode, f"{part.number:03d}"]),
+                    read=partial(self._read, files, part),
+                    source=files.states,
+                    options={"--extrinsics": self.extrinsics or "decided"},
+                )
+
+    def _read(self, files: _Files, part: _Part, folder: Path) -> Recording:
+        info = probe_long_video(files.video)
+        lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
+        matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
+        with open_hdf5(files.states) as file:
+            joints, notes = _read_grippers(file)
+        span = _span(part, {"frames": info.frames, "poses": len(matrices), "states": len(joints)})
+        joints, matrices = joints[span], matrices[span]
+        poses, decision = self._decide(matrices, joints, lens)
+        remap = None if lens.is_pinhole() else Remap.of(lens)
+        cameras = Cameras(
+            world_from_camera=poses,
+            intrinsics_px=lens.intrinsics_px if remap is None else remap.intrinsics_px,
+            height=info.height,
+            width=info.width,
+        )
+        joints, counts = clean_joints(joints, cameras)
+        video, start = files.video, span.start
+        if remap is not None:
+            video, start = _remap_video(files.video, span, info, remap, folder), 0
+        return Recording(
+            recording_id=make_id([files.task, files.episode, f"{part.number:03d}"]),
+            video=video,
+            start=start,
+            frames=span.stop - span.start,
+            fps=info.fps,
+            height=info.height,
+            width=info.width,
+            world_from_camera=poses,
+            intrinsics_px=cameras.intrinsics_px,
+            metric=True,
+            joints_m=joints,
+            kind="robot",
+            depth=_find_depth(files.depth, span) if remap is None else None,
+            caption=part.caption,
+            provenance={
+                **decision,
+                **notes,
+                **counts,
+                "lens": "pinhole" if remap is None else "remapped",
+            },
+        )
+
+    def _decide(
+        self, matrices: Float[np.ndarray, "f 4 4"], joints: Float[np.ndarray, "f 2 3 3"], lens: Lens
+    ) -> tuple[Float[np.ndarray, "f 4 4"], dict[str, str]]:
+        """Return camera poses in the base by the reading that sees the grippers, and its shares."""
+        readings: dict[Reading, np.ndarray] = {
+            "camera_to_base": matrices, "base_to_camera": invert(matrices),
+        }  # fmt: skip
+        shares = {name: share_in_view(poses, joints, lens) for name, poses in readings.items()}
+        best, other = sorted(readings, key=lambda name: -shares[name])
+        written = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
+        chosen = self.extrinsics or best
+        if self.extrinsics is None and not shares[best] > shares[other]:
+            raise InputError(
+                f"The reading of the extrinsics cannot be decided: the share of gripper points in "
+                f"the picture is {written}, and one must be larger. Choose one. (--extrinsics)"
+            )
+        by = "user" if self.extrinsics else "projected grippers"
+        return readings[chosen], {
+            "extrinsics": chosen, "extrinsics_by": by, "grippers_in_view": written
+        }  # fmt: skip
+
+
+def share_in_view(
+    poses: Float[np.ndarray, "f 4 4"], joints: Float[np.ndarray, "f 2 3 3"], lens: Lens
+) -> float:
+    """Return the share of points between fingertips that camera poses put into the picture."""
+    tips = joints[:, :, 1:].mean(axis=2)
+    local = transform(invert(poses), tips)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = project(lens.intrinsics_px, local)
+        inside = (local[..., 2] > 0.05) & (u > -0.5) & (u < lens.width - 0.5)
+        inside &= (v > -0.5) & (v < lens.height - 0.5)
+    given = np.isfinite(tips).all(axis=2)
+    return float(inside[given].mean()) if given.any() else 0.0
+
+
+def _read_info(path: Path | None) -> dict[str, Any]:
+    """Return the entry of each episode of a task, by episode."""
+    if path is None or not path.exists():
+        return {}
+    entries = read_json(path, limit=1 << 28)
+    if not isinstance(entries, list):
+        raise InputError(f"{quote_path(path)} is not a list of episodes.")
+    return {str(e.get("episode_id")): e for e in entries if isinstance(e, dict)}
+
+
+def _parts(info: Mapping[str, Any] | None) -> list[_Part]:
+    label = (info or {}).get("label_info")
+    actions = label.get("action_config") if isinstance(label, dict) else None
+    if isinstance(actions, list) and actions:
+        spans = ("start_frame", "end_frame")
+        return [
+            _Part(number=n, start=a[spans[0]], stop=a[spans[1]], caption=_text(a, "action_text"))
+            for n, a in enumerate(actions)
+            if isinstance(a, dict) and all(type(a.get(name)) is int for name in spans)
+        ]
+    return [_Part(number=0, start=0, stop=None, caption=_text(info or {}, "task_name"))]
+
+
+def _text(entry: Mapping[str, Any], name: str) -> str | None:
+    text = entry.get(name)
+    return text if isinstance(text, str) and text.strip() else None
+
+
+def _span(part: _Part, counts: Mapping[str, int]) -> slice:
+    """Return the frames of a part, which video, poses and states must all have."""
+    written = ", ".join(f"{name} {count}" for name, count in counts.items())
+    if max(counts.values()) - min(counts.values()) > MAX_SURPLUS:
+        raise InputError(
+            f"The episode has different numbers of {written}: they may differ by at most "
+            f"{MAX_SURPLUS}. It is damaged in the set itself."
+        )
+    length = min(counts.values())
+    stop = length if part.stop is None else min(part.stop, length)
+    if not 0 <= part.start < stop or (part.stop or 0) > length + MAX_SURPLUS:
+        raise InputError(
+            f"Part {part.number} is from frame {part.start} to {part.stop}: the episode has "
+            f"{written}, and a part at least one frame of it."
+        )
+    return slice(part.start, stop)
+
+
+def _read_lens(path: Path, info: VideoInfo) -> Lens:
+    written = read_json(path)
+    values = written.get("intrinsic") if isinstance(written, dict) else None
+    if not isinstance(values, dict):
+        raise InputError(f"{quote_path(path)} has no intrinsic.")
+    fx, fy, cx, cy = (_number(values, name, path) for name in ("fx", "fy", "ppx", "ppy"))
+    names = ("k1", "k2", "p1", "p2", "k3")
+    return Lens(
+        model="brown",
+        coefficients=tuple(_number({n: 0.0} | values, n, path) for n in names),
+        intrinsics_px=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
+        height=info.height,
+        width=info.width,
+    )
+
+
+def _number(values: Mapping[str, Any], name: str, path: Path) -> float:
+    value = values.get(name)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e6:
+        raise InputError(f"{quote_path(path)}: {name} is {quote(value)}, not a number.")
+    return float(value)
+
+
+def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"]:
+    written = read_json(path, limit=1 << 27)
+    if not isinstance(written, list) or not written:
+        raise InputError(f"{quote_path(path)} is not a list of one entry per frame.")
+    matrices = np.tile(np.eye(4), (len(written), 1, 1))
+    for number, entry in enumerate(written):
+        values: Any = entry.get("extrinsic") if isinstance(entry, dict) else None
+        try:
+            matrices[number, :3, :3] = values["rotation_matrix"]
+            matrices[number, :3, 3] = values["translation_vector"]
+        except (TypeError, KeyError, ValueError) as error:
+            raise InputError(
+                f"{quote_path(path)}, entry {number}: extrinsic must have a rotation_matrix of "
+                "3 x 3 and a translation_vector of 3 numbers."
+            ) from error
+    return matrices
+
+
+def _read_grippers(file: Hdf5) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, str]]:
+    """Return the joints of both grippers in the base, and how the opening was read."""
+    positions = file.array("state/end/position", (None, 2, 3))
+    rotations = from_quaternions(file.array("state/end/orientation", (len(positions), 2, 4)))
+    opening = file.array("state/effector/position", (len(positions), None))
+    if opening.shape[1] != 2:
+        return np.full((len(positions), 2, 3, 3), np.nan), {"hands": "not grippers"}
+    notes = {"opening": "grows when it opens"}
+    if _closes(file, opening):
+        opening, notes = OPEN_MM - opening, {"opening": "grows when it closes, as the command"}
+    half = np.clip(opening, 0, OPEN_MM) / 2000
+    zero = np.zeros_like(half)
+    local = np.stack(
+        [np.stack([zero, side * half, zero + along], axis=-1)
+         for side, along in ((0, 0.0), (1, TOOL_M), (-1, TOOL_M))], axis=2,
+    )  # fmt: skip
+    joints = np.einsum("fnij,fnkj->fnki", rotations, local) + positions[:, :, None]
+    return joints, notes
+
+
+def _closes(file: Hdf5, opening: Float[np.ndarray, "f 2"]) -> bool:
+    """Return True if the measured value grows with the command, which is 1 when closed."""
+    if not file.has("action/effector/position"):
+        return False
+    try:
+        command = file.array("action/effector/position", (len(opening), 2))
+    except InputError:
+        return False
+    both = command - command.mean(axis=0), opening - opening.mean(axis=0)
+    return bool(np.nansum(both[0] * both[1]) > 0)
+
+
+def _find_depth(folder: Path, span: slice) -> DepthFiles | None:
+    found = {path.stem.rpartition("_")[2]: path for path in folder.glob("head_depth_*.png")}
+    numbered = {int(digits): path for digits, path in found.items() if digits.isdecimal()}
+    paths = tuple(numbered.get(frame) for frame in range(span.start, span.stop))
+    return DepthFiles(paths=paths, unit_m=0.001) if any(paths) else None
+
+
+def _remap_video(path: Path, span: slice, info: VideoInfo, remap: Remap, folder: Path) -> Path:
+    def frames() -> Iterator[np.ndarray]:
+        for start in range(span.start, span.stop, CHUNK):
+            count = min(CHUNK, span.stop - start)
+            yield from remap.apply(read_segment(path, start=start, count=count).frames)
+
+    write_frames(folder / "video.mp4", frames(), info.fps)
+    return folder / "video.mp4"

@@ -1,0 +1,153 @@
+"""COLMAP reconstructions: pictures with poses, intrinsics and triangulated points.
+
+A folder with a sparse model (itself, or in sparse/0 or sparse/) and the pictures in images/. The
+pictures in order of their names are the frames of a video, at a rate that the user gives. The
+longest run of registered pictures is the recording. One camera must have taken all pictures;
+distorted pictures are remapped, and so are the pixels that observe points. The unit is arbitrary,
+so that `metric` is False. Conventions: `colmap_model`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+import tyro
+
+from egosim_jax.data.readers import Entry, inside, make_id, natural_order
+from egosim_jax.data.readers.colmap_model import Image, Model, read_model
+from egosim_jax.data.readers.pictures import (
+    MAX_PICTURES,
+    PictureVideo,
+    longest_run,
+    write_pictures,
+)
+from egosim_jax.data.recording import Recording
+from egosim_jax.data.scene_points import ScenePoints
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.video import read_image
+from egosim_jax.types import InputError
+
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Colmap:
+    """COLMAP reconstruction: pictures, cameras and points."""
+
+    dataset: ClassVar[str] = "colmap"
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of the reconstruction: a sparse model, or one that has it in sparse/0."""
+    fps: float
+    """Frame rate of the pictures in order of their names, which the model does not know."""
+    images: Path | None = None
+    """Folder of the pictures, by default images/ next to the model."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the one model of the source."""
+        folder = next(
+            (
+                path
+                for path in (self.source, self.source / "sparse" / "0", self.source / "sparse")
+                if (path / "images.bin").exists() or (path / "images.txt").exists()
+            ),
+            None,
+        )
+        if folder is None:
+            raise InputError(
+                f"{self.source} has no images.bin or images.txt, in it or in sparse/0: it must be "
+                "a COLMAP model."
+            )
+        yield Entry(
+            recording_id=make_id([self.source.resolve().name]),
+            read=partial(self._read, folder),
+            source=folder,
+            options={"--fps": str(self.fps)},
+        )
+
+    def _read(self, model_folder: Path, folder: Path) -> Recording:
+        fps = make_rate(self.fps)
+        model = read_model(model_folder)
+        root = self.images or self._find_images(model_folder)
+        by_name = {image.name: image for image in model.images}
+        names = [
+            str(path.relative_to(root))
+            for path in sorted(root.rglob("*"), key=natural_order)
+            if path.suffix.lower() in PICTURES
+        ][:MAX_PICTURES]
+        run = longest_run(names, by_name.__contains__)
+        images = [by_name[name] for name in names[run]]
+        if not images:
+            raise InputError(
+                f"{quote_path(root)} has none of the model's {len(by_name)} pictures: their names "
+                "are relative to it. (--images)"
+            )
+        cameras = {image.camera_id for image in images}
+        if len(cameras) > 1:
+            raise InputError(
+                f"The pictures are of {len(cameras)} cameras: one camera must have taken all. "
+                "Reconstruct with a single camera (--ImageReader.single_camera 1)."
+            )
+        paths = [inside(root, image.name, what="a picture of the model") for image in images]
+        lens = model.lenses[cameras.pop()]
+        video = write_pictures(folder, map(read_image, paths), lens, fps)
+        return Recording(
+            recording_id=make_id([self.source.resolve().name]),
+            video=video.path,
+            frames=video.frames,
+            fps=fps,
+            height=video.height,
+            width=video.width,
+            world_from_camera=np.stack([image.world_from_camera for image in images]),
+            intrinsics_px=video.intrinsics_px,
+            points=_points(model, images, video),
+            provenance={
+                "pictures": f"{len(images)} of {len(names)}, {len(by_name)} registered",
+                "lens": "pinhole" if video.remap is None else "remapped",
+            },
+        )
+
+    def _find_images(self, folder: Path) -> Path:
+        near = [parent / "images" for parent in (self.source, folder, *list(folder.parents)[:2])]
+        found = next((path for path in near if path.is_dir()), None)
+        if found is None:
+            raise InputError(f"{self.source} has no folder images/ near the model. (--images)")
+        return found
+
+
+def make_rate(fps: float) -> Fraction:
+    """Return a frame rate that the user gave as a fraction. Raises `InputError` if it is none."""
+    if not 0 < fps <= 1000:
+        raise InputError(f"--fps is {fps}: it must be above 0 and at most 1000.")
+    return Fraction(fps).limit_denominator(1001)
+
+
+def _points(model: Model, images: list[Image], video: PictureVideo) -> ScenePoints | None:
+    """Return the model's points with the pixels that observe them."""
+    if not len(model.point_ids):
+        return None
+    order = np.argsort(model.point_ids)
+    ids = model.point_ids[order]
+    frames, indices, pixels = [], [], []
+    for frame, image in enumerate(images):
+        place = np.minimum(np.searchsorted(ids, image.point_ids), len(ids) - 1)
+        seen = ids[place] == image.point_ids
+        moved = image.pixels_px[seen]
+        moved = moved if video.remap is None else video.remap.move(moved)
+        good = np.isfinite(moved).all(axis=1)
+        pixels.append(moved[good])
+        indices.append(place[seen][good])
+        frames.append(np.full(int(good.sum()), frame))
+    return ScenePoints(
+        points_m=model.points_m[order].astype(np.float32),
+        colors=model.colors[order],
+        error_px=model.error_px[order].astype(np.float32),
+        frames=np.concatenate(frames).astype(np.int32),
+        indices=np.concatenate(indices).astype(np.int32),
+        pixels_px=np.concatenate(pixels).astype(np.float32),
+    )

@@ -1,0 +1,129 @@
+"""Clips that EgoSim's release prepares: a video with the cameras of Depth Anything 3.
+
+    video_16fps.mp4 or video.mp4, caption.txt
+    _proc/poses_da3_smoothed or _proc/poses_da3, at any depth in it:
+        extrinsics_000000.npy `4 4`, world to camera, OpenCV axes; intrinsics_000000.npy `3 3`;
+        depth_000000.npy `h w` of the first frame
+
+One pose per frame of the video is needed, and the smoothed ones are preferred. Pixel centers are at
+integers, as points are back-projected there. Depth Anything 3 estimates meters, so that `metric` is
+True, with its error. Hands are those of HaMeR in _proc/mano_full (`hamer`), if that is there.
+Followed: jinkun-hao/EgoSim of 2026, `data_process`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+import tyro
+
+from egosim_jax.data.readers import Entry, make_id, natural_order
+from egosim_jax.data.readers.egovid import read_matrices
+from egosim_jax.data.readers.hamer import read_hamer
+from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.geometry import invert
+from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.untrusted import quote_path, read_bytes
+from egosim_jax.types import Cameras, InputError
+
+VIDEOS = ("video_16fps.mp4", "video.mp4")
+"""Names of the video, the one that poses belong to first."""
+MAX_DRIFT = 0.02
+"""Largest relative change of the focal length over the frames, whose median is taken."""
+MAX_CAPTION_BYTES = 10_000
+"""Largest caption in bytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EgoSimClips:
+    """Clips as EgoSim's data preparation leaves them: cameras, caption, first depth."""
+
+    dataset: ClassVar[str] = "egosim"
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of one clip, or of several."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the folders with a video and `_proc`."""
+        folders = [self.source] if (self.source / "_proc").is_dir() else sorted(
+            (path.parent for path in self.source.glob("*/_proc")), key=natural_order
+        )  # fmt: skip
+        if not folders:
+            raise InputError(f"{self.source} has no folder _proc, in it or one level below.")
+        for folder in folders:
+            yield Entry(
+                recording_id=make_id([folder.resolve().name]),
+                read=partial(_read, folder),
+                source=folder,
+            )
+
+
+def _read(clip: Path, folder: Path) -> Recording:
+    video = next((clip / name for name in VIDEOS if (clip / name).exists()), None)
+    if video is None:
+        raise InputError(f"{quote_path(clip)} has none of {', '.join(VIDEOS)}.")
+    info = probe_long_video(video)
+    poses_folder = _find_poses(clip / "_proc")
+    paths = sorted(poses_folder.glob("extrinsics_*.npy"), key=natural_order)
+    if len(paths) != info.frames:
+        raise InputError(
+            f"{quote_path(poses_folder)} has {len(paths)} extrinsics, and {video.name} "
+            f"{info.frames} frames: each frame must have one. Run DA3 on this video."
+        )
+    poses = invert(np.stack([read_matrices(path, (4, 4)) for path in paths]))
+    cameras = [
+        read_matrices(path.with_name(path.name.replace("extrinsics", "intrinsics")), (3, 3))
+        for path in paths
+    ]
+    intrinsics = np.median(cameras, axis=0)
+    drift = float(np.ptp(np.stack(cameras)[:, 0, 0]) / max(intrinsics[0, 0], 1e-9))
+    if drift > MAX_DRIFT:
+        raise InputError(
+            f"{quote_path(poses_folder)}: the focal length changes by {drift:.1%}, more than "
+            f"{MAX_DRIFT:.0%}: one camera is needed for all frames."
+        )
+    seen = Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=info.height,
+                   width=info.width)  # fmt: skip
+    joints, counts = None, dict[str, str]()
+    hands = sorted((clip / "_proc" / "mano_full").rglob("*.json"))
+    if hands:
+        joints, counts = clean_joints(read_hamer(hands[0], seen), seen)
+    depth = poses_folder / "depth_000000.npy"
+    files = (depth if depth.exists() else None, *[None] * (info.frames - 1))
+    caption = clip / "caption.txt"
+    text = ""
+    if caption.exists():
+        text = read_bytes(caption, limit=MAX_CAPTION_BYTES).decode("utf-8", "replace").strip()
+    return Recording(
+        recording_id=make_id([clip.resolve().name]),
+        video=video,
+        frames=info.frames,
+        fps=info.fps,
+        height=info.height,
+        width=info.width,
+        world_from_camera=poses,
+        intrinsics_px=intrinsics,
+        metric=True,
+        joints_m=joints,
+        depth=DepthFiles(paths=files, unit_m=1.0) if files[0] else None,
+        caption=text or None,
+        provenance={
+            "poses": str(poses_folder.relative_to(clip)),
+            "scale": "estimated by Depth Anything 3",
+            "focal_drift": f"{drift:.4f}",
+            **counts,
+        },
+    )
+
+
+def _find_poses(folder: Path) -> Path:
+    """Return the folder of extrinsics, the smoothed ones if there are any."""
+    found = sorted({path.parent for path in folder.rglob("extrinsics_*.npy")})
+    if not found:
+        raise InputError(f"{quote_path(folder)} has no extrinsics_*.npy at any depth.")
+    return max(found, key=lambda path: "smoothed" in str(path.relative_to(folder)))

@@ -1,0 +1,245 @@
+"""HOT3D clips: five seconds of Aria or Quest 3 with cameras and both hands, a tar file each.
+
+    <n>.image_<stream>.jpg      pictures; stream 214-1 is Aria's in color
+    <n>.cameras.json            per stream: T_world_from_camera, and calibration of a fisheye624
+    <n>.hands.json              per side: umetrack_pose with joint_angles and T_world_from_wrist
+    <n>.info.json               timestamps in nanoseconds
+    __hand_shapes.json__        UmeTrack's model of the wearer's hands
+
+Transforms are quaternions w x y z and translations in meters; camera axes are OpenCV's, pixel
+centers at integers. The fisheye is remapped to a pinhole. Aria's color camera is mounted sideways:
+its pictures are turned clockwise by 90 degrees, and the cameras with them. Hands are computed from
+UmeTrack's model (`umetrack`); MANO's parameters are not used, nor are hands of clips without a
+shape, as those for testing. Followed: facebookresearch/hot3d, `clip_util.py`, of 2025.
+"""
+
+from __future__ import annotations
+
+import re
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import tyro
+
+from egosim_jax.data.readers import Entry, find_files, make_id
+from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.readers.lenses import Lens, Remap
+from egosim_jax.data.readers.rotations import make_poses
+from egosim_jax.data.readers.umetrack import FINGERS, HINGES, HandModel
+from egosim_jax.data.recording import Recording
+from egosim_jax.io.untrusted import open_regular, parse_json, quote, quote_path, quote_text
+from egosim_jax.io.video import decode_image, write_frames
+from egosim_jax.types import Cameras, InputError
+
+COLOR = "214-1"
+"""Stream of Aria's color camera."""
+SIDES = ("left", "right")
+MAX_MEMBERS = 100_000
+"""Largest number of files of a clip."""
+MAX_MEMBER_BYTES = 1 << 26
+"""Largest file of a clip in bytes."""
+MAX_DRIFT_PX = 1.0
+"""Largest change of the calibration during a clip, in pixels."""
+CLOCKWISE = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+"""Axes of the turned camera, in those of the original one."""
+_FRAME = re.compile(r"(\d{1,9})\.cameras\.json")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hot3D:
+    """HOT3D clips of Aria or Quest 3: pictures, cameras and hands."""
+
+    dataset: ClassVar[str] = "hot3d"
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of clips, or one .tar file."""
+    stream: str = COLOR
+    """Stream to read; Quest 3 has only 1201-1 and 1201-2, in gray."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the clips."""
+        root = self.source if self.source.is_dir() else self.source.parent
+        for path in find_files(self.source, "*.tar", what="clip of HOT3D"):
+            yield Entry(
+                recording_id=make_id(path.relative_to(root).with_suffix("").parts),
+                read=partial(self._read, path),
+                source=path,
+                options={"--stream": self.stream},
+            )
+
+    def _read(self, path: Path, folder: Path) -> Recording:
+        with _open_clip(path) as clip:
+            keys = sorted(match[1] for name in clip.names if (match := _FRAME.fullmatch(name)))
+            if not keys:
+                raise InputError(f"{quote_path(path)} has no <n>.cameras.json: no clip of HOT3D.")
+            cameras = [clip.camera(key, self.stream) for key in keys]
+            lens = _lens([calibration for calibration, _ in cameras], clip.name)
+            remap = Remap.of(lens)
+            poses = np.concatenate([pose for _, pose in cameras])
+            turned = self.stream == COLOR
+            pictures = remap.apply(clip.picture(f"{key}.image_{self.stream}.jpg") for key in keys)
+            frames = (np.rot90(picture, -1) for picture in pictures) if turned else pictures
+            fps = clip.rate(keys, self.stream)
+            _, height, width = write_frames(folder / "video.mp4", frames, fps)
+            joints = clip.hands(keys)
+        intrinsics = remap.intrinsics_px.copy()
+        if turned:
+            poses[:, :3, :3] = poses[:, :3, :3] @ CLOCKWISE
+            (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+            intrinsics = np.array([[fy, 0, lens.height - 1 - cy], [0, fx, cx], [0, 0, 1]])
+        notes: dict[str, str] = {"turned": "clockwise" if turned else "no"}
+        if joints is not None:
+            seen = Cameras(
+                world_from_camera=poses, intrinsics_px=intrinsics, height=height, width=width
+            )
+            joints, counts = clean_joints(joints, seen)
+            notes |= counts
+        return Recording(
+            recording_id=make_id([path.stem]),
+            video=folder / "video.mp4",
+            frames=len(keys),
+            fps=fps,
+            height=height,
+            width=width,
+            world_from_camera=poses,
+            intrinsics_px=intrinsics,
+            metric=True,
+            joints_m=joints,
+            provenance=notes,
+        )
+
+
+class _Clip:
+    """An open tar file of a clip."""
+
+    def __init__(self, tar: tarfile.TarFile, name: str):
+        self.name = name
+        members = []
+        for member in tar:
+            members.append(member)
+            if len(members) > MAX_MEMBERS:
+                raise InputError(f"{name} has more than {MAX_MEMBERS:,} files, the most.")
+        self._tar, self.names = tar, {m.name: m for m in members if m.isreg()}
+
+    def read(self, name: str) -> bytes:
+        """Return the bytes of a file."""
+        member = self.names.get(name)
+        file = member and self._tar.extractfile(member)
+        if not member or not file or member.size > MAX_MEMBER_BYTES:
+            why = "is too large" if member else "is missing"
+            raise InputError(f"{self.name}: {quote_text(name)} {why}.")
+        return file.read()
+
+    def json(self, name: str) -> Any:
+        """Return the contents of a JSON file that is an object."""
+        value = parse_json(self.read(name), source=f"{self.name}: {name}", limit=MAX_MEMBER_BYTES)
+        if not isinstance(value, dict):
+            raise InputError(f"{self.name}: {name} is not a JSON object.")
+        return value
+
+    def picture(self, name: str) -> np.ndarray:
+        """Return a picture."""
+        return decode_image(self.read(name), name=f"{self.name}: {name}")
+
+    def camera(self, key: str, stream: str) -> tuple[dict[str, Any], np.ndarray]:
+        """Return calibration and pose of a camera at a frame."""
+        streams = self.json(f"{key}.cameras.json")
+        camera = streams.get(stream)
+        if not isinstance(camera, dict) or not isinstance(camera.get("calibration"), dict):
+            raise InputError(
+                f"{self.name}: frame {key} has no camera of stream {quote(stream)}; it has "
+                f"{quote_text(', '.join(streams))}. (--stream)"
+            )
+        return camera["calibration"], self._pose(camera.get("T_world_from_camera"), key)
+
+    def hands(self, keys: list[str]) -> np.ndarray | None:
+        """Return the keypoints of both hands in the world; None in a clip without a shape."""
+        if "__hand_shapes.json__" not in self.names:
+            return None
+        model = HandModel.from_json(self.json("__hand_shapes.json__").get("umetrack"))
+        joints = np.full((len(keys), 2, 21, 3), np.nan)
+        for frame, key in enumerate(keys):
+            name = f"{key}.hands.json"
+            written = self.json(name) if name in self.names else {}
+            for side, label in enumerate(SIDES):
+                hand = written.get(label)
+                pose = hand.get("umetrack_pose") if isinstance(hand, dict) else None
+                if isinstance(pose, dict):
+                    angles = _numbers(pose.get("joint_angles"), FINGERS * HINGES, f"{name}: angles")
+                    wrist = self._pose(pose.get("T_world_from_wrist"), key)[0]
+                    joints[frame, side] = model.keypoints(angles, wrist, side)
+        return joints
+
+    def rate(self, keys: list[str], stream: str) -> Fraction:
+        """Return the frame rate, from timestamps."""
+        times = []
+        for key in keys:
+            stamps = self.json(f"{key}.info.json").get("image_timestamps_ns")
+            times.append(stamps.get(stream) if isinstance(stamps, dict) else None)
+        if len(times) < 2 or not all(type(time) is int for time in times):
+            raise InputError(f"{self.name} has no timestamps of stream {quote(stream)}.")
+        period = float(np.median(np.diff(np.array(times, float)))) / 1e9
+        if not 1e-3 <= period <= 10:
+            raise InputError(f"{self.name}: {period:g} s between frames is no frame rate.")
+        return Fraction(1 / period).limit_denominator(1001)
+
+    def _pose(self, written: Any, key: str) -> np.ndarray:
+        parts = written if isinstance(written, dict) else {}
+        what = f"{self.name}: transform of frame {key}"
+        w, x, y, z = _numbers(parts.get("quaternion_wxyz"), 4, what)[:4]
+        translation = _numbers(parts.get("translation_xyz"), 3, what)[:3]
+        return make_poses(np.array([[x, y, z, w]]), translation[None])
+
+
+def _numbers(value: Any, least: int, what: str) -> np.ndarray:
+    try:
+        numbers = np.array(value, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.ndim != 1 or not least <= len(numbers) <= 64 or not np.isfinite(numbers).all():
+        raise InputError(f"{what} is {quote(value)}: it must be at least {least} finite numbers.")
+    return numbers
+
+
+def _lens(calibrations: list[dict[str, Any]], name: str) -> Lens:
+    """Return the lens of all frames."""
+    first = calibrations[0]
+    if "FISHEYE624" not in str(first.get("projection_model_type")):
+        raise InputError(
+            f"{name}: its camera model is {quote(first.get('projection_model_type'))}; FISHEYE624 "
+            "is read."
+        )
+    parameters = [
+        _numbers(c.get("projection_params"), 15, f"{name}: projection_params") for c in calibrations
+    ]
+    same = all(len(p) == len(parameters[0]) for p in parameters)
+    if not same or np.ptp(np.stack(parameters)[:, :3], axis=0).max() > MAX_DRIFT_PX:
+        raise InputError(f"{name}: its calibration changes by more than {MAX_DRIFT_PX:g} px.")
+    values = parameters[0].tolist()
+    fx, fy, cx, cy, *k = values if len(values) == 16 else [values[0], *values]
+    height, width = first.get("image_height"), first.get("image_width")
+    if not isinstance(height, int) or not isinstance(width, int) or min(height, width) < 1:
+        raise InputError(f"{name}: its picture has {quote(width)} x {quote(height)} pixels.")
+    return Lens(
+        model="fisheye624",
+        coefficients=tuple(k),
+        intrinsics_px=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        height=height,
+        width=width,
+    )
+
+
+@contextmanager
+def _open_clip(path: Path) -> Iterator[_Clip]:
+    name = quote_path(path)
+    try:
+        with open_regular(path) as file, tarfile.open(fileobj=file, mode="r:") as tar:
+            yield _Clip(tar, name)
+    except (tarfile.TarError, EOFError) as error:
+        raise InputError(f"{name} is not a readable tar file: {quote_text(str(error))}.") from error

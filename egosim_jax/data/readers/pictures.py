@@ -1,0 +1,66 @@
+"""Captures of single pictures: they are written as the video of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.data.readers.lenses import Lens, Remap
+from egosim_jax.io.video import write_frames
+from egosim_jax.types import InputError
+
+MAX_PICTURES = 100_000
+"""Largest number of pictures of a capture."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class PictureVideo:
+    """Video that was written from pictures, and the pinhole that it is of."""
+
+    path: Path
+    frames: int
+    height: int
+    width: int
+    intrinsics_px: Float[np.ndarray, "3 3"]
+    remap: Remap | None
+    """Remapping of the pictures; None if their lens is a pinhole."""
+
+
+def write_pictures(
+    folder: Path, pictures: Iterable[np.ndarray], lens: Lens, fps: Fraction
+) -> PictureVideo:
+    """Write pictures as video.mp4 of a folder, remapped to a pinhole if their lens is not one."""
+    remap = None if lens.is_pinhole() else Remap.of(lens)
+    intrinsics = lens.intrinsics_px if remap is None else remap.intrinsics_px
+    path = folder / "video.mp4"
+    frames = _checked(pictures, lens) if remap is None else remap.apply(pictures)
+    count, height, width = write_frames(path, frames, fps)
+    return PictureVideo(path=path, frames=count, height=height, width=width,
+                        intrinsics_px=intrinsics, remap=remap)  # fmt: skip
+
+
+def _checked(pictures: Iterable[np.ndarray], lens: Lens) -> Iterator[np.ndarray]:
+    for number, picture in enumerate(pictures):
+        if picture.shape[:2] != (lens.height, lens.width):
+            raise InputError(
+                f"Picture {number} has {picture.shape[1]}x{picture.shape[0]} pixels: its camera is "
+                f"calibrated for {lens.width}x{lens.height}. Use the pictures of that size."
+            )
+        yield picture
+
+
+def longest_run(names: Sequence[str], known: Callable[[str], bool]) -> slice:
+    """Return the longest run of names that are known: a video has no gaps."""
+    best = run = slice(0, 0)
+    for index, name in enumerate(names):
+        run = slice(run.start if known(name) else index + 1, index + 1)
+        if run.stop - run.start > best.stop - best.start:
+            best = run
+    return best

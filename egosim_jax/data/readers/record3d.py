@@ -1,0 +1,262 @@
+"""Record3D captures of an iPhone: pictures with poses, intrinsics and depth of the LiDAR.
+
+    NAME.r3d, a zip archive, or a folder with what is in it
+        metadata        JSON: w h, dw dh, fps, K (9 numbers by columns), poses (qx qy qz qw x y z),
+                        perFrameIntrinsicCoeffs (fx fy cx cy, at w x h)
+        rgbd/<n>.jpg    pictures
+        rgbd/<n>.depth  float32 meters `dh dw`, compressed by LZFSE
+
+or a folder exported as "EXR + RGB", with metadata.json and rgb/<n>.jpg, whose EXR depth is not
+read. Poses take camera to world in OpenGL's axes, as ARKit's, in meters, the world is y up.
+Intrinsics count from the corner of the picture, so that half a pixel is subtracted; ARKit refocuses
+all the time, and the median over the frames is taken if it changes little. Depth is written as
+PNG of millimeters, and needs the package pyliblzfse; without it depth is unknown, and that is
+recorded. Followed: nerfstudio 1.1, `record3d_utils.py`, and readers of .r3d files of 2025.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from egosim_jax.data.readers import Entry, make_id, natural_order
+from egosim_jax.data.readers.lenses import Lens
+from egosim_jax.data.readers.pictures import MAX_PICTURES, write_pictures
+from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
+from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.npz import DAMAGE
+from egosim_jax.io.untrusted import (
+    open_regular,
+    parse_json,
+    quote,
+    quote_path,
+    quote_text,
+    read_bytes,
+)
+from egosim_jax.io.video import decode_image
+from egosim_jax.types import InputError
+
+MAX_FILE_BYTES = 1 << 28
+"""Largest file of a capture, or entry of an archive, in bytes."""
+MAX_SPREAD = 0.03
+"""Largest relative change of the focal length during a capture."""
+MAX_DEPTH_SIDE = 4096
+"""Largest number of rows or columns of a depth map."""
+_PICTURE = re.compile(r"(?:rgbd|rgb)/(\d{1,9})\.jpg")
+
+ReadFile = Callable[[str], bytes]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record3D:
+    """Record3D captures: pictures, cameras and LiDAR depth."""
+
+    dataset: ClassVar[str] = "record3d"
+    source: Annotated[Path, tyro.conf.Positional]
+    """A .r3d file, a folder of such files, or the folder of one capture."""
+
+    def find(self) -> Iterator[Entry]:
+        """List the captures."""
+        captures = [self.source]
+        if self.source.is_dir() and not _metadata_name(self.source):
+            captures = sorted(self.source.rglob("*.r3d"), key=natural_order)
+        if not captures or not self.source.exists():
+            raise InputError(
+                f"{self.source} holds no .r3d files and no metadata: it must be a Record3D "
+                "capture, or a folder of .r3d files."
+            )
+        for path in captures:
+            yield Entry(
+                recording_id=make_id([path.resolve().stem]), read=partial(_read, path), source=path
+            )
+
+
+def _metadata_name(folder: Path) -> str | None:
+    return next((n for n in ("metadata", "metadata.json") if (folder / n).is_file()), None)
+
+
+def _read(path: Path, folder: Path) -> Recording:
+    with _open_capture(path) as (names, read):
+        metadata = _read_metadata(names, read, path)
+        numbered = sorted(
+            (int(match[1]), name) for name in names if (match := _PICTURE.fullmatch(name))
+        )[:MAX_PICTURES]  # fmt: skip
+        poses = _poses(metadata, path)
+        if [number for number, _ in numbered] != list(range(len(poses))):
+            raise InputError(
+                f"{quote_path(path)} has {len(numbered)} pictures and {len(poses)} poses: the "
+                "pictures must be numbered from 0, one per pose. Export the capture again."
+            )
+        lens, spread = _lens(metadata, len(poses), path)
+        fps = Fraction(_number(metadata, "fps", path)).limit_denominator(1001)
+        pictures = (decode_image(read(name), name=quote_text(name)) for _, name in numbered)
+        video = write_pictures(folder, pictures, lens, fps)
+        depth, why = _write_depth(names, read, metadata, len(poses), path, folder)
+    return Recording(
+        recording_id=make_id([path.resolve().stem]),
+        video=video.path,
+        frames=video.frames,
+        fps=fps,
+        height=video.height,
+        width=video.width,
+        world_from_camera=poses,
+        intrinsics_px=video.intrinsics_px,
+        metric=True,
+        depth=depth,
+        provenance={"focal_spread": f"{spread:.4f}", "depth": why},
+    )
+
+
+@contextmanager
+def _open_capture(path: Path) -> Iterator[tuple[list[str], ReadFile]]:
+    """Open an archive or a folder: names of files in it, and a function that reads one."""
+    if path.is_dir():
+        files = (file for file in path.glob("**/*") if file.is_file())
+        names = [str(file.relative_to(path)) for file in files]
+        yield names, lambda name: read_bytes(path / name, limit=MAX_FILE_BYTES)
+        return
+    with open_regular(path) as file:
+        with _refusing(path):
+            archive = zipfile.ZipFile(file)
+
+        def read(name: str) -> bytes:
+            with _refusing(path):
+                if archive.getinfo(name).file_size > MAX_FILE_BYTES:
+                    raise InputError(f"{quote_path(path)}: {quote(name)} is too large.")
+                return archive.read(name)
+
+        yield archive.namelist(), read
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except DAMAGE as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{quote_path(path)} is not a readable .r3d file: {quote_text(str(error))}."
+        ) from error
+
+
+def _read_metadata(names: list[str], read: ReadFile, path: Path) -> dict[str, Any]:
+    name = next((name for name in ("metadata", "metadata.json") if name in names), "")
+    source = f"{quote_path(path)}: {name}"
+    metadata = name and parse_json(read(name), source=source, limit=MAX_FILE_BYTES)
+    if not isinstance(metadata, dict):
+        raise InputError(f"{quote_path(path)} has no metadata: it is not a Record3D capture.")
+    return metadata
+
+
+def _numbers(metadata: dict[str, Any], name: str, columns: int, path: Path) -> np.ndarray:
+    """Return a table of finite numbers."""
+    try:
+        table = np.array(metadata.get(name), float)
+    except (TypeError, ValueError):
+        table = np.zeros((0, 0))
+    if table.ndim != 2 or table.shape[1] != columns or not np.isfinite(table).all():
+        raise InputError(
+            f"{quote_path(path)}: {name} is of shape {table.shape}: it must be finite numbers, "
+            f"{columns} per frame."
+        )
+    return table
+
+
+def _number(metadata: dict[str, Any], name: str, path: Path) -> float:
+    value = metadata.get(name)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e5:
+        raise InputError(f"{quote_path(path)}: {name} is {quote(value)}, not a positive number.")
+    return float(value)
+
+
+def _poses(metadata: dict[str, Any], path: Path) -> np.ndarray:
+    table = _numbers(metadata, "poses", 7, path)
+    return make_poses(table[:, :4], table[:, 4:]) @ OPENCV_FROM_OPENGL
+
+
+def _lens(metadata: dict[str, Any], frames: int, path: Path) -> tuple[Lens, float]:
+    """Return the camera and the relative spread of its focal length over the frames."""
+    width, height = (int(_number(metadata, name, path)) for name in ("w", "h"))
+    if metadata.get("perFrameIntrinsicCoeffs"):
+        table = _numbers(metadata, "perFrameIntrinsicCoeffs", 4, path)
+    else:
+        matrix = _numbers({"K": [metadata.get("K")]}, "K", 9, path)[0]
+        table = matrix[[0, 4, 6, 7]][None]
+    if len(table) not in (1, frames):
+        raise InputError(
+            f"{quote_path(path)}: perFrameIntrinsicCoeffs has {len(table)} rows for {frames} "
+            "frames."
+        )
+    fx, fy, cx, cy = np.median(table, axis=0).tolist()
+    spread = float(np.ptp(table[:, 0])) / max(fx, 1e-9)
+    if spread > MAX_SPREAD:
+        raise InputError(
+            f"{quote_path(path)}: the focal length changes by {spread:.1%} during the capture, "
+            f"more than {MAX_SPREAD:.0%}: one camera is needed for all frames. Lock the focus."
+        )
+    return Lens(
+        model="brown",
+        coefficients=(0.0,) * 5,
+        intrinsics_px=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
+        height=height,
+        width=width,
+    ), spread
+
+
+def _write_depth(
+    names: list[str],
+    read: ReadFile,
+    metadata: dict[str, Any],
+    frames: int,
+    path: Path,
+    folder: Path,
+) -> tuple[DepthFiles | None, str]:
+    """Write depth maps as PNG of millimeters; return them, or None, and why."""
+    found = [f"rgbd/{number}.depth" in names for number in range(frames)]
+    if not any(found):
+        return None, "none"
+    if find_spec("liblzfse") is None:
+        return None, "not read: pip install pyliblzfse"
+    columns, rows = (int(_number(metadata, name, path)) for name in ("dw", "dh"))
+    if max(columns, rows) > MAX_DEPTH_SIDE:
+        raise InputError(f"{quote_path(path)}: depth of {columns}x{rows} pixels is too large.")
+    paths: list[Path | None] = [None] * frames
+    for number in range(frames):
+        if found[number]:
+            data = _unpack(read(f"rgbd/{number}.depth"), 4 * rows * columns, path)
+            meters = np.frombuffer(data, "<f4").reshape(rows, columns)
+            meters = np.where(np.isfinite(meters) & (meters > 0) & (meters < 65), meters, 0)
+            paths[number] = target = folder / "depth" / f"{number:06d}.png"
+            with atomic_write(target) as temporary:
+                Image.fromarray(np.rint(1000 * meters).astype(np.uint16)).save(temporary)
+    return DepthFiles(paths=tuple(paths), unit_m=0.001), "LiDAR"
+
+
+def _unpack(data: bytes, size: int, path: Path) -> bytes:
+    """Return the values of a depth map, which some apps store as they are."""
+    if len(data) != size:
+        import liblzfse  # pyright: ignore[reportMissingImports]
+
+        try:
+            data = liblzfse.decompress(data)
+        except (liblzfse.error, ValueError) as error:
+            raise InputError(f"{quote_path(path)}: a depth map is damaged.") from error
+    if len(data) != size:
+        raise InputError(
+            f"{quote_path(path)}: a depth map has {len(data):,} bytes, {size:,} are expected."
+        )
+    return data

@@ -1,0 +1,121 @@
+"""Clips of EgoSim's data preparation, and TRUMANS, which is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from egosim_jax.data.readers.egosim import EgoSimClips
+from egosim_jax.data.readers.hamer import place_hand
+from egosim_jax.data.readers.trumans import Trumans
+from egosim_jax.geometry import invert, transform
+from egosim_jax.types import Cameras, InputError
+
+
+def write_clip(folder, world, *, poses="poses_da3"):
+    world.write_video(folder / "video_16fps.mp4", fps=16)
+    target = folder / "_proc" / poses / folder.name
+    target.mkdir(parents=True)
+    for frame, matrix in enumerate(invert(world.poses)):
+        np.save(target / f"extrinsics_{frame:06d}.npy", matrix.astype(np.float32))
+        np.save(target / f"intrinsics_{frame:06d}.npy", world.intrinsics.astype(np.float32))
+    np.save(target / "depth_000000.npy", np.full((world.height, world.width), 0.7, np.float32))
+    (folder / "caption.txt").write_text("A person folds a towel.\n")
+    return target
+
+
+def test_cameras_depth_and_caption_are_read(world, tmp_path, imported):
+    write_clip(tmp_path / "samples/fold_1", world)
+    done, problems = imported(EgoSimClips(source=tmp_path / "samples"))
+    assert not problems
+    recording = done["fold_1"]
+    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-6)
+    np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-4)
+    assert recording.caption == "A person folds a towel."
+    assert recording.read_depth(0)[0, 0] == pytest.approx(0.7)
+    assert recording.read_depth(1) is None
+    assert recording.fps == 16
+    world.assert_first(recording)
+
+
+def test_smoothed_poses_are_preferred(world, tmp_path, imported):
+    write_clip(tmp_path / "fold_1", world)
+    raw = world.poses.copy()
+    world.poses[:, 0, 3] += 0.01
+    write_clip(tmp_path / "fold_1", world, poses="poses_da3_smoothed")
+    recording = imported(EgoSimClips(source=tmp_path / "fold_1"))[0]["fold_1"]
+    np.testing.assert_allclose(recording.world_from_camera, raw + world.poses - raw, atol=1e-6)
+    assert "smoothed" in recording.provenance["poses"]
+
+
+def test_poses_of_another_video_are_refused(world, tmp_path, imported):
+    target = write_clip(tmp_path / "fold_1", world)
+    (target / "extrinsics_000011.npy").unlink()
+    assert "11 extrinsics" in imported(EgoSimClips(source=tmp_path / "fold_1"))[1]["fold_1"]
+
+
+def write_hands(folder, world, **changes):
+    """HaMeR's result for the hands of the scene, by its camera of another focal length."""
+    focal = 5000 / 256 * max(world.width, world.height)
+    local = transform(invert(world.poses[:, None]), world.joints)
+    frames = []
+    for frame in range(world.frames):
+        hands = []
+        for side in range(2):
+            points = local[frame, side] - local[frame, side].mean(axis=0)
+            center = local[frame, side].mean(axis=0)
+            depth = center[2] * focal / world.intrinsics[0, 0]
+            place = [*center[:2].tolist(), depth]
+            hands.append({
+                "is_right": side, "confidence": 0.9, "cam_t_full": place,
+                "keypoints_3d": (points * [2 * side - 1, 1, 1]).tolist(), **changes,
+            })  # fmt: skip
+        frames.append({"frame_idx": frame, "hands": hands})
+    path = folder / "_proc/mano_full/video.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"video_id": "video", "frames": frames}))
+
+
+def test_hands_of_hamer_are_placed_where_both_cameras_see_them(world, tmp_path, imported):
+    """A weak perspective keeps the pixels to a few percent of a hand, so that the place follows."""
+    write_clip(tmp_path / "fold_1", world)
+    write_hands(tmp_path / "fold_1", world)
+    joints = imported(EgoSimClips(source=tmp_path / "fold_1"))[0]["fold_1"].joints_m
+    center, expected = joints.mean(axis=2), world.joints.mean(axis=2)
+    np.testing.assert_allclose(center, expected, atol=0.02)
+    np.testing.assert_allclose(
+        joints - center[:, :, None], world.joints - expected[:, :, None], atol=1e-6
+    )
+
+
+def test_a_hand_is_placed_exactly_where_its_pixels_are():
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (21, 3))
+    focal = 5000 / 256 * 640
+    place = np.array([0.1, -0.05, 0.5])
+    same = Cameras(
+        world_from_camera=np.eye(4)[None],
+        intrinsics_px=np.array([[focal, 0, 319.5], [0, focal, 239.5], [0, 0, 1]]),
+        height=480,
+        width=640,
+    )
+    np.testing.assert_allclose(place_hand(points, place, same), points + place, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"keypoints_3d": [[0, 0, 0]] * 20}, "keypoints_3d"),
+        ({"cam_t_full": [0, 0, float("nan")]}, "not finite"),
+        ({"cam_t_full": [0, 0, -1]}, "behind"),
+        ({"is_right": None}, "is_right"),
+    ],
+)
+def test_hostile_hands_are_refused(world, tmp_path, imported, changes, message):
+    write_clip(tmp_path / "fold_1", world)
+    write_hands(tmp_path / "fold_1", world, **changes)
+    assert message in imported(EgoSimClips(source=tmp_path / "fold_1"))[1]["fold_1"]
+
+
+def test_trumans_is_refused_with_the_reason(tmp_path):
+    with pytest.raises(InputError, match="SMPL-X"):
+        Trumans(source=tmp_path).find()

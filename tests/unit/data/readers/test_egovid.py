@@ -1,0 +1,100 @@
+"""EgoVid-5M: the direction of its poses is decided from the video; captions and spans are right."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.data.readers.egovid import EgoVid
+from egosim_jax.geometry import invert
+from egosim_jax.types import InputError
+from tests.captures import World
+
+UUID = "0a47c74a-dad9-42d5-b937-0f375490f034"
+
+
+@pytest.fixture(scope="module")
+def plane():
+    world = World(frames=20, height=240, width=320)
+    world.render_plane()
+    return world
+
+
+def write_set(root, world, *, poses=None, video=None, span=(0, 20)):
+    video_id = f"{UUID}_{span[0]}_{span[1]}"
+    world.write_video(root / f"{video or video_id}.mp4")
+    root.joinpath("egovid-val.csv").write_text(
+        "video_id,frame_num,name,llava_cap,noun_cls\n"
+        f'{video_id},20,cut onion,"The wearer cuts an onion, slowly.","onion, knife"\n'
+        "another_0_20,20,not downloaded,,\n"
+    )
+    folder = root / "poses" / video_id
+    folder.mkdir(parents=True)
+    intrinsics = world.intrinsics.copy()
+    intrinsics[:2] *= 540 / world.height
+    np.save(folder / "intri.npy", intrinsics)
+    np.save(folder / "fused_pose.npy", world.poses if poses is None else poses)
+    return video_id
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_the_direction_of_poses_is_decided_by_epipolar_geometry(
+    plane, tmp_path, imported, inverted
+):
+    poses = invert(plane.poses) if inverted else plane.poses
+    video_id = write_set(tmp_path / "set", plane, poses=poses)
+    done, problems = imported(EgoVid(source=tmp_path / "set"))
+    assert not problems
+    recording = done[video_id]
+    direction = "world_to_camera" if inverted else "camera_to_world"
+    assert recording.provenance["poses"] == direction
+    np.testing.assert_allclose(recording.world_from_camera, plane.poses, atol=1e-9)
+    np.testing.assert_allclose(recording.intrinsics_px, plane.intrinsics, atol=1e-9)
+    assert recording.caption == "The wearer cuts an onion, slowly."
+    assert recording.names == ("onion", "knife")
+    assert not recording.metric
+
+
+def test_poses_that_do_not_fit_the_video_stay_unknown(plane, tmp_path, imported):
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 1, 3] = 0.05 * np.arange(20)
+    video_id = write_set(tmp_path / "set", plane, poses=poses)
+    recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
+    assert recording.world_from_camera is None
+    assert "no reading clearly fits" in recording.provenance["poses"]
+    assert recording.intrinsics_px is not None
+
+
+def test_poses_of_another_number_of_frames_stay_unknown(plane, tmp_path, imported):
+    video_id = write_set(tmp_path / "set", plane, poses=plane.poses[:15])
+    recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
+    assert recording.world_from_camera is None
+    assert recording.provenance["poses"] == "unknown: 15 poses for 20 frames"
+
+
+def test_a_span_of_a_long_video_is_taken(world, tmp_path, imported):
+    write_set(tmp_path / "set", world, video=UUID, span=(3, 9), poses=world.poses[:2])
+    recording = imported(EgoVid(source=tmp_path / "set"))[0][f"{UUID}_3_9"]
+    assert (recording.start, recording.frames) == (3, 6)
+    corner = recording.read_frames().frames[:, 2:6, 2:6].mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(corner, 10 + 20 * np.arange(3, 9), atol=8)
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [np.zeros((20, 4, 4), complex), np.zeros((20, 3, 4)), np.full((20, 4, 4), np.nan), "object"],
+)
+def test_hostile_poses_are_refused(world, tmp_path, imported, poses):
+    video_id = write_set(tmp_path / "set", world)
+    path = tmp_path / f"set/poses/{video_id}/fused_pose.npy"
+    if isinstance(poses, str):
+        np.save(path, np.array([{}], object), allow_pickle=True)
+    else:
+        np.save(path, poses)
+    done, problems = imported(EgoVid(source=tmp_path / "set"))
+    assert not done
+    assert "fused_pose.npy" in problems[video_id]
+
+
+def test_a_folder_without_videos_is_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("video_id\n")
+    with pytest.raises(InputError, match="--videos"):
+        list(EgoVid(source=tmp_path).find())

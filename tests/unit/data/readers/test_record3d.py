@@ -1,0 +1,125 @@
+"""Record3D: poses turned from OpenGL's axes, intrinsics, depth, and damaged captures."""
+
+import io
+import json
+import sys
+import types
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egosim_jax.data.readers.record3d import Record3D
+from egosim_jax.types import InputError
+from tests.captures import quaternions
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+def jpeg(frame):
+    data = io.BytesIO()
+    Image.fromarray(frame).save(data, "JPEG", quality=95)
+    return data.getvalue()
+
+
+def write_capture(path, world, *, per_frame=True, pictures="rgbd", **changes):
+    opengl = world.poses @ FLIP
+    (fx, _, cx), (_, fy, cy), _ = world.intrinsics.tolist()
+    metadata = {
+        "w": world.width,
+        "h": world.height,
+        "dw": 4,
+        "dh": 3,
+        "fps": 60,
+        "K": [fx, 0, 0, 0, fy, 0, cx + 0.5, cy + 0.5, 1],
+        "poses": np.concatenate([quaternions(opengl[:, :3, :3]), opengl[:, :3, 3]], 1).tolist(),
+    }
+    if per_frame:
+        metadata["perFrameIntrinsicCoeffs"] = [[fx, fy, cx + 0.5, cy + 0.5]] * world.frames
+    metadata |= changes
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("metadata", json.dumps(metadata))
+        for number, frame in enumerate(world.video):
+            archive.writestr(f"{pictures}/{number}.jpg", jpeg(frame))
+            depth = np.full((3, 4), 0.5 + 0.1 * number, np.float32)
+            depth[0, 0] = np.nan
+            archive.writestr(f"rgbd/{number}.depth", zlib.compress(depth.tobytes()))
+
+
+@pytest.fixture
+def unpacker(monkeypatch):
+    """A substitute for the optional library, whose compression is zlib's."""
+    module = types.ModuleType("liblzfse")
+    module.decompress, module.error = zlib.decompress, zlib.error
+    module.__spec__ = types.SimpleNamespace(name="liblzfse")
+    monkeypatch.setitem(sys.modules, "liblzfse", module)
+
+
+@pytest.mark.parametrize("per_frame", [True, False])
+def test_poses_and_intrinsics_are_those_of_the_scene(world, tmp_path, imported, per_frame):
+    write_capture(tmp_path / "scan.r3d", world, per_frame=per_frame)
+    done, problems = imported(Record3D(source=tmp_path))
+    assert not problems
+    recording = done["scan"]
+    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
+    np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-9)
+    assert recording.metric
+    assert recording.fps == 60
+    world.assert_first(recording)
+
+
+def test_depth_is_in_meters_and_unknown_where_it_is_not_finite(world, tmp_path, imported, unpacker):
+    write_capture(tmp_path / "scan.r3d", world)
+    recording = imported(Record3D(source=tmp_path / "scan.r3d"))[0]["scan"]
+    depth = recording.read_depth(3)
+    assert depth.shape == (world.height, world.width)
+    assert depth[-1, -1] == pytest.approx(0.8)
+    assert np.isinf(depth[0, 0])
+
+
+def test_without_the_library_depth_is_unknown_and_that_is_recorded(world, tmp_path, imported):
+    write_capture(tmp_path / "scan.r3d", world)
+    recording = imported(Record3D(source=tmp_path))[0]["scan"]
+    if "liblzfse" not in sys.modules:
+        assert recording.depth is None
+        assert "pyliblzfse" in recording.provenance["depth"]
+
+
+def test_a_folder_that_was_exported_is_read(world, tmp_path, imported):
+    write_capture(tmp_path / "scan.r3d", world, pictures="rgb")
+    with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
+        archive.extractall(tmp_path / "room")
+    (tmp_path / "room/metadata").rename(tmp_path / "room/metadata.json")
+    recording = imported(Record3D(source=tmp_path / "room"))[0]["room"]
+    world.assert_first(recording)
+
+
+def test_damaged_captures_are_named(world, tmp_path, imported):
+    source = tmp_path / "set"
+    source.mkdir()
+    write_capture(source / "good.r3d", world)
+    write_capture(source / "few.r3d", world, poses=[[0, 0, 0, 1, 0, 0, 0]] * 5)
+    write_capture(source / "wild.r3d", world, poses=[[0, 0, 0, 1, float("nan"), 0, 0]] * 12)
+    write_capture(source / "long.r3d", world, poses=[[0, 0, 0, 2, 0, 0, 0]] * 12)
+    zoom = [[90 + n, 90, 64, 48] for n in range(12)]
+    write_capture(source / "zoom.r3d", world, perFrameIntrinsicCoeffs=zoom)
+    write_capture(source / "small.r3d", world, w=64)
+    (source / "cut.r3d").write_bytes((source / "good.r3d").read_bytes()[:3000])
+    done, problems = imported(Record3D(source=source))
+    assert list(done) == ["good"]
+    for name, message in {
+        "few": "5 poses",
+        "wild": "finite numbers",
+        "long": "not a rigid transform",
+        "zoom": "Lock the focus",
+        "small": "calibrated for 64x96",
+        "cut": "not a readable .r3d",
+    }.items():
+        assert message in problems[name]
+
+
+def test_a_folder_without_captures_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no \.r3d files"):
+        list(Record3D(source=tmp_path).find())
