@@ -44,6 +44,7 @@ from egosim_jax.types import (
     Kind,
     check_counts,
     is_rigid,
+    near_view,
 )
 
 FORMAT, VERSION = "egosim_jax.recording", 1
@@ -194,17 +195,23 @@ class Recording:
         return np.where(np.isfinite(values) & (values > 0), values, np.float32(np.inf))
 
     def clip(self, start: int, stop: int) -> Recording:
-        """Return the recording of frames `start` to `stop` (exclusive), with the same id."""
+        """Return the recording of frames `start` to `stop` (exclusive), with the same id.
+
+        Hands that never come near the view in these frames are missing from all of them.
+        """
         if not 0 <= start < stop <= self.frames:
             raise InputError(
                 f"Frames {start} to {stop} of recording {self.recording_id}: it has {self.frames}, "
                 "and a clip needs at least one."
             )
-        per_frame = {
-            name: value[start:stop]
-            for name in ("world_from_camera", "joints_m")
-            if (value := getattr(self, name)) is not None
-        }
+        poses, joints = self.world_from_camera, self.joints_m
+        if joints is not None:
+            joints = joints[start:stop].copy()
+        if joints is not None and self.cameras is not None:
+            shown = replace(
+                self.cameras, world_from_camera=self.cameras.world_from_camera[start:stop]
+            )
+            joints[:, ~near_view(shown, joints).any(axis=0)] = np.nan
         depth = self.depth and replace(self.depth, paths=self.depth.paths[start:stop])
         return replace(
             self,
@@ -212,7 +219,8 @@ class Recording:
             frames=stop - start,
             depth=depth,
             points=self.points and self.points.within(start, stop),
-            **per_frame,
+            world_from_camera=None if poses is None else poses[start:stop],
+            joints_m=joints,
         )
 
     def save(self, folder: Path) -> None:

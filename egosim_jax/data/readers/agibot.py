@@ -38,11 +38,11 @@ from jaxtyping import Float
 
 from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
-from egosim_jax.data.readers.hdf5 import Hdf5, open_hdf5
 from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.data.readers.rotations import from_quaternions
 from egosim_jax.data.recording import DepthFiles, Recording
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.io.isolated import read_hdf5
 from egosim_jax.io.segments import probe_long_video, read_segment
 from egosim_jax.io.untrusted import quote, quote_path, read_json
 from egosim_jax.io.video import VideoInfo, write_frames
@@ -127,8 +127,7 @@ class AgiBot:
         info = probe_long_video(files.video)
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
-        with open_hdf5(files.states) as file:
-            joints, notes = _read_grippers(file)
+        joints, notes = _read_grippers(files.states)
         span = _span(part, {"frames": info.frames, "poses": len(matrices), "states": len(joints)})
         joints, matrices = joints[span], matrices[span]
         poses, decision = self._decide(matrices, joints, lens)
@@ -289,15 +288,23 @@ def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"]:
     return matrices
 
 
-def _read_grippers(file: Hdf5) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, str]]:
+def _read_grippers(path: Path) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, str]]:
     """Return the joints of both grippers in the base, and how the opening was read."""
-    positions = file.array("state/end/position", (None, 2, 3))
-    rotations = from_quaternions(file.array("state/end/orientation", (len(positions), 2, 4)))
-    opening = file.array("state/effector/position", (len(positions), None))
+    end, effector = "state/end", "effector/position"
+    shapes = {f"{end}/position": (None, 2, 3), f"{end}/orientation": (None, 2, 4),
+              f"state/{effector}": (None, None)}  # fmt: skip
+    arrays = read_hdf5(path, shapes, optional={f"action/{effector}": (None, None)}).arrays
+    positions, orientations, opening = (arrays[name] for name in shapes)
+    if not len(positions) == len(orientations) == len(opening):
+        raise InputError(
+            f"{quote_path(path)} has {len(positions)} positions, {len(orientations)} orientations "
+            f"and {len(opening)} openings: it is damaged in the set itself."
+        )
+    rotations = from_quaternions(orientations)
     if opening.shape[1] != 2:
         return np.full((len(positions), 2, 3, 3), np.nan), {"hands": "not grippers"}
     notes = {"opening": "grows when it opens"}
-    if _closes(file, opening):
+    if _closes(arrays.get(f"action/{effector}"), opening):
         opening, notes = OPEN_MM - opening, {"opening": "grows when it closes, as the command"}
     half = np.clip(opening, 0, OPEN_MM) / 2000
     zero = np.zeros_like(half)
@@ -309,16 +316,12 @@ def _read_grippers(file: Hdf5) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, 
     return joints, notes
 
 
-def _closes(file: Hdf5, opening: Float[np.ndarray, "f 2"]) -> bool:
+def _closes(command: np.ndarray | None, opening: Float[np.ndarray, "f 2"]) -> bool:
     """Return True if the measured value grows with the command, which is 1 when closed."""
-    if not file.has("action/effector/position"):
+    if command is None or command.shape != opening.shape:
         return False
-    try:
-        command = file.array("action/effector/position", (len(opening), 2))
-    except InputError:
-        return False
-    both = command - command.mean(axis=0), opening - opening.mean(axis=0)
-    return bool(np.nansum(both[0] * both[1]) > 0)
+    changes = (command - command.mean(axis=0)) * (opening - opening.mean(axis=0))
+    return bool(np.nansum(changes) > 0)
 
 
 def _find_depth(folder: Path, span: slice) -> DepthFiles | None:

@@ -26,6 +26,8 @@ from egosim_jax.types import InputError
 
 MAX_BYTES = 1 << 30
 """Largest file of a model in bytes."""
+MAX_VALUE = 1e12
+"""Largest coordinate, color or error of a point."""
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5),
           4: ("OPENCV", 8), 5: ("OPENCV_FISHEYE", 8)}  # fmt: skip
 """Camera models that are read, by number: name and number of parameters."""
@@ -228,6 +230,8 @@ def _image(
 
 def _points(rows: list) -> tuple[np.ndarray, ...]:
     table = np.array(rows, float).reshape(len(rows), 8)
+    if not (np.abs(table[:, 1:]) < MAX_VALUE).all():
+        raise ValueError("a point is not finite, or implausible")
     colors = np.clip(table[:, 4:7], 0, 255).astype(np.uint8)
     return table[:, 0].astype(np.int64), table[:, 1:4], colors, table[:, 7]
 

@@ -17,7 +17,7 @@ ring and little finger. Columns and rows count from the corner of the picture (i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,14 +25,15 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 import tyro
+from einops import rearrange
 from jaxtyping import Float
 
 from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
-from egosim_jax.data.readers.hdf5 import Hdf5, open_hdf5
 from egosim_jax.data.recording import Recording
+from egosim_jax.io.isolated import read_hdf5
 from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted import quote, quote_path
 from egosim_jax.types import Cameras, InputError
 
 _SEGMENTS = ("Knuckle", "IntermediateBase", "IntermediateTip", "Tip")
@@ -40,6 +41,8 @@ _FINGERS = ("Thumb", "IndexFinger", "MiddleFinger", "RingFinger", "LittleFinger"
 JOINT_NAMES = ("Hand", *(finger + segment for finger in _FINGERS for segment in _SEGMENTS))
 """Names of our 21 keypoints in the set, without the side."""
 SIDES = ("left", "right")
+TEXTS = ("llm_description", "llm_description2", "which_llm_description", "llm_type", "llm_objects")
+"""Attributes that are read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,19 +70,26 @@ class EgoDex:
     def _read(self, path: Path, folder: Path) -> Recording:
         video = path.with_suffix(".mp4")
         info = probe_long_video(video)
-        with open_hdf5(path) as file:
-            poses = file.array("transforms/camera", (None, 4, 4))
-            intrinsics = file.array("camera/intrinsic", (3, 3))
-            frames = len(poses)
-            if frames != info.frames:
-                raise InputError(
-                    f"{quote_path(path)} has {frames} camera poses, and {video.name} "
-                    f"{info.frames} frames: each frame must have one. Get both files again."
-                )
-            joints = None
-            if any(file.has(f"transforms/{side}{name}") for side in SIDES for name in JOINT_NAMES):
-                joints = np.stack([self._hand(file, side, frames) for side in SIDES], axis=1)
-            caption, names = _texts(file)
+        names = [side + name for side in SIDES for name in JOINT_NAMES]
+        file = read_hdf5(
+            path,
+            {"transforms/camera": (None, 4, 4), "camera/intrinsic": (3, 3)},
+            optional={
+                **{f"transforms/{name}": (None, 4, 4) for name in names},
+                **{f"confidences/{name}": (None,) for name in names},
+            },
+            texts=TEXTS,
+        )
+        poses, intrinsics = (file.arrays[n] for n in ("transforms/camera", "camera/intrinsic"))
+        lengths = {len(a) for name, a in file.arrays.items() if name != "camera/intrinsic"}
+        if lengths != {info.frames}:
+            raise InputError(
+                f"{quote_path(path)} has {len(poses)} camera poses, joints or confidences of "
+                f"{quote(str(sorted(lengths)))} frames, and {video.name} has {info.frames}: all "
+                "must agree. Get both files again."
+            )
+        joints = self._joints(file.arrays, names, path)
+        caption, objects = _texts(file.texts)
         cameras = Cameras(
             world_from_camera=poses,
             intrinsics_px=_fit_intrinsics(intrinsics, info.height, info.width),
@@ -92,7 +102,7 @@ class EgoDex:
         return Recording(
             recording_id=make_id([path.stem]),
             video=video,
-            frames=frames,
+            frames=info.frames,
             fps=info.fps,
             height=info.height,
             width=info.width,
@@ -101,17 +111,27 @@ class EgoDex:
             metric=True,
             joints_m=joints,
             caption=caption or None,
-            names=names,
+            names=objects,
             provenance=counts,
         )
 
-    def _hand(self, file: Hdf5, side: str, frames: int) -> Float[np.ndarray, "f 21 3"]:
-        names = [side + name for name in JOINT_NAMES]
-        poses = [file.array(f"transforms/{name}", (frames, 4, 4)) for name in names]
-        joints = np.stack(poses, axis=1)[:, :, :3, 3]
-        if file.has("confidences"):
-            certain = [file.array(f"confidences/{name}", (frames,)) for name in names]
-            joints[np.median(certain, axis=0) < self.min_confidence] = np.nan
+    def _joints(
+        self, arrays: Mapping[str, np.ndarray], names: list[str], path: Path
+    ) -> Float[np.ndarray, "f 2 21 3"] | None:
+        """Return the joints of both hands; None if the file has none."""
+        absent = [name for name in names if f"transforms/{name}" not in arrays]
+        if len(absent) == len(names):
+            return None
+        if absent:
+            raise InputError(
+                f"{quote_path(path)}: transforms/{absent[0]} is missing; expected all joints of "
+                "both hands, or none."
+            )
+        joints = np.stack([arrays[f"transforms/{name}"][:, :3, 3] for name in names], axis=1)
+        joints = rearrange(joints, "f (n j) c -> f n j c", n=2)
+        certain = [arrays.get(f"confidences/{name}", np.ones(len(joints))) for name in names]
+        confidence = rearrange(np.stack(certain), "(n j) f -> f n j", n=2)
+        joints[np.median(confidence, axis=2) < self.min_confidence] = np.nan
         return joints
 
 
@@ -134,10 +154,13 @@ def _fit_intrinsics(
     return fitted
 
 
-def _texts(file: Hdf5) -> tuple[str, tuple[str, ...]]:
+def _texts(texts: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
     """Return the caption and the names of objects.
 
     Of a task that can be reversed, `which_llm_description` names the one that was done.
     """
-    second = file.text("llm_type") == "reversible" and file.text("which_llm_description") == "2"
-    return file.text("llm_description2" if second else "llm_description"), file.texts("llm_objects")
+    first = {name: values[0] for name, values in texts.items() if values}
+    reversible = first.get("llm_type") == "reversible"
+    second = reversible and first.get("which_llm_description") == "2"
+    caption = first.get("llm_description2" if second else "llm_description", "")
+    return caption, texts["llm_objects"]

@@ -24,8 +24,8 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
-from egosim_jax.data.readers.parquet import read_columns
 from egosim_jax.data.recording import MAX_FRAMES, Recording
+from egosim_jax.io.isolated import read_parquet
 from egosim_jax.io.segments import probe_long_video
 from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text, read_json, read_lines
 from egosim_jax.io.video import VideoInfo
@@ -186,7 +186,7 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
         raise InputError(f"{root} has no meta/episodes/chunk-*/file-*.parquet.")
     place = {n: f"videos/{camera}/{n}" for n in ("chunk_index", "file_index", "from_timestamp")}
     for path in paths:
-        table = read_columns(
+        table = read_parquet(
             path,
             ["episode_index", "length", *place.values()],
             optional=["tasks", "data/chunk_index", "data/file_index"],
@@ -214,7 +214,7 @@ def _tasks(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> tuple
     """Return the tasks of an episode whose row does not name them, from the rows of its frames."""
     fields = {n: _count(row.get(f"data/{n}"), n) for n in ("chunk_index", "file_index")}
     path = _fill(root, info.get("data_path"), fields, what="data_path")
-    frames = read_columns(path, ["episode_index", "task_index"])
+    frames = read_parquet(path, ["episode_index", "task_index"])
     pairs = zip(frames["episode_index"], frames["task_index"], strict=True)
     used = dict.fromkeys(task for episode, task in pairs if episode == row["episode_index"])
     texts = read_tasks(root)
@@ -224,7 +224,7 @@ def _tasks(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> tuple
 def read_tasks(root: Path) -> dict[int, str]:
     """Return the texts of tasks by index, from either form of meta/tasks.parquet."""
     names = ("task", "__index_level_0__")
-    table = read_columns(root / "meta" / "tasks.parquet", ["task_index"], optional=names)
+    table = read_parquet(root / "meta" / "tasks.parquet", ["task_index"], optional=names)
     texts = next((table[name] for name in names if name in table), None)
     if texts is None:
         raise InputError("meta/tasks.parquet has neither an index of texts nor a column task.")

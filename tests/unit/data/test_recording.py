@@ -124,6 +124,17 @@ def test_a_clip_keeps_what_belongs_to_its_frames(tmp_path):
     assert clip.points.indices.tolist() == [3]
 
 
+def test_a_clip_has_no_hand_that_comes_into_view_only_later(tmp_path):
+    joints = make_recording(tmp_path).joints_m.copy()
+    joints[:4, 0] = make_hand() + [9, 0, 0]
+    joints[4:, 0] = make_hand()
+    recording = make_recording(tmp_path, joints_m=joints)
+    clip = recording.clip(0, 3)
+    assert np.isnan(clip.joints_m[:, 0]).all()
+    assert np.isfinite(clip.joints_m[1:, 1]).all()
+    assert np.isfinite(recording.joints_m[:, 0]).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

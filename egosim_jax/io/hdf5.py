@@ -74,10 +74,6 @@ class Hdf5:
         texts = (v.decode("utf-8", "replace") if isinstance(v, bytes) else v for v in values)
         return tuple(text for text in texts if isinstance(text, str))
 
-    def text(self, name: str) -> str:
-        """Return the text of an attribute of the file, empty if it is absent."""
-        return next(iter(self.texts(name)), "")
-
     def _resolve(self, path: str) -> Any:
         import h5py
 

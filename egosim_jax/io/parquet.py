@@ -11,7 +11,7 @@ from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 32
 """Largest file in bytes."""
-MAX_COLUMN_BYTES = 1 << 28
+MAX_COLUMN_BYTES = 1 << 26
 """Largest size of the columns that are read, in bytes, unpacked."""
 MAX_ROWS = 1 << 24
 """Largest number of rows."""
