@@ -16,15 +16,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float, Float32, Int32
 
-from egosim_jax.geometry import cameras_in_object_frame, invert, pixel_rays, project, transform
-from egosim_jax.perception.object_motion import PALM, TrackObjects
+from egosim_jax.geometry import cameras_in_object_frame, pixel_rays
+from egosim_jax.perception.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
 from egosim_jax.perception.registry import register
+from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering.reference import render, splat
-from egosim_jax.rendering.skeleton import SKELETONS
-from egosim_jax.types import Action, Cameras, Clip, Kind, SceneState, check_counts
+from egosim_jax.types import Action, Cameras, Clip, SceneState, check_counts
 
 
 def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
@@ -33,25 +33,8 @@ def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observati
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandMasks:
+class HandMasks(HandShape):
     """Stage that sets `object_ids` to the silhouettes of hands and arms, drawn from the joints."""
-
-    finger_radius_m: float = 0.013
-    """Radius of the flesh around a bone in meters."""
-    arm_radius_m: float = 0.05
-    """Radius of a forearm in meters."""
-    shoulder_offset_m: tuple[float, float, float] = (0.0, 0.35, 0.05)
-    """Origin of an arm in camera axes in meters; x is relative to the wrist's."""
-    arm_fraction: float = 0.8
-    """Fraction of the way from the wrist to the arm's origin that is drawn."""
-    near_m: float = 0.05
-    """Flesh nearer to the camera than this is not drawn, in meters."""
-    discs: int = 25
-    """Number of discs that a capsule is drawn with."""
-
-    def __post_init__(self) -> None:
-        """Check that a capsule is drawn with at least one disc."""
-        check_counts({"discs": self.discs})
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
@@ -131,60 +114,6 @@ class ClassicalConfig:
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
         """Return the classical perception pipeline; the ground truth is not used."""
         return Pipeline(stages=(take_action, self.hands, self.motion, self.surfaces))
-
-
-def hand_silhouette(
-    joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, cameras: Cameras, config: HandMasks
-) -> Int32[np.ndarray, "f h w"]:
-    """Return the number of the hand that covers each pixel, arm included; -1 for none.
-
-    A hand is its bones with flesh around them, the palm between its knuckles, and an arm from the
-    wrist towards the wearer. One with a joint that is not finite is missing.
-    """
-    import cv2
-
-    covered = np.full((len(joints_m), cameras.height, cameras.width), -1, np.int32)
-    bones = SKELETONS[kind].bones.tolist()
-    for frame, world_from_camera in enumerate(cameras.world_from_camera):
-        canvas = np.zeros((cameras.height, cameras.width), np.uint8)
-        for number, hand in enumerate(joints_m[frame]):
-            if not np.isfinite(hand).all():
-                continue
-            joints = transform(invert(world_from_camera), hand)
-            palm = joints[PALM[kind]]
-            shoulder = np.array(config.shoulder_offset_m) + [palm[0, 0], 0, 0]
-            elbow = palm[0] + config.arm_fraction * (shoulder - palm[0])
-            canvas[:] = 0
-            for start, end in bones:
-                radius_m = config.finger_radius_m
-                draw_capsule(canvas, joints[start], joints[end], radius_m, cameras, config)
-            draw_capsule(canvas, palm[0], elbow, config.arm_radius_m, cameras, config)
-            if (palm[:, 2] > config.near_m).all():
-                u, v = project(cameras.intrinsics_px, palm)
-                corners = np.rint(np.stack([u, v], axis=1)).astype(np.int32)
-                cv2.fillConvexPoly(canvas, cv2.convexHull(corners), 1)
-            covered[frame][canvas > 0] = number
-    return covered
-
-
-def draw_capsule(
-    canvas: UInt8[np.ndarray, "h w"],
-    start: Float[np.ndarray, " 3"],
-    end: Float[np.ndarray, " 3"],
-    radius_m: float,
-    cameras: Cameras,
-    config: HandMasks,
-) -> None:
-    """Draw a capsule between two points in camera coordinates, as discs of its radius."""
-    import cv2
-
-    centers_m = start + np.linspace(0, 1, config.discs)[:, None] * (end - start)
-    centers_m = centers_m[centers_m[:, 2] > config.near_m]
-    limit = 10 * cameras.width  # beyond it a disc is outside the image, and OpenCV's range
-    centers = np.clip(np.stack(project(cameras.intrinsics_px, centers_m), axis=1), -limit, limit)
-    radii = cameras.intrinsics_px[0, 0] * radius_m / centers_m[:, 2]
-    for (column, row), radius in zip(np.rint(centers).astype(int), radii, strict=True):
-        cv2.circle(canvas, (int(column), int(row)), max(1, round(float(radius))), 1, -1)
 
 
 def plane_depth(plane: Float[np.ndarray, " 4"], cameras: Cameras) -> Float32[np.ndarray, "f h w"]:

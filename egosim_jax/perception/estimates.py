@@ -105,6 +105,8 @@ class DepthEstimate:
     """Pixels that were measured; the others were completed from them."""
     metric: bool
     """True if the depth is in meters by itself, as of a metric network."""
+    reason: str = ""
+    """Method in words, for the report: above all that depth was assumed and not measured."""
 
 
 @runtime_checkable

@@ -26,11 +26,10 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
+from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
 from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
 
-PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
-"""Joints that move as one rigid body: wrist and knuckles; all of a gripper."""
 TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Joints that grasp: thumb, index and middle finger; both jaws of a gripper."""
 

@@ -1,0 +1,148 @@
+"""Depth estimator for recorded videos: plane sweep, sparse points, completion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from einops import reduce
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from egosim_jax.perception.depth.complete import Diffusion
+from egosim_jax.perception.depth.planes import has_parallax, plane_depth_estimate
+from egosim_jax.perception.depth.sparse import SparseFilter
+from egosim_jax.perception.depth.sweep import PlaneSweep, choose_views
+from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
+from egosim_jax.types import Cameras, InputError, check_counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweptDepth:
+    """Depth of a static scene from the parallax of a moving camera; a `DepthEstimator`."""
+
+    downscale: int = 2
+    """Factor by which frames are reduced before the sweep."""
+    percentiles: tuple[float, float] = (1.0, 99.0)
+    """Percentiles of the sparse points' depths between which planes are swept."""
+    margin: float = 0.1
+    """Widening of that range, relative to the inverse depths at its ends."""
+    sparse_weight: float = 4.0
+    """Weight of a sparse point in the completion, versus a confident pixel of the sweep."""
+    points: SparseFilter = field(default_factory=SparseFilter)
+    """Selection of sparse points."""
+    sweep: PlaneSweep = field(default_factory=PlaneSweep)
+    """Plane sweep of each wanted frame."""
+    diffusion: Diffusion = field(default_factory=Diffusion)
+    """Completion of what was not measured."""
+
+    def __post_init__(self) -> None:
+        """Check the factor of the reduction."""
+        check_counts({"downscale": self.downscale})
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        moving: Bool[np.ndarray, "f h w"],
+        estimate: CameraEstimate,
+        wanted: Sequence[int],
+    ) -> DepthEstimate:
+        """Return depth of the wanted frames in the unit of the cameras, known everywhere.
+
+        What `moving` hides is completed from around it. Cameras that stay in place have no
+        parallax: then depth is that of a plane, and the estimate's `reason` says so. Raises
+        `InputError` if cameras were refused, or have no triangulated points.
+        """
+        cameras = estimate.cameras
+        if cameras is None:
+            raise InputError(
+                "Depth cannot be swept without cameras, which were refused: "
+                f"{estimate.verdict.reason}. Give cameras, or a depth network. (--depth)"
+            )
+        if not has_parallax(estimate):
+            return plane_depth_estimate(estimate, cameras, wanted)
+        if estimate.points is None:
+            raise InputError(
+                "Depth cannot be swept without triangulated points, which give its range. Give "
+                "them with the cameras, or a depth network. (--depth)"
+            )
+        small, hidden, reduced = reduce_video(frames, moving, cameras, self.downscale)
+        depths, measured = [], []
+        for frame in wanted:
+            pixels, depth = self.points(estimate.points, cameras, frame, moving[frame])
+            pixels = (pixels + 0.5) / self.downscale - 0.5
+            inverse, known = self._frame(small, hidden, reduced, frame, pixels, depth)
+            depths.append(1 / _enlarge(inverse, cameras))
+            measured.append(_enlarge(known.astype(np.float32), cameras) > 0.5)
+        return DepthEstimate(
+            frames=np.array(wanted, np.int32),
+            depth_m=np.stack(depths),
+            confident=np.stack(measured),
+            metric=estimate.metric,
+            reason="plane sweep, completed by diffusion",
+        )
+
+    def _frame(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        hidden: Bool[np.ndarray, "f h w"],
+        cameras: Cameras,
+        frame: int,
+        pixels: Float[np.ndarray, "n 2"],
+        depth: Float[np.ndarray, " n"],
+    ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+        """Return the completed inverse depth of a reduced frame, and where it was measured."""
+        if len(depth) < 2:
+            raise InputError(
+                f"Frame {frame} observes {len(depth)} triangulated points that can be trusted: at "
+                "least 2 are needed for the range of its depth. Give a depth network. (--depth)"
+            )
+        far, near = np.percentile(1 / depth, [100 - p for p in self.percentiles[::-1]])
+        far, near = float(far) * (1 - self.margin), float(near) * (1 + self.margin)
+        views = choose_views(cameras, frame, float(np.median(depth)), self.sweep.views)
+        swept = self.sweep(frames, hidden, cameras, frame, views, (far, near))
+        weight = swept.confident.astype(float)
+        total = weight * swept.inverse
+        column, row = np.rint(pixels).astype(int).T
+        row, column = np.clip(row, 0, cameras.height - 1), np.clip(column, 0, cameras.width - 1)
+        np.add.at(total, (row, column), self.sparse_weight / depth)
+        np.add.at(weight, (row, column), self.sparse_weight)
+        inverse = self.diffusion(frames[frame], total / np.maximum(weight, 1e-12), weight)
+        return np.clip(inverse, far, near), weight > 0
+
+
+def reduce_video(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    moving: Bool[np.ndarray, "f h w"],
+    cameras: Cameras,
+    factor: int,
+) -> tuple[UInt8[np.ndarray, "f r c 3"], Bool[np.ndarray, "f r c"], Cameras]:
+    """Return frames, moving pixels and cameras reduced by a factor; what is left over is cut off.
+
+    A reduced pixel moves if any of its pixels does.
+    """
+    import cv2
+
+    height, width = cameras.height // factor, cameras.width // factor
+    rows, columns = slice(height * factor), slice(width * factor)
+    small = [
+        cv2.resize(frame[rows, columns], (width, height), interpolation=cv2.INTER_AREA)
+        for frame in frames
+    ]
+    hidden = reduce(moving[:, rows, columns], "f (h a) (w b) -> f h w", "max", a=factor, b=factor)
+    matrix = cameras.intrinsics_px.astype(float).copy()
+    matrix[:2, 2] += 0.5
+    matrix[:2] /= factor
+    matrix[:2, 2] -= 0.5
+    return (
+        np.stack(small),
+        hidden,
+        replace(cameras, intrinsics_px=matrix, height=height, width=width),
+    )
+
+
+def _enlarge(values: Float32[np.ndarray, "r c"], cameras: Cameras) -> Float32[np.ndarray, "h w"]:
+    import cv2
+
+    size = cameras.width, cameras.height
+    return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)

@@ -1,0 +1,133 @@
+"""First frame without hands: hidden pixels are taken from the frames that see them.
+
+A pixel that a hand hides in the first frame shows the scene at its depth there. Each is taken from
+the nearest frame in time whose view of that point is free, so that what a hand moves later stays
+where it was: a temporal median would erase it. What no frame shows is filled with patches of the
+rest of the picture (PatchMatch; Barnes et al. 2009), or by Telea's method without that library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from egosim_jax.geometry import invert, pixel_rays, project, transform
+from egosim_jax.types import Cameras
+
+Inpainter = Literal["patchmatch", "telea", "none"]
+"""Method that filled the pixels that no frame shows."""
+PATCH = 5
+"""Radius of the compared patches in pixels."""
+RING_PX = 7
+"""Width in pixels of the ring around the hidden pixels in which brightness is compared."""
+MAX_GAIN = 1.25
+"""Largest factor on the colors of another frame."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class CleanPlate:
+    """First frame without hands."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    seen: Bool[np.ndarray, "h w"]
+    """Hidden pixels that were taken from other frames."""
+    method: Inpainter
+    """Method that filled the other hidden pixels; `none` if there were none."""
+
+
+def clean_plate(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    moving: Bool[np.ndarray, "f h w"],
+    cameras: Cameras,
+    depth_m: Float[np.ndarray, "h w"],
+    *,
+    margin_px: int = 3,
+) -> CleanPlate:
+    """Return the first frame with its `moving` pixels replaced by what they hide.
+
+    `depth_m` is the first frame's, in the unit of the cameras, completed behind the hands; a pixel
+    whose depth is not known is filled by patches. `moving` is widened by a margin.
+    """
+    import cv2
+
+    margin = np.ones((2 * margin_px + 1,) * 2, np.uint8)
+    hide = np.stack([cv2.dilate(m.astype(np.uint8), margin) for m in moving]) > 0
+    image, missing = frames[0].copy(), hide[0].copy()
+    ring = cv2.dilate(missing.astype(np.uint8), np.ones((2 * RING_PX + 1,) * 2, np.uint8)) > 0
+    rows, columns = np.nonzero(ring & np.isfinite(depth_m))
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    points = transform(
+        cameras.world_from_camera[0], rays[rows, columns] * depth_m[rows, columns][:, None]
+    )
+    for frame in range(1, len(frames)):
+        wanted = missing[rows, columns]
+        if not wanted.any():
+            break
+        colors, free = _look_up(frames[frame], hide[frame], cameras, frame, points)
+        border = free & ~hide[0][rows, columns]
+        gain = _gain(image[rows, columns][border], colors[border])
+        taken = free & wanted
+        image[rows[taken], columns[taken]] = np.clip(colors[taken] * gain + 0.5, 0, 255)
+        missing[rows[taken], columns[taken]] = False
+    image, method = _inpaint(image, missing)
+    return CleanPlate(image=image, seen=hide[0] & ~missing, method=method)
+
+
+def _look_up(
+    image: UInt8[np.ndarray, "h w 3"],
+    hide: Bool[np.ndarray, "h w"],
+    cameras: Cameras,
+    frame: int,
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Return the colors of points in a frame, and which are in view and not hidden."""
+    import cv2
+
+    local = transform(invert(cameras.world_from_camera[frame]), points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (x.astype(np.float32) for x in project(cameras.intrinsics_px, local))
+        free = (local[:, 2] > 0) & (u >= 0) & (v >= 0)
+        free &= (u <= cameras.width - 1) & (v <= cameras.height - 1)
+    u, v = np.where(free, u, 0), np.where(free, v, 0)
+    colors = _sample(image, u, v, cv2.INTER_LINEAR)
+    free &= _sample(hide.astype(np.uint8), u, v, cv2.INTER_NEAREST) == 0
+    return colors.astype(float), free
+
+
+def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray, method: int) -> np.ndarray:
+    """Return the values of an image at some pixels; in rows, for OpenCV's limit on their number."""
+    import cv2
+
+    width = 1024
+    missing = -len(u) % width
+    u, v = (np.pad(x, (0, missing)).reshape(-1, width) for x in (u, v))
+    values = cv2.remap(image, u, v, method, borderMode=cv2.BORDER_REPLICATE)
+    return values.reshape(-1, *image.shape[2:])[: values.shape[0] * width - missing]
+
+
+def _gain(here: np.ndarray, there: np.ndarray) -> Float[np.ndarray, " 3"]:
+    """Return the factor of each channel that equals the brightness of two views of the ring."""
+    if len(here) < 50:
+        return np.ones(3)
+    ratio = np.median(here.astype(float) + 1, axis=0) / np.median(there + 1, axis=0)
+    return np.clip(ratio, 1 / MAX_GAIN, MAX_GAIN)
+
+
+def _inpaint(
+    image: UInt8[np.ndarray, "h w 3"], missing: Bool[np.ndarray, "h w"]
+) -> tuple[UInt8[np.ndarray, "h w 3"], Inpainter]:
+    """Return the image with its missing pixels filled, and the method's name."""
+    if not missing.any():
+        return image, "none"
+    try:
+        from patchmatch import patch_match
+    except ImportError:
+        import cv2
+
+        return cv2.inpaint(image, missing.astype(np.uint8), PATCH, cv2.INPAINT_TELEA), "telea"
+    hole = missing[..., None].astype(np.uint8)
+    return patch_match.inpaint(image, hole, patch_size=PATCH), "patchmatch"

@@ -1,0 +1,271 @@
+"""Meters per unit of estimated cameras, with the source and the uncertainty of that scale.
+
+Cameras from one moving camera have an unknown unit. A hand gives the meter: the size of its mean
+skeleton gives its depth, a hand is never behind the surface that is seen at its fingertips, and it
+touches that surface now and then. So z_hand / z_scene, over fingertips and frames, is at most the
+scale, apart from errors, and near it at contact: its 90th percentile is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from egosim_jax.geometry import pixel_rays, pixels_of, transform
+from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
+from egosim_jax.rendering.reference import splat
+from egosim_jax.types import Cameras, InputError
+
+Source = Literal["given", "cameras", "camera height", "metric depth", "hands", "median depth"]
+"""Origin of a scale, from the most to the least certain."""
+TIPS = (4, 8, 12, 16, 20)
+"""Keypoints at the tips of thumb, index, middle, ring and little finger."""
+CONTACT_PERCENTILE = 90
+"""Percentile of z_hand / z_scene that is taken for contact."""
+HAND_SIZE_ERROR = 0.1
+"""Relative standard deviation of the size of human hands around their mean."""
+ASSUMED_MEDIAN_M = 0.6
+"""Median depth in meters that is assumed where nothing gives a scale."""
+ASSUMED_ERROR = 0.5
+"""Relative uncertainty of a scale from the assumed median depth."""
+MIN_TIPS = 20
+"""Fewest fingertips over all frames that give a scale."""
+REDUCTION = 2
+"""Factor by which the scene's depth is reduced for the comparison with fingertips."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Meters per unit of cameras and depth."""
+
+    meters_per_unit: float
+    """Factor on positions and depths that gives meters."""
+    uncertainty: float
+    """Relative standard deviation of the factor."""
+    source: Source
+    """Origin of the scale."""
+    reason: str
+    """Explanation in words, for the report."""
+
+    def __post_init__(self) -> None:
+        """Check that the scale is positive and finite."""
+        if not (np.isfinite(self.meters_per_unit) and self.meters_per_unit > 0):
+            raise InputError(
+                f"The scale is {self.meters_per_unit:.4g} m per unit: it must be positive and "
+                "finite. Give another. (--scale)"
+            )
+
+
+def estimate_scale(
+    estimate: CameraEstimate,
+    depth: DepthEstimate,
+    joints_camera_m: Float[np.ndarray, "f n 21 3"] | None = None,
+    moving: Bool[np.ndarray, "f h w"] | None = None,
+    *,
+    meters_per_unit: float | None = None,
+    camera_height_m: float | None = None,
+    metric_depth: DepthEstimate | None = None,
+) -> Scale:
+    """Return the scale of estimated cameras from the best source at hand.
+
+    In this order: given, cameras that are metric, the height of the camera above the surface in the
+    lower half of the first frame, a metric depth map of some of the same frames, hands, and an
+    assumed median depth, which is flagged by its source and its uncertainty. `joints_camera_m` are
+    the joints of the hands in meters in the camera of each frame. Pixels in `moving` do not count
+    as scene.
+    """
+    if meters_per_unit is not None:
+        return Scale(
+            meters_per_unit=meters_per_unit, uncertainty=0.0, source="given", reason="given"
+        )
+    cameras = estimate.cameras
+    if cameras is None:
+        raise InputError(
+            "Cameras were refused, so that they have no scale: it needs estimated cameras. Give "
+            f"them, or another clip. Reason of the refusal: {estimate.verdict.reason}"
+        )
+    if estimate.metric:
+        return Scale(
+            meters_per_unit=1.0, uncertainty=0.0, source="cameras", reason="cameras are in meters"
+        )
+    scene = _without(depth, moving)
+    if camera_height_m is not None:
+        return _from_height(cameras, scene, camera_height_m)
+    if metric_depth is not None:
+        return _from_depth(scene, metric_depth)
+    if joints_camera_m is not None:
+        found = _from_hands(cameras, scene, joints_camera_m)
+        if found is not None:
+            return found
+    known = scene.depth_m[np.isfinite(scene.depth_m)]
+    _require(known.size > 0, "no depth is known")
+    return Scale(
+        meters_per_unit=ASSUMED_MEDIAN_M / float(np.median(known)),
+        uncertainty=ASSUMED_ERROR,
+        source="median depth",
+        reason=f"assumed: no hand, camera height or metric depth gives the scale, so that the "
+        f"median depth is set to {ASSUMED_MEDIAN_M} m",
+    )
+
+
+def scale_cameras(estimate: CameraEstimate, scale: Scale) -> CameraEstimate:
+    """Return cameras and sparse points in meters."""
+    cameras, factor = estimate.cameras, scale.meters_per_unit
+    if cameras is None:
+        return estimate
+    poses = cameras.world_from_camera.copy()
+    poses[:, :3, 3] *= factor
+    points = estimate.points
+    return replace(
+        estimate,
+        cameras=replace(cameras, world_from_camera=poses),
+        points=points and replace(points, points_m=points.points_m * factor),
+        metric=True,
+    )
+
+
+def scale_depth(depth: DepthEstimate, scale: Scale) -> DepthEstimate:
+    """Return depth in meters; a map that is metric by itself is returned as it is."""
+    if depth.metric:
+        return depth
+    depth_m = (depth.depth_m * scale.meters_per_unit).astype(np.float32)
+    return replace(depth, depth_m=depth_m, metric=True)
+
+
+def _from_hands(
+    cameras: Cameras, scene: DepthEstimate, joints_camera_m: Float[np.ndarray, "f n 21 3"]
+) -> Scale | None:
+    """Return the scale at which hands touch the scene; None with too few fingertips."""
+    small, depth = _scene_depth(cameras, scene)
+    tips = joints_camera_m[:, :, TIPS].reshape(len(joints_camera_m), -1, 3)
+    row, column, inside = pixels_of(small, np.where(np.isfinite(tips), tips, -1.0))
+    behind = np.take_along_axis(depth.reshape(len(depth), -1), row * small.width + column, axis=1)
+    ratios = (tips[..., 2] / behind)[inside & np.isfinite(behind)]
+    if len(ratios) < MIN_TIPS:
+        return None
+    low, middle, high = np.percentile(
+        ratios, (CONTACT_PERCENTILE - 5, CONTACT_PERCENTILE, CONTACT_PERCENTILE + 5)
+    )
+    spread = (high - low) / 2 / middle
+    return Scale(
+        meters_per_unit=float(middle),
+        uncertainty=float(np.hypot(HAND_SIZE_ERROR, spread)),
+        source="hands",
+        reason=f"{len(ratios)} fingertips before the scene, in contact at the "
+        f"{CONTACT_PERCENTILE}th percentile of their depth ratios; percentiles "
+        f"{CONTACT_PERCENTILE - 5} and {CONTACT_PERCENTILE + 5} differ from it by "
+        f"{(low / middle - 1):+.1%} and {(high / middle - 1):+.1%}",
+    )
+
+
+def _scene_depth(
+    cameras: Cameras, scene: DepthEstimate
+) -> tuple[Cameras, Float32[np.ndarray, "f h w"]]:
+    """Return reduced cameras, and the depth of the static scene in the view of each."""
+    step = REDUCTION
+    matrix = cameras.intrinsics_px.astype(float).copy()
+    matrix[:2] /= step
+    small = replace(
+        cameras,
+        intrinsics_px=matrix,
+        height=-(-cameras.height // step),
+        width=-(-cameras.width // step),
+    )
+    points = []
+    rays = pixel_rays(matrix, height=small.height, width=small.width)
+    for frame, depth in zip(scene.frames, scene.depth_m, strict=True):
+        sampled = depth[::step, ::step]
+        known = np.isfinite(sampled)
+        local = rays[known] * sampled[known][:, None]
+        points.append(transform(cameras.world_from_camera[frame], local))
+    unit = np.median(scene.depth_m[np.isfinite(scene.depth_m)])  # within the renderer's range
+    poses = small.world_from_camera.copy()
+    poses[:, :3, 3] /= unit
+    depth, _ = splat(
+        np.concatenate(points) / unit, replace(small, world_from_camera=poses), point_px=1
+    )
+    return small, depth * np.float32(unit)
+
+
+def _from_height(cameras: Cameras, scene: DepthEstimate, height_m: float) -> Scale:
+    """Return the scale that puts the first camera at a height above the surface below it."""
+    first, frame = scene.depth_m[0], int(scene.frames[0])
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    lower = np.isfinite(first)
+    lower[: cameras.height // 2] = False
+    points = (rays[lower] * first[lower][:, None])[:: max(1, lower.sum() // 20_000)]
+    _require(len(points) >= 100, "the lower half of the first frame has no depth")
+    distance, share, spread = _plane_distance(points)
+    return Scale(
+        meters_per_unit=height_m / distance,
+        uncertainty=float(spread),
+        source="camera height",
+        reason=f"camera {height_m:g} m above the plane of {share:.0%} of the lower half of "
+        f"frame {frame}",
+    )
+
+
+def _plane_distance(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, float]:
+    """Return distance of the largest plane from the origin, its share of points, its error.
+
+    By random sample consensus with a fixed seed, in units of the points, and refined on its
+    inliers. The error is the deviation of the inliers relative to the distance.
+    """
+    rng = np.random.default_rng(0)
+    tolerance = 0.02 * np.median(points[:, 2])
+    best = np.zeros(len(points), bool)
+    for _ in range(200):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length > 0:
+            inliers = np.abs((points - a) @ (normal / length)) < tolerance
+            best = max(best, inliers, key=np.sum)
+    center = points[best].mean(axis=0)
+    normal = np.linalg.svd(points[best] - center, full_matrices=False)[2][2]
+    distance = abs(float(center @ normal))
+    _require(distance > 0, "the plane in the lower half of the first frame meets the camera")
+    deviation = np.std((points[best] - center) @ normal)
+    return distance, float(best.mean()), float(deviation / distance)
+
+
+def _from_depth(scene: DepthEstimate, metric: DepthEstimate) -> Scale:
+    """Return the median ratio of a metric depth map to the depth of the scene."""
+    ratios = [
+        (metric.depth_m[list(metric.frames).index(frame)] / depth)[confident]
+        for frame, depth, confident in zip(
+            scene.frames, scene.depth_m, scene.confident, strict=True
+        )
+        if frame in metric.frames
+    ]
+    all_ratios = np.concatenate([*ratios, np.zeros(0)])
+    all_ratios = all_ratios[np.isfinite(all_ratios) & (all_ratios > 0)]
+    _require(len(all_ratios) >= MIN_TIPS, "no confident pixel of the scene has metric depth")
+    middle = np.median(all_ratios)
+    spread = 1.4826 * np.median(np.abs(all_ratios - middle)) / middle
+    return Scale(
+        meters_per_unit=float(middle),
+        uncertainty=float(spread),
+        source="metric depth",
+        reason=f"median over {len(all_ratios)} confident pixels with metric depth",
+    )
+
+
+def _without(depth: DepthEstimate, moving: Bool[np.ndarray, "f h w"] | None) -> DepthEstimate:
+    """Return depth without moving pixels."""
+    if moving is None:
+        return depth
+    hidden = moving[depth.frames]
+    return replace(
+        depth,
+        depth_m=np.where(hidden, np.float32(np.inf), depth.depth_m),
+        confident=depth.confident & ~hidden,
+    )
+
+
+def _require(fits: bool, what: str) -> None:
+    if not fits:
+        raise InputError(f"The scale cannot be estimated: {what}. Give meters per unit. (--scale)")

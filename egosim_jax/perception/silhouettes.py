@@ -1,0 +1,127 @@
+"""Silhouettes of hands and forearms, drawn from their joints.
+
+A hand is its bones with soft tissue around them, the palm between its knuckles, and a forearm from
+the wrist towards the wearer. Without a segmentation network this is the mask of what moves with
+the wearer; a wide sleeve is wider than the drawn forearm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int32, UInt8
+
+from egosim_jax.geometry import invert, project, transform
+from egosim_jax.perception.estimates import HandTracks
+from egosim_jax.perception.hands import lift
+from egosim_jax.rendering.skeleton import SKELETONS
+from egosim_jax.types import Cameras, Kind, check_counts
+
+PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
+"""Joints that move as one rigid body: wrist and knuckles; all of a gripper."""
+ASSUMED_FOCAL = 0.45
+"""Focal length that silhouettes of tracks are drawn with, in widths of the picture.
+
+Depth is in proportion to it, and so the picture of a hand does not depend on it; that of a forearm
+hardly does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandShape:
+    """Size of drawn hands and forearms."""
+
+    finger_radius_m: float = 0.013
+    """Radius of a finger around its bones in meters."""
+    arm_radius_m: float = 0.05
+    """Radius of a forearm in meters."""
+    shoulder_offset_m: tuple[float, float, float] = (0.0, 0.35, 0.05)
+    """Origin of an arm in camera axes in meters; x is relative to the wrist's."""
+    arm_fraction: float = 0.8
+    """Fraction of the way from the wrist to the arm's origin that is drawn."""
+    near_m: float = 0.05
+    """Parts nearer to the camera than this are not drawn, in meters."""
+    discs: int = 25
+    """Number of discs that a capsule is drawn with."""
+
+    def __post_init__(self) -> None:
+        """Check that a capsule is drawn with at least one disc."""
+        check_counts({"discs": self.discs})
+
+
+def hand_silhouettes(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    tracks: HandTracks,
+    *,
+    shape: HandShape | None = None,
+    focal_px: float | None = None,
+) -> Bool[np.ndarray, "f h w"]:
+    """Return the pixels of hands and forearms of tracked hands, by geometry.
+
+    Cameras need not be known. A hand that is missing from a frame covers nothing there.
+    """
+    height, width = frames.shape[1:3]
+    focal = focal_px or ASSUMED_FOCAL * width
+    center = (width - 1) / 2, (height - 1) / 2
+    cameras = Cameras(
+        world_from_camera=np.repeat(np.eye(4)[None], len(frames), axis=0),
+        intrinsics_px=np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]]),
+        height=height,
+        width=width,
+    )
+    joints_m = lift(tracks, cameras.intrinsics_px)
+    return hand_silhouette(joints_m, "human", cameras, shape or HandShape()) >= 0
+
+
+def hand_silhouette(
+    joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, cameras: Cameras, shape: HandShape
+) -> Int32[np.ndarray, "f h w"]:
+    """Return the number of the hand that covers each pixel, arm included; -1 for none.
+
+    A hand is its bones with flesh around them, the palm between its knuckles, and an arm from the
+    wrist towards the wearer. One with a joint that is not finite is missing.
+    """
+    import cv2
+
+    covered = np.full((len(joints_m), cameras.height, cameras.width), -1, np.int32)
+    bones = SKELETONS[kind].bones.tolist()
+    for frame, world_from_camera in enumerate(cameras.world_from_camera):
+        canvas = np.zeros((cameras.height, cameras.width), np.uint8)
+        for number, hand in enumerate(joints_m[frame]):
+            if not np.isfinite(hand).all():
+                continue
+            joints = transform(invert(world_from_camera), hand)
+            palm = joints[PALM[kind]]
+            shoulder = np.array(shape.shoulder_offset_m) + [palm[0, 0], 0, 0]
+            elbow = palm[0] + shape.arm_fraction * (shoulder - palm[0])
+            canvas[:] = 0
+            for start, end in bones:
+                radius_m = shape.finger_radius_m
+                draw_capsule(canvas, joints[start], joints[end], radius_m, cameras, shape)
+            draw_capsule(canvas, palm[0], elbow, shape.arm_radius_m, cameras, shape)
+            if (palm[:, 2] > shape.near_m).all():
+                u, v = project(cameras.intrinsics_px, palm)
+                corners = np.rint(np.stack([u, v], axis=1)).astype(np.int32)
+                cv2.fillConvexPoly(canvas, cv2.convexHull(corners), 1)
+            covered[frame][canvas > 0] = number
+    return covered
+
+
+def draw_capsule(
+    canvas: UInt8[np.ndarray, "h w"],
+    start: Float[np.ndarray, " 3"],
+    end: Float[np.ndarray, " 3"],
+    radius_m: float,
+    cameras: Cameras,
+    shape: HandShape,
+) -> None:
+    """Draw a capsule between two points in camera coordinates, as discs of its radius."""
+    import cv2
+
+    centers_m = start + np.linspace(0, 1, shape.discs)[:, None] * (end - start)
+    centers_m = centers_m[centers_m[:, 2] > shape.near_m]
+    limit = 10 * cameras.width  # beyond it a disc is outside the image, and OpenCV's range
+    centers = np.clip(np.stack(project(cameras.intrinsics_px, centers_m), axis=1), -limit, limit)
+    radii = cameras.intrinsics_px[0, 0] * radius_m / centers_m[:, 2]
+    for (column, row), radius in zip(np.rint(centers).astype(int), radii, strict=True):
+        cv2.circle(canvas, (int(column), int(row)), max(1, round(float(radius))), 1, -1)

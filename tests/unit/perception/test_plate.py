@@ -1,0 +1,70 @@
+"""First frames without hands, of the tabletop world, where the picture under them is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.perception.plate import clean_plate
+from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+from tests.unit.perception.posed import make_clip
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return make_clip()
+
+
+@pytest.fixture(scope="module")
+def covered(clip):
+    """A clip with a dark occluder that passes over the first frame without hands."""
+    frames = np.repeat(clip.first.colors[None], 5, axis=0)
+    moving = np.zeros(frames.shape[:3], bool)
+    for number in range(5):
+        moving[number, 20:60, 40 + 30 * number : 80 + 30 * number] = True
+    frames[moving] = (20, 10, 5)
+    poses = np.repeat(clip.cameras.world_from_camera[:1], 5, axis=0)
+    return frames, moving, replace(clip.cameras, world_from_camera=poses)
+
+
+def test_what_an_occluder_hid_is_what_later_frames_show(clip, covered):
+    frames, moving, cameras = covered
+    plate = clean_plate(frames, moving, cameras, clip.first.depth_m)
+    difference = np.abs(plate.image.astype(int) - clip.first.colors)
+    assert plate.method == "none"
+    assert plate.seen[moving[0]].all()
+    assert difference[moving[0]].mean() < 2
+    np.testing.assert_array_equal(plate.image[~plate.seen], frames[0][~plate.seen])
+
+
+def test_an_object_that_is_carried_away_stays(clip):
+    moving = clip.ids >= FIRST_HAND
+    target = clip.body_ids[clip.target]
+    plate = clean_plate(clip.frames, moving, clip.cameras, clip.first.depth_m)
+    body = (clip.first.ids == target) & ~plate.seen & ~moving[0]
+    assert body.sum() > 50
+    assert (clip.ids[-1][body] != target).any()
+    np.testing.assert_array_equal(plate.image[body], clip.frames[0][body])
+
+
+def test_what_no_frame_shows_is_filled_by_patches(clip, covered):
+    frames, moving, cameras = covered
+    always = moving | moving[0]
+    plate = clean_plate(frames, always, cameras, clip.first.depth_m)
+    assert plate.method == "patchmatch"
+    assert not plate.seen.any()
+    filled = plate.image[moving[0]]
+    assert np.abs(filled - np.array([20, 10, 5])).sum(axis=1).min() > 10
+
+
+def test_without_the_library_telea_fills(clip, covered, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "patchmatch", None)
+    frames, moving, cameras = covered
+    plate = clean_plate(frames, moving | moving[0], cameras, clip.first.depth_m)
+    assert plate.method == "telea"
+
+
+def test_a_frame_without_hands_is_returned_as_it_is(clip, covered):
+    frames, moving, cameras = covered
+    plate = clean_plate(frames, np.zeros_like(moving), cameras, clip.first.depth_m)
+    np.testing.assert_array_equal(plate.image, frames[0])
