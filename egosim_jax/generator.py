@@ -61,6 +61,9 @@ class Inputs:
     mask: UInt8[Any, "b lf lh lw m"] | None
     ids: Int[Any, "b n"]
     ids_mask: Bool[Any, "b n"]
+    null_ids: Int[Any, "b n"] | None
+    """Token ids of the model's `unconditional_prompt`."""
+    null_mask: Bool[Any, "b n"] | None
     pixels: Float[Any, "b s s 3"] | None
 
     @classmethod
@@ -68,12 +71,16 @@ class Inputs:
         """Tokenize the prompts, pack the masks and prepare the image for CLIP."""
         tokens, layout = config.tokenizer.tokenize([t.prompt for t in triplets]), config.layout
         masks = [layout.pack_mask(t.mask, config.grid) for t in triplets if "mask" in layout]
+        null = config.unconditional_prompt
+        nulls = None if null is None else config.tokenizer.tokenize([null] * len(triplets))
         return cls(
             prior=np.stack([t.prior for t in triplets]) if "prior" in layout else None,
             hands=np.stack([t.hands for t in triplets]) if "hands" in layout else None,
             mask=np.stack(masks) if "mask" in layout else None,
             ids=tokens.ids,
             ids_mask=tokens.mask,
+            null_ids=nulls and nulls.ids,
+            null_mask=nulls and nulls.mask,
             pixels=config.image
             and clip_pixels(
                 np.stack([t.first_frame for t in triplets]),
@@ -90,12 +97,15 @@ class Inputs:
         frames = shape(np.uint8, video.frames, video.height, video.width, 3)
         size = config.image and config.image.image_size
         mask = shape(np.uint8, *config.latent_shape, layout.count("mask"))
+        null = config.unconditional_prompt is not None
         return cls(
             prior=frames if "prior" in layout else None,
             hands=frames if "hands" in layout else None,
             mask=mask if "mask" in layout else None,
             ids=shape(np.int32, tokens),
             ids_mask=shape(np.bool_, tokens),
+            null_ids=shape(np.int32, tokens) if null else None,
+            null_mask=shape(np.bool_, tokens) if null else None,
             pixels=size and shape(np.float32, size, size, 3),
         )
 
@@ -106,11 +116,15 @@ def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
     def encode(video: Array | None) -> Array | None:
         return None if video is None else networks.vae.encode(to_model(video))
 
+    embed = replicate_params(networks.text)
     return Condition(
         mask=None if inputs.mask is None else inputs.mask.astype(jnp.float32),
         prior=encode(inputs.prior),
         hands=encode(inputs.hands),
-        text=replicate_params(networks.text)(inputs.ids, inputs.ids_mask),
+        text=embed(inputs.ids, inputs.ids_mask),
+        null_text=None
+        if inputs.null_ids is None or inputs.null_mask is None
+        else embed(inputs.null_ids, inputs.null_mask),
         image=None
         if networks.image is None or inputs.pixels is None
         else replicate_params(networks.image)(inputs.pixels),
@@ -124,7 +138,7 @@ def denoise(
     config: ModelConfig,
     keys: Key[Array, " b"] | None = None,
 ) -> Float[Array, "b f h w z"]:
-    """Run the sampler; the unconditional branch gets text embeddings of zeros.
+    """Run the sampler; the unconditional branch gets the text embeddings of no prompt.
 
     `keys`, one for each item, draw the noise that a stochastic solver adds.
     """
@@ -137,7 +151,7 @@ def denoise(
     text = jnp.asarray(condition.text)
     conditional = branch(text)
     guided = config.guidance.scale != 1
-    unconditional = branch(jnp.zeros_like(text)) if guided else conditional
+    unconditional = branch(condition.drop("text").text) if guided else conditional
     return integrate(
         config.guidance.guide(conditional, unconditional),
         noise,

@@ -72,6 +72,11 @@ class ModelConfig:
     """Sampler of the denoising steps."""
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
+    unconditional_prompt: str | None = None
+    """Prompt whose embeddings stand for no prompt; None: embeddings of zeros (EgoSim).
+
+    Guidance pushes away from it, and a prompt that is dropped in training is replaced by it.
+    """
     steps: int | tuple[int | float, ...] = 50
     """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
 

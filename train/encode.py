@@ -67,7 +67,7 @@ class Encoding:
         inputs = Inputs.of(triplets, self.config)
         arrays = {"mask": inputs.mask, **self._encode(inputs, targets_of(triplets))}
         if self.config.encoders == "joint":
-            arrays |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
+            arrays |= _encoder_inputs(inputs)
         present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
         return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
 
@@ -82,9 +82,17 @@ def _encode(encoders: Networks, inputs: Inputs, target: jax.Array) -> dict[str, 
     arrays = dict(zip(videos, latents, strict=True))
     if encoders.text is not None:
         arrays["text"] = encoders.text(inputs.ids, inputs.ids_mask)
+        if inputs.null_ids is not None and inputs.null_mask is not None:
+            arrays["null_text"] = encoders.text(inputs.null_ids, inputs.null_mask)
     if encoders.image is not None and inputs.pixels is not None:
         arrays["image"] = encoders.image(inputs.pixels)
     return arrays
+
+
+def _encoder_inputs(inputs: Inputs) -> dict[str, Any]:
+    """Return the inputs of encoders that are trained; None where the model has none."""
+    names = ("ids", "ids_mask", "null_ids", "null_mask", "pixels")
+    return {name: getattr(inputs, name) for name in names}
 
 
 def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeStruct]:
@@ -97,7 +105,7 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
     )
     given = {"mask": inputs.mask}
     if config.encoders == "joint":
-        given |= {"ids": inputs.ids, "ids_mask": inputs.ids_mask, "pixels": inputs.pixels}
+        given |= _encoder_inputs(inputs)
     return {name: shape for name, shape in {**given, **encoded}.items() if shape is not None}
 
 

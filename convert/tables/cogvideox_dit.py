@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from einops import rearrange
 
+from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
 from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
@@ -134,5 +135,6 @@ TABLE = Table(
         shorten=shorten,
         outputs=outputs,
     ),
+    base=COGVIDEOX_INPAINT,
 )
-"""Conversions of CogVideoX's transformer."""
+"""Conversions of CogVideoX's transformer; its base models are CogVideoX-Fun's InP models."""

@@ -4,7 +4,8 @@
     mask    0: everything counts as observed, as in the EgoSim release without a mask file;
             the prior stays
     hands   latents 0
-    text    embeddings 0, the empty prompt of the EgoSim release's continuous runner
+    text    embeddings 0, the empty prompt of the EgoSim release's continuous runner, or those of
+            the model's `unconditional_prompt` (CogVideoX)
 
 The CLIP tokens of the first frame are never dropped.
 """
@@ -39,11 +40,16 @@ class Condition:
     """Latents of the drawn hands."""
     text: Float[Array, "b n d"]
     """Prompt embeddings."""
+    null_text: Float[Array, "b n d"] | None = None
+    """Prompt embeddings that stand for no prompt; None: zeros."""
     image: Float[Array, "b m e"] | None = None
     """Image tokens of the first frame; None for models without the image branch."""
 
     def drop(self, name: Name, where: Bool[Array, " b"] | bool = True) -> Condition:
         """Return the condition without one of its inputs, in the samples of `where`."""
+        if name == "text" and self.null_text is not None:
+            where = jnp.asarray(where).reshape(-1, 1, 1)
+            return replace(self, text=jnp.where(where, self.null_text, self.text))
         dropped = {name: _fill(getattr(self, name), where, 0)}
         if name == "prior":
             dropped["mask"] = _fill(self.mask, where, 1)

@@ -137,6 +137,24 @@ class ChannelLayout:
 
 EGOSIM = ChannelLayout()
 """EgoSim: 52 channels."""
+DWM = ChannelLayout(
+    parts=(("noisy", 16), ("mask", 1), ("prior", 16), ("hands", 16)),
+    mask_packing="observed",
+    mask_one="keep",
+    mask_scale=0.7,
+    mask_prior=False,
+)
+"""DWM on CogVideoX: 49 channels; the mask is constant, the scale of the VAE's latents."""
+DWM_WAN = ChannelLayout(mask_packing="observed", mask_one="keep", mask_prior=False)
+"""DWM on Wan 2.1 Fun InP: EgoSim's 52 channels, with a constant mask of 1."""
+COGVIDEOX_INPAINT = ChannelLayout(
+    parts=(("noisy", 16), ("mask", 1), ("prior", 16)),
+    mask_packing="single",
+    mask_one="keep",
+    mask_scale=0.7,
+    mask_prior=False,
+)
+"""CogVideoX-Fun V1.1 InP: 33 channels; the prior is masked in pixels."""
 WAN_TEXT = ChannelLayout(parts=(("noisy", 16),))
 """Wan 2.1 text to video: 16 channels."""
 WAN_INPAINT = ChannelLayout(

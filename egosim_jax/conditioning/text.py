@@ -53,10 +53,12 @@ class Tokens:
 
 @dataclass(frozen=True, kw_only=True)
 class PromptTokenizer:
-    """Tokenizer of prompts, which it cleans first."""
+    """Tokenizer of prompts."""
 
     kind: Literal["byt5"] | Path = "byt5"
-    """`byt5`, or a folder with the tokenizer.json of google/umt5-xxl."""
+    """`byt5`, or a folder with the tokenizer.json of google/umt5-xxl or another model of T5."""
+    clean: bool = True
+    """Repair encodings, HTML entities and white space first, as Wan does and CogVideoX does not."""
     max_tokens: int = 512
     """Tokens that every prompt is padded or cut to, the end token included."""
 
@@ -78,7 +80,7 @@ class PromptTokenizer:
 
         Raises `InputError` if the tokenizer folder is missing or is not of the T5 family.
         """
-        cleaned = [clean_prompt(prompt) for prompt in prompts]
+        cleaned = [clean_prompt(prompt) if self.clean else prompt for prompt in prompts]
         if self.kind == "byt5":
             encoded = [[byte + BYTE_OFFSET for byte in text.encode()] for text in cleaned]
         else:

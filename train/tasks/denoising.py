@@ -131,15 +131,19 @@ class Denoising:
 
 def condition_of(networks: Networks, batch: Batch) -> Condition:
     """Return the condition of a cached batch, under encoders that are trained or cached."""
-    text = (
-        batch["text"] if networks.text is None else networks.text(batch["ids"], batch["ids_mask"])
-    )
+    if networks.text is None:
+        text, null_text = batch["text"], batch.get("null_text")
+    else:
+        text = networks.text(batch["ids"], batch["ids_mask"])
+        null = "null_ids" in batch
+        null_text = networks.text(batch["null_ids"], batch["null_mask"]) if null else None
     image = batch.get("image") if networks.image is None else networks.image(batch["pixels"])
     return Condition(
         mask=batch.get("mask"),
         prior=batch.get("prior"),
         hands=batch.get("hands"),
         text=text,
+        null_text=null_text,
         image=image,
     )
 

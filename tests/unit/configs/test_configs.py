@@ -9,7 +9,14 @@ from egosim_jax.types import InputError
 
 
 def test_every_config_knows_its_own_name():
-    assert configs.names() == ["debug", "egosim_14b", "egosim_1_3b", "real_tiny", "tabletop"]
+    assert configs.names() == [
+        "debug",
+        "dwm_cogvideox_5b",
+        "egosim_14b",
+        "egosim_1_3b",
+        "real_tiny",
+        "tabletop",
+    ]
     assert [configs.get(name).name for name in configs.names()] == configs.names()
 
 

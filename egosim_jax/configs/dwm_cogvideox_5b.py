@@ -1,0 +1,35 @@
+"""DWM on CogVideoX-Fun V1.1 5B InP: 49 frames of 720 x 480 at 8 per second, as it was released.
+
+The prior is the video of the static scene along the camera path, observed everywhere, and the hands
+are shaded meshes on black. 50 DDIM steps with guidance away from the empty prompt.
+(Kim et al. 2026, Dexterous World Models.)
+"""
+
+from pathlib import Path
+
+from egosim_jax.conditioning.layout import DWM
+from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.diffusion.guidance import Guidance
+from egosim_jax.diffusion.process import VariancePreserving
+from egosim_jax.diffusion.solver import DDIM
+from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.t5 import T5Config
+from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
+from egosim_jax.networks import ModelConfig
+from egosim_jax.types import VideoSpec
+
+CONFIG = ModelConfig(
+    name="dwm_cogvideox_5b",
+    video=VideoSpec(frames=49, height=480, width=720, fps=8),
+    dit=CogVideoXDiTConfig(in_channels=49, dtype="bfloat16", remat="attention"),
+    vae=CogVideoXVAEConfig(dtype="bfloat16"),
+    text=T5Config(dtype="bfloat16"),
+    image=None,
+    layout=DWM,
+    tokenizer=PromptTokenizer(kind=Path("tokenizer"), clean=False, max_tokens=226),
+    process=VariancePreserving(),
+    solver=DDIM(),
+    guidance=Guidance(scale=6.0),
+    unconditional_prompt="",
+    steps=50,
+)

@@ -1,0 +1,121 @@
+"""CogVideoX as a family: it generates, guides away from the empty prompt and caches it."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.layout import DWM
+from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
+from egosim_jax.diffusion import DDIM, Guidance, VariancePreserving
+from egosim_jax.generator import Generator, Inputs, encode_condition
+from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.t5 import T5Config
+from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
+from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.program import CompiledFn
+from egosim_jax.testing import random_triplet
+from egosim_jax.train.encode import Encoding, example_shapes
+from egosim_jax.train.tasks.denoising import Denoising, condition_of
+from egosim_jax.types import InputError, VideoSpec
+
+TINY = ModelConfig(
+    name="dwm_tiny",
+    video=VideoSpec(frames=9, height=32, width=48, fps=8),
+    dit=CogVideoXDiTConfig(
+        in_channels=49, dim=32, heads=2, layers=2, text_dim=16, time_dim=16, base_rows=2,
+        base_columns=3,
+    ),
+    vae=CogVideoXVAEConfig(dims=(4, 4, 8, 8), res_blocks=1, groups=2),
+    text=T5Config(vocab=BYT5_VOCAB, dim=16, ffn_dim=32, heads=2, head_dim=8, layers=1),
+    image=None,
+    layout=DWM,
+    tokenizer=PromptTokenizer(clean=False, max_tokens=16),
+    process=VariancePreserving(),
+    solver=DDIM(),
+    guidance=Guidance(scale=6.0),
+    unconditional_prompt="",
+    steps=2,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def networks():
+    made = Networks.random(TINY, seed=0)
+    made.dit.out.kernel[...] = 0.1 * jax.random.normal(jax.random.key(1), (32, 64))
+    return made
+
+
+@pytest.fixture(scope="module")
+def condition(networks):
+    inputs = Inputs.of([random_triplet(TINY.video, seed) for seed in range(2)], TINY)
+    return CompiledFn(encode_condition, networks)(inputs)
+
+
+def test_a_prompt_that_is_dropped_is_the_empty_one(networks, condition):
+    tokens = TINY.tokenizer.tokenize([""] * 2)
+    want = networks.text(jnp.asarray(tokens.ids), jnp.asarray(tokens.mask))
+    np.testing.assert_allclose(condition.drop("text").text, want, atol=1e-6)
+    mixed = condition.drop("text", jnp.array([True, False])).text
+    np.testing.assert_array_equal(mixed[1], condition.text[1])
+    assert np.abs(mixed[0] - condition.text[0]).max() > 0.1
+
+
+def test_it_generates_and_guidance_leads_away_from_the_empty_prompt(networks):
+    triplets = [random_triplet(TINY.video, 0)]
+    (clip,) = Generator(TINY, networks).generate(triplets, [0])
+    assert clip.frames.shape == (9, 32, 48, 3)
+    same = [replace(triplets[0], prompt="")]
+    plain = replace(TINY, guidance=Guidance(scale=1.0))
+    want = Generator(plain, networks).latents(same, [0])
+    # At an empty prompt both branches are the same, whatever the scale.
+    np.testing.assert_allclose(Generator(TINY, networks).latents(same, [0]), want, atol=1e-4)
+
+
+def test_the_mask_of_dwm_is_the_scale_of_the_latents(condition):
+    noisy = jnp.zeros((2, *TINY.latent_shape, 16))
+    channels = DWM.assemble(noisy, condition)
+    assert channels.shape[-1] == 49
+    np.testing.assert_allclose(channels[..., 16], 0.7)
+    np.testing.assert_array_equal(channels[..., 17:33], condition.prior)
+
+
+def test_cached_clips_hold_the_empty_prompt_that_training_drops_to(networks):
+    triplet = random_triplet(TINY.video, 0)
+    triplet = replace(triplet, target=triplet.prior)
+    encoders = Networks(vae=networks.vae, text=networks.text)
+    (record,) = Encoding(TINY, encoders)([triplet])
+    shapes = example_shapes(TINY, 1)
+    assert {name: a.shape for name, a in record.items()} == {
+        name: a.shape[1:] for name, a in shapes.items()
+    }
+    batch = {name: jnp.asarray(a)[None] for name, a in record.items()}
+    task = Denoising(model=TINY, dropout=ConditionDropout(text=1.0))
+    trained = Networks(dit=networks.dit)
+    dropped = task.dropout.apply(condition_of(trained, batch), jax.random.key(0))
+    np.testing.assert_array_equal(dropped.text[0], record["null_text"])
+    loss, _ = task.loss(trained, batch, task.keys(jax.random.key(0), 1))
+    assert np.isfinite(loss)
+
+
+def test_frames_that_do_not_fill_chunks_are_refused():
+    vae = nnx.eval_shape(lambda: TINY.vae.build(rngs=nnx.Rngs(0)))
+    with pytest.raises(InputError, match=r"8k\+1 frames. Nearest: 9 or 17"):
+        jax.eval_shape(vae.encode, jax.ShapeDtypeStruct((1, 13, 32, 48, 3), jnp.float32))
+    with pytest.raises(InputError, match="4 latent frames cannot be decoded"):
+        jax.eval_shape(vae.decode, jax.ShapeDtypeStruct((1, 4, 4, 6, 16), jnp.float32))
+
+
+def test_the_released_config_has_the_tokens_and_the_lora_of_the_paper():
+    config = configs.get("dwm_cogvideox_5b")
+    assert config.latent_shape == (13, 60, 90)
+    dit = config.dit
+    flops = dit.forward_flops(latents=config.latent_shape, text=226, image=0)
+    assert flops.attention == 42 * 4 * 17_776**2 * 3072
+    rank, targets = 64, len(dit.lora_targets)
+    assert dit.layers * targets * rank * 2 * dit.dim == 66_060_288
