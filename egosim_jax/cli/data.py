@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.imports import Import
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
@@ -305,10 +306,11 @@ class Stats:
 
 @dataclass(frozen=True, kw_only=True)
 class Data:
-    """Prepare data: recordings, clips of a procedural world, shards of videos or latents."""
+    """Prepare data: recordings, annotated clips, clips of a procedural world, and shards."""
 
     command: (
-        Annotated[Import, tyro.conf.subcommand("import")]
+        Annotated[Annotate, tyro.conf.subcommand("annotate")]
+        | Annotated[Import, tyro.conf.subcommand("import")]
         | Annotated[Make, tyro.conf.subcommand("make")]
         | Annotated[Pack, tyro.conf.subcommand("pack")]
         | Annotated[Encode, tyro.conf.subcommand("encode")]

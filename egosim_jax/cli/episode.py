@@ -142,6 +142,35 @@ class MakeEpisode:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FromAnnotation:
+    """Make an episode of a recorded video, from a clip that `egosim data annotate` accepted.
+
+    The scene is that of the clip's first frame, the actions are its cameras and hands, and the
+    ground truth is the video, cut into clips of the model's length at its size and frame rate.
+    """
+
+    clip: Annotated[Path, tyro.conf.Positional]
+    """Folder of the annotated clip."""
+    out: Path
+    """Folder to write, or a file whose name ends in .zip."""
+    config: str = "real_tiny"
+    """Model whose length, size and frame rate the clips have."""
+    clips: int | None = None
+    """Number of clips; as many as the video is long if not given."""
+
+    def run(self) -> int:
+        """Read the clip, make, check and write the episode."""
+        from egosim_jax import configs
+        from egosim_jax.annotate.episode import episode_from
+
+        check_counts({"--clips": self.clips})
+        episode = episode_from(self.clip, configs.get(self.config).video, clips=self.clips)
+        episode.save(self.out)
+        print(f"{self.out}: {summary(episode)}")
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
 class CheckEpisode:
     """Validate an episode: files, joints, units, cameras, frame of reference.
 
@@ -320,6 +349,7 @@ class Episode:
 
     command: (
         Annotated[MakeEpisode, tyro.conf.subcommand("make")]
+        | Annotated[FromAnnotation, tyro.conf.subcommand("from-annotation")]
         | Annotated[CheckEpisode, tyro.conf.subcommand("check")]
         | Annotated[ShowEpisode, tyro.conf.subcommand("show")]
     )

@@ -14,6 +14,7 @@ import csv
 import io
 import logging
 from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -59,35 +60,44 @@ def write_clips(
     if append and path.exists():
         rows = {row.get("video_id", ""): row for _, row in csv_rows(path)}
     for triplet in triplets:
-        name = triplet.video_id
-        if not is_safe_id(name):
-            raise InputError(f"video_id {quote(name)} is not a valid file name; use {SAFE_IDS}.")
-        videos = {
-            "ego_prior_video.mp4": triplet.prior,
-            "hand_keypoint_video.mp4": triplet.hands,
-            MASK_NAME: np.repeat(triplet.mask[..., None], 3, axis=-1),
-        }
-        row = {
-            "ego_prior_video": f"{name}/ego_prior_video.mp4",
-            "hand_keypoint_video": f"{name}/hand_keypoint_video.mp4",
-            "first_frame": f"{name}/first_frame.png",
-            "prompt": triplet.prompt,
-            "video_id": name,
-            **triplet.extra,
-        }
-        if triplet.target is not None:
-            videos["video.mp4"] = triplet.target
-            row = {"video": f"{name}/video.mp4", **row}
-        for file, frames in videos.items():
-            write_video(folder / name / file, frames, fps)
-        with atomic_write(folder / name / "first_frame.png") as temporary:
-            Image.fromarray(triplet.first_frame).save(temporary)
-        rows[name] = row
-    _write_rows(path, list(rows.values()))
+        rows[triplet.video_id] = write_clip(folder, triplet, fps=fps)
+    write_table(path, list(rows.values()))
     return path
 
 
-def _write_rows(path: Path, rows: Sequence[Mapping[str, str]]) -> None:
+def write_clip(folder: Path, triplet: Triplet, *, fps: int | Fraction) -> dict[str, str]:
+    """Write the files of one triplet; return its row of the table (`write_table`).
+
+    Raises `InputError` for an id that is not a valid file name.
+    """
+    name = triplet.video_id
+    if not is_safe_id(name):
+        raise InputError(f"video_id {quote(name)} is not a valid file name; use {SAFE_IDS}.")
+    videos = {
+        "ego_prior_video.mp4": triplet.prior,
+        "hand_keypoint_video.mp4": triplet.hands,
+        MASK_NAME: np.repeat(triplet.mask[..., None], 3, axis=-1),
+    }
+    row = {
+        "ego_prior_video": f"{name}/ego_prior_video.mp4",
+        "hand_keypoint_video": f"{name}/hand_keypoint_video.mp4",
+        "first_frame": f"{name}/first_frame.png",
+        "prompt": triplet.prompt,
+        "video_id": name,
+        **triplet.extra,
+    }
+    if triplet.target is not None:
+        videos["video.mp4"] = triplet.target
+        row = {"video": f"{name}/video.mp4", **row}
+    for file, frames in videos.items():
+        write_video(folder / name / file, frames, fps)
+    with atomic_write(folder / name / "first_frame.png") as temporary:
+        Image.fromarray(triplet.first_frame).save(temporary)
+    return row
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    """Write rows of equal columns as metadata.csv. Raises `InputError` if columns differ."""
     columns = list(rows[-1])
     for row in rows:
         if row.keys() != set(columns):

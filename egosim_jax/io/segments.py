@@ -27,6 +27,7 @@ from egosim_jax.io.video import (
     decode_packet,
     enlarge,
     frame_rate,
+    is_hdr,
     open_file,
     open_video,
     to_rgb,
@@ -54,8 +55,9 @@ def probe_long_video(path: Path) -> VideoInfo:
         with open_video(file, name, None) as container:
             picture = next(_pictures(container, name, listing.keys[0][1]))
             height, width = upright(picture, np.empty((picture.height, picture.width))).shape
-            fps = frame_rate(container.streams.video[0], name)
-    return VideoInfo(frames=len(listing.times), height=height, width=width, fps=fps)
+            stream = container.streams.video[0]
+            fps, hdr = frame_rate(stream, name), is_hdr(stream)
+    return VideoInfo(frames=len(listing.times), height=height, width=width, fps=fps, hdr=hdr)
 
 
 def read_segment(

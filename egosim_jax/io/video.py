@@ -72,6 +72,8 @@ _SCALERS: dict[Decoding, Interpolation] = {
     "official": Interpolation.BICUBIC,
 }
 _SMPTE170M, _LIMITED_RANGE = 6, 1
+_HDR = (16, 18)
+"""Transfer functions PQ and HLG (ITU-T H.273, table 3)."""
 _OPTIONS = {
     "format_whitelist": "mov,mp4,m4a,matroska,webm,avi,mpegts",
     "protocol_whitelist": "none",
@@ -102,6 +104,8 @@ class VideoInfo:
     height: int
     width: int
     fps: Fraction
+    hdr: bool = False
+    """True if brightness is coded for HDR, by PQ or HLG: converted to 8 bits, it looks pale."""
 
 
 def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
@@ -302,7 +306,18 @@ def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
                 raise
         if size is None:
             raise InputError(f"{name} holds no frames.")
-        return VideoInfo(frames=frames, height=size[0], width=size[1], fps=frame_rate(stream, name))
+        return VideoInfo(
+            frames=frames,
+            height=size[0],
+            width=size[1],
+            fps=frame_rate(stream, name),
+            hdr=is_hdr(stream),
+        )
+
+
+def is_hdr(stream: VideoStream) -> bool:
+    """Return True for a stream whose transfer function is PQ or HLG."""
+    return stream.codec_context.color_trc in _HDR
 
 
 def _decode(

@@ -13,7 +13,13 @@ from egosim_jax.train.__main__ import Recipes
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = {"egosim": Commands, "egosim-train": Recipes, "egosim-convert": Conversions}
-DOCUMENTS = ["README.md", "docs/train.md", "docs/gpu.md", "egosim_jax/weights/tabletop/README.md"]
+DOCUMENTS = [
+    "README.md",
+    "docs/train.md",
+    "docs/gpu.md",
+    "docs/video.md",
+    "egosim_jax/weights/tabletop/README.md",
+]
 RECIPES = [ROOT / "train" / "recipes.py"]
 
 

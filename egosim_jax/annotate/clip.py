@@ -1,0 +1,265 @@
+"""Annotation of one clip: the stages over its record, journaled, and the files of its triplet.
+
+work/ID/            journal and results of finished stages; removed when the clip is done
+ID/                 the triplet's files, in the layout of `data/metadata.py`
+ID/action.npz       world_from_camera, intrinsics_px and joints_m, as `egosim episode` reads
+ID/depth.npz        depth_m of the first frame, infinite where unknown
+ID/state            the scene (`state/snapshot.py`)
+ID/annotation.json  what was chosen and measured, or why the clip was refused; written last
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.annotate import record as records
+from egosim_jax.annotate.config import AnnotateConfig, Estimators
+from egosim_jax.annotate.frames import plan, read_frames
+from egosim_jax.annotate.prepare import RefusedError
+from egosim_jax.annotate.record import Record
+from egosim_jax.annotate.scene import FIRST_STAGES, STAGES, check_prior, to_triplet
+from egosim_jax.annotate.stages import Stage
+from egosim_jax.command import system_failure
+from egosim_jax.data.clips import write_clip
+from egosim_jax.data.recording import Recording
+from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.journal import Journal
+from egosim_jax.io.run import write_json, write_text
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.state import snapshot
+from egosim_jax.types import InputError
+
+ANNOTATION, SHEET, WORK = "annotation.json", "sheet.jpg", "work"
+FINAL = ("done", "refused")
+"""Statuses of clips that are not annotated again; those that failed are."""
+MOMENTS = 6
+"""Frames of each video on the sheet of a clip."""
+SHEET_PX = 208
+"""Width of a frame on the sheet, in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One clip to annotate: paths and small values only, so that it can be sent anywhere."""
+
+    video_id: str
+    """Unique id of the clip."""
+    recording: str
+    """Folder of the recording."""
+    start: int
+    """First frame, at the rate of the clip."""
+    stop: int
+    """Frame after the last."""
+    figures: Mapping[str, float]
+    """Figures of its quality."""
+    focal_px: float | None = None
+    """Focal length of its device in pixels of the clip, from other clips of the video."""
+
+
+def annotate(
+    job: Job, out: Path, config: AnnotateConfig, parts: Estimators, *, first_only: bool = False
+) -> str:
+    """Annotate a clip, or run its first stages only; return done, refused, failed or started.
+
+    What was finished before is not repeated. An error of the program is reported as a failure of
+    this clip, with its traceback in `work`; a full disk ends the run.
+    """
+    if is_final(job, out):
+        return read_annotation(job.video_id, out)["status"]
+    notes: dict[str, Any] = {}
+    try:
+        record = _run_stages(job, out, config, parts, notes, first_only=first_only)
+        if record is None:
+            return "started"
+        _write(job, out, config, record, notes)
+        status = "done"
+    except RefusedError as refused:
+        status = "refused"
+        notes |= {"rule": refused.rule, "reason": str(refused), "figures": refused.figures}
+    except InputError as error:
+        status, notes["reason"] = "failed", str(error)
+    except Exception as error:
+        if system_failure(error) is not None:
+            raise
+        status, notes["reason"] = "failed", f"{type(error).__name__}: {error}"
+        write_text(out / WORK / job.video_id / "traceback.txt", traceback.format_exc())
+    finish(job, out, config, status, notes)
+    return status
+
+
+def read_annotation(video_id: str, out: Path) -> dict[str, Any]:
+    """Return the annotation of a clip; empty if it was not annotated."""
+    path = out / video_id / ANNOTATION
+    return read_json(path) if path.exists() else {}
+
+
+def is_final(job: Job, out: Path) -> bool:
+    """Return True if a clip is annotated and is not to be tried again."""
+    about = read_annotation(job.video_id, out)
+    return about.get("status") in FINAL and not (can_retry(about) and job.focal_px is not None)
+
+
+def can_retry(about: Mapping[str, Any]) -> bool:
+    """Return True for a clip without cameras that its device's focal length may still give."""
+    return about.get("rule") == "cameras" and about.get("focal_px") is None
+
+
+def finish(
+    job: Job, out: Path, config: AnnotateConfig, status: str, notes: Mapping[str, Any]
+) -> None:
+    """Write the annotation of a clip, and a sheet of the video of one without a triplet."""
+    folder = out / job.video_id
+    if status != "done":
+        _draw_refused(job, out, config)
+    about = {
+        "video_id": job.video_id,
+        "status": status,
+        "start": job.start,
+        "stop": job.stop,
+        "quality": dict(job.figures),
+        "focal_px": job.focal_px,
+        **notes,
+    }
+    write_json(folder / ANNOTATION, about)
+    if status != "failed" and not can_retry(about):
+        shutil.rmtree(out / WORK / job.video_id, ignore_errors=True)
+
+
+def open_record(job: Job, config: AnnotateConfig) -> Record:
+    """Return the record of a clip before its stages, with its frames."""
+    recording = Recording.load(Path(job.recording))
+    fitted = plan(recording, config.sampling, cut=config.cutting.clips)
+    frames = read_frames(recording, fitted, job.start, job.stop)
+    first, last = fitted.indices(job.start, job.stop)[[0, -1]]
+    return Record(
+        video_id=job.video_id,
+        recording=recording.clip(int(first), min(int(last) + 1, recording.frames)),
+        plan=fitted,
+        frames=frames,
+        device_focal_px=job.focal_px,
+    )
+
+
+def _run_stages(
+    job: Job,
+    out: Path,
+    config: AnnotateConfig,
+    parts: Estimators,
+    notes: dict[str, Any],
+    *,
+    first_only: bool,
+) -> Record | None:
+    """Run the stages, or load their results; return the record, or None after the first ones.
+
+    Notes and times of the stages are added to `notes` as they finish.
+    """
+    import cv2
+
+    folder = out / WORK / job.video_id
+    journal = Journal(folder)
+    chosen = STAGES[:FIRST_STAGES] if first_only else STAGES
+    stored = [stage.name for stage in chosen if stage.stored]
+    if first_only and all(name in journal.done for name in stored):
+        return None
+    record = open_record(job, config)
+    times = notes.setdefault("seconds", {})
+    for stage in chosen:
+        cv2.setRNGSeed(config.seed % 2**31)
+        then = time.monotonic()
+        if stage.stored:
+            record = _stored(journal, folder, stage, record, parts, config)
+            times[stage.name] = journal.done[stage.name]["seconds"]
+        else:
+            record = stage.run(record, parts, config)
+            times[stage.name] = round(time.monotonic() - then, 3)
+        notes |= record.notes
+    return None if first_only else record
+
+
+def _stored(
+    journal: Journal,
+    folder: Path,
+    stage: Stage,
+    record: Record,
+    parts: Estimators,
+    config: AnnotateConfig,
+) -> Record:
+    return journal.phase(
+        stage.name,
+        folder / f"{stage.name}.npz",
+        make=lambda: stage.run(record, parts, config),
+        save=lambda path, found: records.save(path, found, stage.stored, stage.name),
+        load=partial(_load, record=record, stage=stage),
+    )
+
+
+def _load(path: Path, *, record: Record, stage: Stage) -> Record:
+    return records.load(path, record, stage.stored, stage.name)
+
+
+def _write(
+    job: Job, out: Path, config: AnnotateConfig, record: Record, notes: dict[str, Any]
+) -> None:
+    """Write the triplet and what was estimated with it."""
+    then = time.monotonic()
+    triplet, figures = to_triplet(record, config)
+    check_prior(figures, config)
+    folder, cameras = out / job.video_id, record.cameras
+    notes["row"] = write_clip(out, triplet, fps=record.fps)
+    with atomic_write(folder / "action.npz") as temporary:
+        np.savez(
+            temporary,
+            world_from_camera=np.asarray(cameras.world_from_camera, float),
+            intrinsics_px=np.asarray(cameras.intrinsics_px, float),
+            joints_m=np.asarray(record.joints_m, float),
+        )
+    with atomic_write(folder / "depth.npz") as temporary:
+        np.savez(temporary, depth_m=record.require("depth").depth_m[0])
+    snapshot.save(folder / "state", record.require("state"))
+    mask = np.repeat(triplet.mask[..., None], 3, axis=-1)
+    videos = {
+        "prior": triplet.prior,
+        "mask": mask,
+        "hands": triplet.hands,
+        "video": record.frames,
+    }
+    _draw(folder, f"{job.video_id}: {', '.join(videos)}", list(videos.values()))
+    notes["prior"] = figures
+    notes["video"] = {
+        "file": str(record.recording.video),
+        "fps": float(record.fps),
+        "source_fps": float(record.plan.source_fps),
+        "frames": len(record.frames),
+        "height": record.plan.height,
+        "width": record.plan.width,
+        "scale": record.plan.scale,
+    }
+    notes["seconds"]["write"] = round(time.monotonic() - then, 3)
+
+
+def _draw_refused(job: Job, out: Path, config: AnnotateConfig) -> None:
+    """Draw frames of a clip that has no triplet, if its video can be read."""
+    picked = np.linspace(job.start, job.stop - 1, MOMENTS).astype(int)
+    try:
+        recording = Recording.load(Path(job.recording))
+        fitted = plan(recording, config.sampling, cut=config.cutting.clips)
+        shown = [read_frames(recording, fitted, int(k), int(k) + 1) for k in picked]
+    except InputError:
+        return
+    _draw(out / job.video_id, f"{job.video_id}: video", [np.concatenate(shown)])
+
+
+def _draw(folder: Path, title: str, videos: list[np.ndarray]) -> None:
+    last = len(videos[0]) - 1
+    moments = [last * k // (MOMENTS - 1) for k in range(MOMENTS)]
+    draw_sheet([SheetClip(title, videos)], folder / SHEET, moments=moments, width=SHEET_PX)

@@ -1,0 +1,116 @@
+"""Annotation on Ray: the stages as two pools of actors, on this machine or on a cluster.
+
+    ray start --head                                    on one machine of the cluster
+    ray start --address=HEAD:6379                       on each of the others
+    ray job submit -- egosim data annotate VIDEO ... --out OUT --ray auto --ray-actors 8 4
+
+OUT and the videos must be at the same paths on all machines. Rows are ids and paths: no frame
+enters the object store. What an actor finishes is on disk, so a run that was killed resumes as one
+without Ray does, and either continues the other's. A local cluster listens on the loopback device
+only and sends no usage statistics.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.annotate import clip
+from egosim_jax.annotate.clip import Job
+from egosim_jax.annotate.config import AnnotateConfig
+from egosim_jax.types import InputError
+
+ADDRESS = "RAY_ADDRESS"
+"""Variable that names the cluster of a submitted job."""
+
+
+class FirstStages:
+    """Actor that runs the stages that need no camera, on rows of clips."""
+
+    def __init__(self, out: str, config: AnnotateConfig):
+        self._out, self._config, self._parts = Path(out), config, config.build()
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        """Return the row with the clip's status."""
+        status = clip.annotate(_job(row), self._out, self._config, self._parts, first_only=True)
+        return {**row, "status": status}
+
+
+class LastStages(FirstStages):
+    """Actor that runs the other stages and writes the clips."""
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        """Return the row with the clip's status."""
+        if row["status"] == "failed":
+            return row
+        return {**row, "status": clip.annotate(_job(row), self._out, self._config, self._parts)}
+
+
+def annotate_on_ray(
+    jobs: Sequence[Job],
+    out: Path,
+    config: AnnotateConfig,
+    *,
+    address: str,
+    gpus: tuple[float, float] = (0.0, 0.0),
+    actors: tuple[int, int] = (1, 1),
+) -> Iterator[str]:
+    """Annotate clips by two pools of actors; yield the status of each when it is done.
+
+    `address` is that of a cluster; `auto` is the one that RAY_ADDRESS names, or a new local one.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "Ray is not installed: --ray needs it. Run pip install 'egosim-jax[cluster]'."
+        ) from error
+    out = out.resolve()
+    rows = [_row(job) for job in jobs if not clip.is_final(job, out)]
+    yield from ["done"] * (len(jobs) - len(rows))
+    if not rows:
+        return
+    _connect(address)
+    try:
+        data = ray.data.from_items(rows, override_num_blocks=min(len(rows), 1000))
+        for stage, gpu, most in zip((FirstStages, LastStages), gpus, actors, strict=True):
+            data = data.map(
+                stage,
+                fn_constructor_args=(str(out), config),
+                compute=ray.data.ActorPoolStrategy(min_size=1, max_size=max(1, most)),
+                num_gpus=gpu or None,
+            )
+        for row in data.iter_rows():
+            yield row["status"]
+    finally:
+        ray.shutdown()
+
+
+def _connect(address: str) -> None:
+    """Connect to a cluster, or start one that only this machine can reach."""
+    import ray
+
+    if address == "auto" and not os.environ.get(ADDRESS):
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level="ERROR",
+            _node_ip_address="127.0.0.1",
+        )
+    else:
+        ray.init(address=None if address == "auto" else address, log_to_driver=False)
+    ray.data.DataContext.get_current().enable_progress_bars = False
+
+
+def _row(job: Job) -> dict[str, Any]:
+    return {"video_id": job.video_id, "job": json.dumps(asdict(job)), "status": ""}
+
+
+def _job(row: Mapping[str, Any]) -> Job:
+    return Job(**json.loads(row["job"]))

@@ -1,0 +1,178 @@
+"""Configuration of an annotation: rules for clips, and the estimator of each stage.
+
+An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
+
+    hands     landmarks                                   perception.hands
+    masks     geometry, sam3=FOLDER                       perception.silhouettes, networks
+    cameras   ladder                                      perception.cameras
+    depth     sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER
+    caption   any text, or qwen=FOLDER
+
+Every choice that the stages would make can be given instead: focal length, rung, scale, side.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+from egosim_jax.annotate.frames import Sampling
+from egosim_jax.annotate.prepare import Cutting, check_length
+from egosim_jax.io.untrusted import quote
+from egosim_jax.perception.estimates import (
+    CameraEstimator,
+    Captioner,
+    DepthEstimator,
+    HandEstimator,
+    Rung,
+    Segmenter,
+)
+from egosim_jax.rendering import RendererName
+from egosim_jax.types import InputError, check_seed
+
+Side = Literal["auto", "left", "right"]
+_DEPTH = {
+    "sweep": "perception.depth:SweptDepth",
+    "depth-anything": "perception.networks.depth_anything:DepthAnything",
+    "depth-pro": "perception.networks.depth_pro:DepthPro",
+    "depth-anything-3": "perception.networks.depth_anything_3:DepthAnything3",
+    "files": "",
+}
+_MASKS = {"geometry": "", "sam3": "perception.networks:GroundedSam3"}
+_CAPTIONS = {"qwen": "perception.networks:Qwen3VL"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimators:
+    """Estimators of the stages, built from a configuration."""
+
+    hands: HandEstimator
+    cameras: CameraEstimator
+    depth: DepthEstimator
+    segmenter: Segmenter | None = None
+    """None for silhouettes drawn from the hands."""
+    captioner: Captioner | None = None
+    """None for captions from the recording or the command."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnnotateConfig:
+    """Configuration of an annotation; equal ones make equal annotations."""
+
+    sampling: Sampling = field(default_factory=Sampling)
+    """Size, rate and length of the clips."""
+    cutting: Cutting = field(default_factory=Cutting)
+    """Shots, windows and quality."""
+    hand_weights: Path | None = None
+    """Folder of the hand networks; fetched at first use if not given."""
+    offline: bool = False
+    """Refuse to fetch anything."""
+    side: Side = "auto"
+    """Side of all hands; auto: as the landmarks say."""
+    masks: str = "geometry"
+    """Silhouettes of hands, arms and objects."""
+    detector: Path | None = None
+    """Folder of the detector that prompts sam3."""
+    phrases: tuple[str, ...] = ()
+    """Objects to segment, where no network names them."""
+    focal_px: float | None = None
+    """Focal length in pixels of the video."""
+    rung: Rung | None = None
+    """Rung of the ladder of camera estimation to use instead of trying them."""
+    depth: str = "sweep"
+    """Depth estimator; the recording's depth is used instead where it has some."""
+    scale: float | None = None
+    """Meters per unit of the cameras."""
+    camera_height_m: float | None = None
+    """Height of the camera above the surface in front of it, from which the scale follows."""
+    state: Literal["first", "fused"] = "first"
+    """Scene of the prior: seen in the first frame alone, or fused from key frames."""
+    caption: str | None = None
+    """Caption, or a network that writes it."""
+    renderer: RendererName = "jax"
+    """Renderer of prior and hands."""
+    split: str = "train"
+    """Value of the column split."""
+    seed: int = 0
+    """Seed of what is random."""
+
+    def __post_init__(self) -> None:
+        """Check everything that can be checked before a video is read."""
+        check_seed(self.seed)
+        check_length(self.sampling.num_frames, cut=self.cutting.clips)
+        for name, low in (("focal_px", 1), ("scale", 0), ("camera_height_m", 0)):
+            value = getattr(self, name)
+            if value is not None and not low < value < 1e6:
+                option = name.removesuffix("_px").removesuffix("_m").replace("_", "-")
+                raise InputError(f"--{option} is {value:g}: it must be above {low} and finite.")
+        if self.scale is not None and self.camera_height_m is not None:
+            raise InputError("--scale and --camera-height both give the scale: choose one.")
+        if self.rung is not None and self.rung not in get_args(Rung):
+            raise InputError(f"--rung must be one of {', '.join(get_args(Rung))}.")
+        _find(_DEPTH, self.depth, "--depth")
+        name, _ = _find(_MASKS, self.masks, "--masks")
+        if (name == "sam3") != (self.detector is not None):
+            raise InputError(
+                "--masks sam3=FOLDER and --detector FOLDER belong together: the detector finds "
+                "what is segmented."
+            )
+
+    @property
+    def depth_files(self) -> Path | None:
+        """Folder of depth maps made by others."""
+        name, folder = _find(_DEPTH, self.depth, "--depth")
+        return folder if name == "files" else None
+
+    @property
+    def caption_text(self) -> str | None:
+        """Caption that was given as text."""
+        return None if self._captioner else self.caption
+
+    @property
+    def _captioner(self) -> bool:
+        return (self.caption or "").partition("=")[0] in _CAPTIONS and "=" in (self.caption or "")
+
+    def build(self) -> Estimators:
+        """Return the estimators; heavy libraries are imported here, networks loaded later."""
+        from egosim_jax.perception.cameras import CameraLadder
+        from egosim_jax.perception.hands import LandmarkHands
+
+        ladder: dict[str, Any] = {} if self.rung is None else {"rung": self.rung}
+        segmenter = captioner = None
+        if self.masks != "geometry":
+            _, folder = _find(_MASKS, self.masks, "--masks")
+            kind = _import(_MASKS["sam3"])
+            segmenter = cast(Segmenter, kind(detector=self.detector, segmenter=folder))
+        if self._captioner:
+            name, folder = _find(_CAPTIONS, self.caption or "", "--caption")
+            captioner = cast(Captioner, _import(_CAPTIONS[name])(folder))
+        name, folder = _find(_DEPTH, self.depth, "--depth")
+        if name == "files":  # frames without a map are estimated
+            name, folder = "sweep", None
+        depth = _import(_DEPTH[name])
+        return Estimators(
+            hands=LandmarkHands(weights=self.hand_weights, offline=self.offline),
+            cameras=CameraLadder(**ladder),
+            depth=cast(DepthEstimator, depth() if folder is None else depth(folder)),
+            segmenter=segmenter,
+            captioner=captioner,
+        )
+
+
+def _find(known: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:
+    """Return name and folder of an estimator. Raises `InputError` naming all that are known."""
+    name, equals, folder = text.partition("=")
+    bare = name in ("sweep", "geometry")
+    if name not in known or bool(equals) == bare or (equals and not folder):
+        shown = ", ".join(n if n in ("sweep", "geometry") else f"{n}=FOLDER" for n in known)
+        raise InputError(f"{option} {quote(text)} must be one of {shown}.")
+    if equals and not Path(folder).is_dir():
+        raise InputError(f"{option} {quote(text)}: {quote(folder)} is not a folder.")
+    return name, Path(folder) if equals else None
+
+
+def _import(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(f"egosim_jax.{module}"), name)

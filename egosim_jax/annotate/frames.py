@@ -1,0 +1,178 @@
+"""Rate, size and length of the clips of a recorded video, and its frames at that size.
+
+- Rate: that of the video. Above 60 fps every second, third, ... frame is taken, so that 60 are not
+  exceeded. Another rate takes the frame nearest in time, as EgoSim does. Frames are taken to be
+  equally spaced.
+- Size: that of the video, reduced to at most 832 pixels on its longer side and cropped at the
+  borders to multiples of 16. Another size crops what its aspect ratio does not hold; one that would
+  lose more than 40 % of the picture, as landscape from portrait, is refused.
+- Length: all frames, cut to 4k+1. More than 601 need `--clips` or `--num-frames`.
+- HDR (PQ or HLG) is refused: converted to 8 bits without its tone curve, it would be pale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from egosim_jax.data.recording import Recording
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.types import WAN_GRID, InputError, check_counts
+
+MAX_FPS = 60
+"""Highest rate that is kept, in frames per second."""
+MAX_CLIP_FRAMES, MIN_CLIP_FRAMES = 601, 9
+"""Longest and shortest clip in frames."""
+LONGEST_PX = 832
+"""Longer side of clips without a given size, at most, in pixels."""
+LEAST_KEPT = 0.6
+"""Smallest fraction of the picture that a crop may keep."""
+CHUNK = 300
+"""Frames of a video that are decoded at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """Size, rate and length of clips, each that of the video where it is not given."""
+
+    size: tuple[int, int] | None = None
+    """Height and width in pixels, multiples of 16."""
+    fps: float | None = None
+    """Frames per second."""
+    num_frames: int | None = None
+    """Frames of a clip, 4k + 1."""
+
+    def __post_init__(self) -> None:
+        """Check that a model can encode such clips."""
+        check_counts({"--num-frames": self.num_frames})
+        if self.num_frames is not None:
+            WAN_GRID.check_frames(self.num_frames, what="a clip")
+        for name, size in zip(("--size height", "--size width"), self.size or (), strict=False):
+            WAN_GRID.check_size(size, name=name)
+        if self.fps is not None and not 1 <= self.fps <= MAX_FPS:
+            raise InputError(f"--fps must be from 1 to {MAX_FPS}, not {self.fps:g}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The frames to take of one video and how to fit them."""
+
+    source_fps: Fraction
+    """Rate of the video in frames per second."""
+    fps: Fraction
+    """Rate of the clips in frames per second."""
+    count: int
+    """Number of frames at the rate of the clips."""
+    height: int
+    """Rows of a clip in pixels."""
+    width: int
+    """Columns of a clip in pixels."""
+    scale: float
+    """Pixels of the clip per pixel of the video."""
+    offset_px: tuple[float, float]
+    """Column and row, in the resized picture, of the clip's first pixel."""
+
+    @no_type_check
+    def indices(self, start: int, stop: int) -> Int[np.ndarray, " f"]:
+        """Return the frames of the video nearest in time to some at the rate of the clips.
+
+        Of two equally near ones the later is taken.
+        """
+        times = [Fraction(k) * self.source_fps / self.fps for k in range(start, stop)]
+        return np.array([int(time + Fraction(1, 2)) for time in times])
+
+    @no_type_check
+    def intrinsics(self, source_px: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+        """Return intrinsics of the video as those of the clip, both in pixels."""
+        fitted = np.array(source_px, float)
+        fitted[:2] *= self.scale
+        fitted[:2, 2] += (self.scale - 1) / 2 - np.array(self.offset_px)
+        return fitted
+
+    @no_type_check
+    def fit(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Return a frame of the video resized, by areas, and cropped."""
+        import cv2
+
+        rows, columns = frame.shape[:2]
+        size = round(columns * self.scale), round(rows * self.scale)
+        how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC
+        resized = frame if size == (columns, rows) else cv2.resize(frame, size, interpolation=how)
+        left, top = (round(offset) for offset in self.offset_px)
+        return resized[top : top + self.height, left : left + self.width]
+
+
+def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
+    """Return rate, size and crop of a recording's clips, which are `cut` from it or all of it.
+
+    Raises `InputError` for one that is too short or too long, or of another shape than the size.
+    """
+    name = quote_path(recording.video)
+    fps = recording.fps / int(np.ceil(recording.fps / MAX_FPS))
+    if sampling.fps is not None:
+        fps = Fraction(sampling.fps).limit_denominator(1001)
+    count = int((recording.frames - 1) * fps / recording.fps + Fraction(1, 2)) + 1
+    wanted = sampling.num_frames or MIN_CLIP_FRAMES
+    if count < wanted:
+        raise InputError(
+            f"{name} has {count} frames at {float(fps):.4g} fps: a clip needs {wanted}. "
+            "(--num-frames, --fps)"
+        )
+    if not cut and sampling.num_frames is None and count > MAX_CLIP_FRAMES:
+        raise InputError(
+            f"{name} has {count} frames at {float(fps):.4g} fps: a clip has at most "
+            f"{MAX_CLIP_FRAMES}. Cut it into clips (--clips), or take its first ones "
+            "(--num-frames)."
+        )
+    info = recording
+    height, width = sampling.size or _own_size(info)
+    scale = max(height / info.height, width / info.width)
+    kept = height * width / (info.height * info.width * scale**2)
+    if kept < LEAST_KEPT:
+        raise InputError(
+            f"{name} is {info.width}x{info.height}: {width}x{height} would keep {kept:.0%} of the "
+            f"picture, less than {LEAST_KEPT:.0%}. Choose a size of a similar shape, for instance "
+            f"{' '.join(map(str, _own_size(info)))}. (--size)"
+        )
+    rest = round(info.width * scale) - width, round(info.height * scale) - height
+    return Plan(
+        source_fps=recording.fps,
+        fps=fps,
+        count=count,
+        height=height,
+        width=width,
+        scale=scale,
+        offset_px=(float(rest[0] // 2), float(rest[1] // 2)),
+    )
+
+
+def _own_size(info: Recording) -> tuple[int, int]:
+    """Return the largest size on the grid of at most 832 pixels that keeps a video's shape."""
+    scale = min(1.0, LONGEST_PX / max(info.height, info.width))
+    unit = WAN_GRID.spatial_stride * WAN_GRID.patch
+    height, width = (
+        max(unit, int(size * scale + 1e-6) // unit * unit) for size in (info.height, info.width)
+    )
+    return height, width
+
+
+def read_frames(
+    recording: Recording, fitted: Plan, start: int, stop: int
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return frames `start` to `stop`, at the rate of the clips, fitted to their size.
+
+    Raises `InputError` if the video is damaged.
+    """
+    wanted = fitted.indices(start, stop)
+    wanted = wanted[wanted < recording.frames]
+    frames = np.empty((len(wanted), fitted.height, fitted.width, 3), np.uint8)
+    for first in range(wanted[0], wanted[-1] + 1, CHUNK):
+        here = np.flatnonzero((wanted >= first) & (wanted < first + CHUNK))
+        low, high = wanted[here[0]], wanted[here[-1]]
+        chunk = recording.read_frames(int(low), int(high) + 1, each=fitted.fit).frames
+        frames[here] = chunk[wanted[here] - low]
+    return frames

@@ -1,0 +1,233 @@
+"""Shots, windows and quality of a recorded video, measured on thumbnails in one pass.
+
+A shot ends where the picture changes by more than `cut_difference` gray levels and three times as
+much as in the frames around (adaptive content detection, as in PySceneDetect); black frames belong
+to no shot. A clip is a window of one shot. It is refused if it is black, blurred, still, or shaken,
+each with the figure that decided; the figures are fractions of the picture's width, so that they
+hold for any size. Whether hands are visible is known after the first stage (`stages`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from egosim_jax.annotate.frames import CHUNK, MAX_CLIP_FRAMES, Plan
+from egosim_jax.data.recording import Recording
+from egosim_jax.types import WAN_GRID, InputError
+
+THUMB_PX = 160
+"""Width of the thumbnails, on which changes and motion are measured, in pixels."""
+SHARP_PX = 320
+"""Width at which sharpness is measured, in pixels."""
+
+
+class RefusedError(InputError):
+    """Raised for a clip that a rule refuses, with the rule's name and the figures that decided."""
+
+    def __init__(self, rule: str, reason: str, figures: Mapping[str, float] | None = None):
+        super().__init__(reason)
+        self.rule, self.figures = rule, dict(figures or {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """Rules that a clip must satisfy; 0 or infinity switches a rule off."""
+
+    min_hands: float = 0.5
+    """Smallest fraction of frames in which a hand is visible."""
+    min_sharpness: float = 15.0
+    """Smallest median over frames of the Laplacian's variance, in squared gray levels."""
+    max_black: float = 0.0
+    """Largest fraction of black frames, darker than 16 of 255."""
+    min_motion: float = 0.005
+    """Smallest motion of what moves fastest (95 %), in widths of the picture per second."""
+    max_motion: float = 1.5
+    """Largest motion of the picture as a whole (median), in widths of the picture per second."""
+    min_prior_gain_db: float = -1.0
+    """Smallest PSNR of the prior, compared with that of the first frame repeated, in decibels."""
+
+    def check(self, figures: Mapping[str, float]) -> None:
+        """Raise `RefusedError` for the first rule that the figures of a clip break."""
+        for rule, name, bad, option in (
+            ("black", "black", figures["black"] > self.max_black, "--max-black"),
+            ("blur", "sharpness", figures["sharpness"] < self.min_sharpness, "--min-sharpness"),
+            ("still", "motion", figures["motion"] < self.min_motion, "--min-motion"),
+            ("shaken", "camera_motion", figures["camera_motion"] > self.max_motion, "--max-motion"),
+        ):
+            if bad:
+                limit = getattr(self, option[2:].replace("-", "_"))
+                raise RefusedError(
+                    rule, f"{rule}: {name} is {figures[name]:.3g}, beyond {limit:g}. ({option})",
+                    figures,
+                )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cutting:
+    """Rules for shots and windows."""
+
+    clips: bool = False
+    """Cut videos into clips; else a video is one clip, which a cut makes unusable."""
+    cut_difference: float = 15.0
+    """Smallest change of the picture at a cut, in gray levels."""
+    quality: Quality = field(default_factory=Quality)
+    """Rules that a clip must satisfy."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Scan:
+    """Measurements of every frame of a video, at the rate of the clips."""
+
+    difference: Float[np.ndarray, " f"]
+    """Mean absolute change of color from the frame before, in gray levels."""
+    luminance: Float[np.ndarray, " f"]
+    """Mean brightness in gray levels."""
+    sharpness: Float[np.ndarray, " f"]
+    """Variance of the Laplacian in squared gray levels."""
+    motion: Float[np.ndarray, "f 2"]
+    """Optical flow from the frame before, median and 95 %, in widths of the picture per second."""
+
+    @property
+    def black(self) -> Bool[np.ndarray, " f"]:
+        """Frames that are black."""
+        return self.luminance < 16
+
+    def cuts(self, least: float) -> list[int]:
+        """Return the first frames of all shots but the first."""
+        around = np.pad(self.difference, 3, mode="edge")
+        near = np.stack([around[k : k + len(self.difference)] for k in (0, 1, 2, 4, 5, 6)])
+        sudden = (self.difference > least) & (self.difference > 3 * np.median(near, axis=0))
+        return np.flatnonzero(sudden).tolist()
+
+    def figures(self, start: int, stop: int) -> dict[str, float]:
+        """Return the figures of a clip that `Quality` judges."""
+        inner = self.motion[start + 1 : stop]
+        return {
+            "black": float(self.black[start:stop].mean()),
+            "sharpness": float(np.median(self.sharpness[start:stop])),
+            "motion": float(np.median(inner[:, 1])),
+            "camera_motion": float(np.median(inner[:, 0])),
+        }
+
+
+def scan(recording: Recording, fitted: Plan) -> Scan:
+    """Decode a video once and measure every frame. Raises `InputError` if it is damaged."""
+    import cv2
+
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    fps, before, rows = float(fitted.fps), None, []
+    height = max(16, round(SHARP_PX * fitted.height / fitted.width))
+
+    def thumb(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+        return cv2.resize(frame, (SHARP_PX, height), interpolation=cv2.INTER_AREA)
+
+    for first in range(0, fitted.count, CHUNK):
+        wanted = fitted.indices(first, min(first + CHUNK, fitted.count))
+        low, high = int(wanted[0]), min(int(wanted[-1]), recording.frames - 1)
+        for frame in recording.read_frames(low, high + 1, each=thumb).frames[
+            np.minimum(wanted, high) - low
+        ]:
+            gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+            small = cv2.resize(frame, (THUMB_PX, height // 2), interpolation=cv2.INTER_AREA)
+            small_gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+            change, speed = 0.0, np.zeros(1)
+            if before is not None:
+                change = float(np.abs(small.astype(int) - before[0]).mean())
+                moved = flow.calc(before[1], small_gray, None)
+                speed = np.linalg.norm(moved, axis=-1) * fps / THUMB_PX
+            low_high = np.percentile(speed, (50, 95))
+            sharpness = cv2.Laplacian(gray, cv2.CV_32F).var()
+            rows.append((change, gray.mean(), sharpness, *low_high))
+            before = small.astype(int), small_gray
+    table = np.array(rows)
+    return Scan(
+        difference=table[:, 0],
+        luminance=table[:, 1],
+        sharpness=table[:, 2],
+        motion=table[:, 3:],
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """A clip to annotate: some frames of a recording, at the rate of the clips."""
+
+    video_id: str
+    """Unique id of the clip."""
+    start: int
+    """First frame."""
+    stop: int
+    """Frame after the last."""
+    figures: Mapping[str, float]
+    """Figures that `Quality` judges."""
+    refused: tuple[str, str] | None = None
+    """Rule and reason if the clip is refused."""
+
+
+def windows(
+    recording: Recording, scanned: Scan, length: int | None, rules: Cutting
+) -> list[Window]:
+    """Return the clips of a recording, refused ones included."""
+    count = len(scanned.difference)
+    cuts = scanned.cuts(rules.cut_difference)
+    name = recording.recording_id
+    if not rules.clips:
+        stop = length or min((count - 1) // 4 * 4 + 1, MAX_CLIP_FRAMES)
+        inside = [cut for cut in cuts if cut < stop]
+        refusal = None
+        if inside:
+            refusal = (
+                "cut",
+                (f"the shot changes at frame {inside[0]}: a clip is one shot. (--clips)"),
+            )
+        return [_judge(name, scanned, 0, stop, rules, refusal)]
+    check_length(length, cut=True)
+    found, length = [], length or count
+    for first, last in _shots(scanned, cuts):
+        for start in range(first, last - length + 1, length):
+            here = f"{name}_{start}_{start + length - 1}"
+            found.append(_judge(here, scanned, start, start + length, rules))
+    return found
+
+
+def _shots(scanned: Scan, cuts: Sequence[int]) -> list[tuple[int, int]]:
+    """Return first frame and end of every run of frames that are in one shot and not black."""
+    bounds = np.zeros(len(scanned.black) + 1, bool)
+    bounds[[0, *cuts, -1]] = True
+    changes = np.flatnonzero(np.diff(scanned.black.astype(int))) + 1
+    bounds[changes] = True
+    edges = np.flatnonzero(bounds).tolist()
+    return [(start, stop) for start, stop in pairwise(edges) if not scanned.black[start]]
+
+
+def _judge(
+    video_id: str,
+    scanned: Scan,
+    start: int,
+    stop: int,
+    rules: Cutting,
+    refusal: tuple[str, str] | None = None,
+) -> Window:
+    figures = scanned.figures(start, stop)
+    try:
+        if refusal is None:
+            rules.quality.check(figures)
+    except RefusedError as refused:
+        refusal = refused.rule, str(refused)
+    return Window(video_id=video_id, start=start, stop=stop, figures=figures, refused=refusal)
+
+
+def check_length(length: int | None, *, cut: bool) -> None:
+    """Raise `InputError` if clips are cut without a length, or of one that is too long."""
+    if cut and length is None:
+        raise InputError("--clips needs the length of the clips: --num-frames, or --config.")
+    if length is not None and length > MAX_CLIP_FRAMES:
+        WAN_GRID.check_frames(length, what="a clip")
+        raise InputError(f"--num-frames {length}: a clip has at most {MAX_CLIP_FRAMES} frames.")

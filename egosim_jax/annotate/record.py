@@ -1,0 +1,201 @@
+"""The growing record of one clip, and storage of a stage's results as npz.
+
+Every stage reads the record and returns it with its own fields added, as in `perception.pipeline`.
+Expensive fields are stored by name: arrays as they are, nested dataclasses by dotted names, object
+ids run-length encoded, everything else as JSON. Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Int32, UInt8
+
+from egosim_jax.annotate.frames import Plan
+from egosim_jax.data.recording import Recording
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.npz import DAMAGE, read_arrays
+from egosim_jax.io.untrusted import parse_json, quote_path, quote_text
+from egosim_jax.perception.estimates import (
+    CameraEstimate,
+    DepthEstimate,
+    HandTracks,
+    Lens,
+    SparsePoints,
+    Verdict,
+)
+from egosim_jax.types import Cameras, InputError, SceneState
+
+_CLASSES = {
+    "hands": HandTracks,
+    "estimate": CameraEstimate,
+    "estimate.cameras": Cameras,
+    "estimate.verdict": Verdict,
+    "estimate.points": SparsePoints,
+    "estimate.lens": Lens,
+    "depth": DepthEstimate,
+}
+"""Dataclass of each dotted name."""
+_RUNS = "object_ids"
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """Results of the stages for one clip; None where no stage has run yet."""
+
+    video_id: str
+    """Unique id of the clip."""
+    recording: Recording
+    """Knowledge of the clip's part of the video; its frames are at the video's rate."""
+    plan: Plan
+    """Rate and crop of the clip."""
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """The clip."""
+    device_focal_px: float | None = None
+    """Focal length of the device in pixels of the clip, from other clips."""
+    hands: HandTracks | None = None
+    """Hands in pixels."""
+    object_ids: Int32[np.ndarray, "f h w"] | None = None
+    """Object instance of each pixel: 0 none, negative hands and arms."""
+    names: Mapping[int, str] | None = None
+    """Names of object instances."""
+    estimate: CameraEstimate | None = None
+    """Cameras, with the decision about them; in meters from the stage `scale` on."""
+    depth: DepthEstimate | None = None
+    """Depth of some frames, the first included; in meters from the stage `scale` on."""
+    joints_m: Float[np.ndarray, "f n j 3"] | None = None
+    """Joints in the world in meters."""
+    first_frame: UInt8[np.ndarray, "h w 3"] | None = None
+    """First frame without hands."""
+    state: SceneState | None = None
+    """Scene, without hands."""
+    prompt: str | None = None
+    """Caption of the clip."""
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    """Choices, figures and warnings of the stages, for annotation.json."""
+
+    def require(self, name: str) -> Any:
+        """Return a field; raise `InputError` if no stage has set it."""
+        value = getattr(self, name)
+        if value is None:
+            raise InputError(f"{name} is missing: no stage before this one sets it.")
+        return value
+
+    @property
+    def cameras(self) -> Cameras:
+        """Cameras, once they are estimated."""
+        return self.require("estimate").cameras
+
+    @property
+    def moving(self) -> Bool[np.ndarray, "f h w"]:
+        """Pixels of hands and arms."""
+        return self.require("object_ids") < 0
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "3 3"] | None:
+        """Intrinsics of the clip in pixels, where the recording knows them."""
+        known = self.recording.intrinsics_px
+        return None if known is None else self.plan.intrinsics(known)
+
+    @property
+    def fps(self) -> Fraction:
+        """Rate of the clip in frames per second."""
+        return self.plan.fps
+
+    def add(self, stage: str, notes: Mapping[str, Any], **fields: Any) -> Record:
+        """Return the record with a stage's fields and notes."""
+        return replace(self, notes={**self.notes, stage: dict(notes)}, **fields)
+
+
+def save(path: Path, record: Record, fields: Sequence[str], stage: str) -> None:
+    """Write some fields of a record, and the notes of a stage, atomically."""
+    arrays: dict[str, np.ndarray] = {}
+    about: dict[str, Any] = {"notes": record.notes.get(stage, {})}
+    for name in fields:
+        value = getattr(record, name)
+        if name == _RUNS:
+            arrays |= _encode_runs(value)
+        else:
+            _flatten(name, value, arrays, about)
+    text = json.dumps(about, default=_number)
+    with atomic_write(path) as temporary:
+        np.savez(temporary, about=np.frombuffer(text.encode(), np.uint8), **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def load(path: Path, record: Record, fields: Sequence[str], stage: str) -> Record:
+    """Return a record with the fields and notes of a file that `save` wrote.
+
+    Raises `InputError` if the file is damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+        arrays = read_arrays(path, {}, others=names)
+        about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
+        found = {
+            name: _decode_runs(arrays) if name == _RUNS else _build(name, arrays, about)
+            for name in fields
+        }
+    except (*DAMAGE, KeyError, TypeError) as error:
+        raise InputError(
+            f"{quote_path(path)} is damaged: {quote_text(str(error))}. Remove it."
+        ) from error
+    return record.add(stage, about["notes"], **found)
+
+
+def _number(value: Any) -> Any:
+    """Return a NumPy number as one of Python, for JSON."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return str(value)
+
+
+def _flatten(name: str, value: Any, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+    elif name in _CLASSES and value is not None:
+        about[name] = {}
+        for part in dataclasses.fields(value):
+            _flatten(f"{name}.{part.name}", getattr(value, part.name), arrays, about)
+    elif isinstance(value, Mapping):
+        about[name] = [[key, item] for key, item in value.items()]
+    else:
+        about[name] = value
+
+
+def _build(name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> Any:
+    if name in arrays:
+        return arrays[name]
+    value = about[name]
+    if name in _CLASSES and value is not None:
+        kind = _CLASSES[name]
+        parts = (part.name for part in dataclasses.fields(kind))
+        return kind(**{part: _build(f"{name}.{part}", arrays, about) for part in parts})
+    if isinstance(value, list):
+        return {key: item for key, item in value}
+    return value
+
+
+def _encode_runs(ids: np.ndarray) -> dict[str, np.ndarray]:
+    flat = ids.reshape(-1)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(flat)) + 1])
+    return {
+        "runs.starts": starts,
+        "runs.values": flat[starts],
+        "runs.shape": np.array(ids.shape),
+    }
+
+
+def _decode_runs(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    starts, shape = arrays["runs.starts"], arrays["runs.shape"]
+    lengths = np.diff(np.append(starts, np.prod(shape)))
+    return np.repeat(arrays["runs.values"], lengths).reshape(shape).astype(np.int32)

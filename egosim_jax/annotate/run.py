@@ -1,0 +1,259 @@
+"""Annotation of many videos: scanned, annotated in parallel, and listed.
+
+    OUT/journal.jsonl        the configuration, so that another one is refused
+    OUT/work/recordings/ID   what is known of each video
+    OUT/work/scans/ID.json   its clips, or why it has none
+    OUT/ID/                  each clip (`clip`)
+    OUT/metadata.csv         the accepted clips
+    OUT/report.json          all clips and videos, with reasons
+    OUT/index.html           a page of all clips
+
+A file is written when it is complete, and what exists is not made again, so the same command
+continues after an interruption at any time. A video that cannot be read is reported; the others
+are annotated.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from egosim_jax import interrupts
+from egosim_jax.annotate import clip
+from egosim_jax.annotate.clip import ANNOTATION, WORK, Job
+from egosim_jax.annotate.config import AnnotateConfig
+from egosim_jax.annotate.frames import plan
+from egosim_jax.annotate.page import write_page
+from egosim_jax.annotate.prepare import scan, windows
+from egosim_jax.annotate.sources import Source, open_source
+from egosim_jax.command import CommandExit, ExitCode
+from egosim_jax.data.clips import write_table
+from egosim_jax.io.journal import Journal
+from egosim_jax.io.run import plain, write_json
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.types import InputError
+
+T = TypeVar("T")
+CALIBRATED = ("incremental", "global")
+"""Rungs that estimate a focal length."""
+REPORT, METADATA = "report.json", "metadata.csv"
+MAX_REPORT_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """Result of scanning one video."""
+
+    source: str
+    """Id of the video."""
+    jobs: tuple[Job, ...] = ()
+    """Clips to annotate."""
+    refused: tuple[tuple[Job, str, str], ...] = ()
+    """Clips that are refused before any stage, with rule and reason."""
+    problem: str | None = None
+    """Reason if the video has no clips."""
+
+
+def require_config(out: Path, config: AnnotateConfig) -> None:
+    """Record the configuration of a folder. Raises `InputError` if it holds another one's clips."""
+    journal = Journal(out, outputs=(REPORT, f"*/{ANNOTATION}"))
+    journal.require("annotate", {name: str(value) for name, value in _flat(plain(config)).items()})
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        if isinstance(item, Mapping):
+            found |= _flat(item, f"{prefix}{name}.")
+        elif name != "type":
+            found[f"{prefix}{name}"] = item
+    return found
+
+
+def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
+    """Measure a video and choose its clips, or load the result; report one that is not readable.
+
+    Raises `InputError` if the file was replaced by another one since.
+    """
+    path = out / WORK / "scans" / f"{source.name}.json"
+    size = 0 if source.path.is_dir() else source.path.stat().st_size
+    if path.exists():
+        written = read_json(path)
+        if written["path"] != str(source.path) or written["bytes"] != size:
+            raise InputError(
+                f"{source.path} is not the file that {out} was made of: {written['path']} of "
+                f"{written['bytes']:,} bytes. Choose another folder. (--out)"
+            )
+        return _scanned(source.name, written)
+    about: dict[str, Any] = {"path": str(source.path), "bytes": size, "windows": []}
+    try:
+        recording = open_source(source, config.depth_files)
+        fitted = plan(recording, config.sampling, cut=config.cutting.clips)
+        folder = out / WORK / "recordings" / source.name
+        recording.save(folder)
+        length = config.sampling.num_frames
+        about["recording"] = str(folder)
+        about["windows"] = [
+            asdict(window)
+            for window in windows(recording, scan(recording, fitted), length, config.cutting)
+        ]
+        if not about["windows"]:
+            about["problem"] = "no shot is long enough for a clip. (--num-frames)"
+    except InputError as error:
+        about["problem"] = str(error)
+    write_json(path, about)
+    return _scanned(source.name, about)
+
+
+def _scanned(name: str, about: Mapping[str, Any]) -> Scanned:
+    jobs, refused = [], []
+    for window in about["windows"]:
+        job = Job(
+            recording=about["recording"],
+            **{key: window[key] for key in ("video_id", "start", "stop", "figures")},
+        )
+        if window["refused"]:
+            rule, reason = window["refused"]
+            refused.append((job, rule, reason))
+        else:
+            jobs.append(job)
+    return Scanned(name, tuple(jobs), tuple(refused), about.get("problem"))
+
+
+def scan_sources(
+    sources: Sequence[Source], out: Path, config: AnnotateConfig, *, workers: int
+) -> Iterator[Scanned]:
+    """Scan videos, in parallel; yield each when it is done."""
+    yield from _each(_scan_one, [(source, out, config) for source in sources], workers)
+
+
+def annotate_jobs(
+    jobs: Sequence[Job], out: Path, config: AnnotateConfig, *, workers: int
+) -> Iterator[str]:
+    """Annotate clips, in parallel; yield the status of each when it is done."""
+    yield from _each(_annotate_one, [(job, out, config) for job in jobs], workers)
+
+
+def _each(run: Callable[..., T], calls: Sequence[tuple[Any, ...]], workers: int) -> Iterator[T]:
+    if workers == 1 or len(calls) < 2:
+        yield from (run(*call) for call in calls)
+        return
+    # One thread per process: two processes that share the cores by threads take twice as long.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(calls)), mp_context=context)
+    try:
+        with interrupts.not_inherited():
+            tasks = [pool.submit(run, *call) for call in calls]
+        for task in as_completed(tasks):
+            yield task.result()
+    except BrokenProcessPool as error:
+        raise CommandExit(
+            "error: a worker process was killed, maybe because memory ran out. Run the same "
+            "command again with fewer --workers; finished stages are kept.",
+            ExitCode.FAILED,
+        ) from error
+    finally:  # after an error or Ctrl-C, clips that have not started are canceled
+        pool.shutdown(cancel_futures=True)
+
+
+def _scan_one(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
+    return scan_source(source, out, config)
+
+
+_built: dict[AnnotateConfig, Any] = {}
+"""Estimators of this process, so that networks are loaded once."""
+
+
+def _annotate_one(job: Job, out: Path, config: AnnotateConfig) -> str:
+    if config not in _built:
+        _built[config] = config.build()
+    return clip.annotate(job, out, config, _built[config])
+
+
+def choose_jobs(scanned: Iterable[Scanned], out: Path, config: AnnotateConfig) -> list[Job]:
+    """Return the clips to annotate; write the annotations of those that are refused already.
+
+    Of two clips with one id, the second one's video is reported as a problem.
+    """
+    jobs: list[Job] = []
+    seen: dict[str, str] = {}
+    for found in scanned:
+        for job, rule, reason in found.refused:
+            if not clip.read_annotation(job.video_id, out):
+                notes = {"rule": rule, "reason": reason, "figures": dict(job.figures)}
+                clip.finish(job, out, config, "refused", notes)
+        for job in found.jobs:
+            if (other := seen.setdefault(job.video_id, job.recording)) != job.recording:
+                raise InputError(
+                    f"Two recordings have the id {job.video_id}: {other} and {job.recording}. "
+                    "Annotate them to different folders. (--out)"
+                )
+            jobs.append(job)
+    return jobs
+
+
+def choose_retries(scanned: Iterable[Scanned], out: Path) -> list[Job]:
+    """Return refused clips that have no cameras, with the focal length of their video's others.
+
+    It is the median over the clips whose cameras were calibrated without one.
+    """
+    retries = []
+    for found in scanned:
+        abouts = [clip.read_annotation(job.video_id, out) for job in found.jobs]
+        focals = [
+            about["cameras"]["focal_px"]
+            for about in abouts
+            if about.get("status") == "done" and about["cameras"]["rung"] in CALIBRATED
+        ]
+        if focals:
+            focal = float(np.median(focals))
+            retries += [
+                replace(job, focal_px=focal)
+                for job, about in zip(found.jobs, abouts, strict=True)
+                if clip.can_retry(about)
+            ]
+    return retries
+
+
+def write_report(scanned: Sequence[Scanned], out: Path) -> dict[str, Any]:
+    """Write metadata.csv, report.json and index.html of what is annotated; return the report."""
+    clips: list[dict[str, Any]] = []
+    rows: list[dict[str, str]] = []
+    for found in scanned:
+        for job in (*found.jobs, *(job for job, _, _ in found.refused)):
+            about = read_json(out / job.video_id / ANNOTATION)
+            if about["status"] == "done":
+                rows.append(about["row"])
+            clips.append({"source": found.source, **about})
+    clips.sort(key=lambda about: (about["source"], about["start"]))
+    videos = {found.source: _summary(found, clips) for found in scanned}
+    counts = {
+        status: sum(about["status"] == status for about in clips)
+        for status in ("done", "refused", "failed")
+    }
+    report = {"clips": counts, "videos": videos, "annotations": clips}
+    if rows:
+        write_table(out / METADATA, sorted(rows, key=lambda row: row["video_id"]))
+    else:
+        (out / METADATA).unlink(missing_ok=True)
+    write_json(out / REPORT, report)
+    write_page(out, report)
+    return report
+
+
+def _summary(found: Scanned, clips: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    own = [about for about in clips if about["source"] == found.source]
+    done = sum(about["status"] == "done" for about in own)
+    summary: dict[str, Any] = {"clips": len(own), "done": done}
+    if found.problem is not None:
+        summary["problem"] = found.problem
+    return summary

@@ -1,0 +1,135 @@
+"""Videos and recordings to annotate, found by path, each with its unique id."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from egosim_jax.data.clips import VIDEO_SUFFIXES
+from egosim_jax.data.recording import DESCRIPTION, DepthFiles, Recording
+from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.untrusted import listing, quote_path
+from egosim_jax.types import InputError
+
+DEPTH_SUFFIXES = {".png": 0.001, ".npy": 1.0}
+"""Suffixes of depth maps, and the unit of each in meters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A video file, or a folder of a recording."""
+
+    name: str
+    """Unique id, which names the clips of a video."""
+    path: Path
+    """Video file or recording folder."""
+
+
+def find_sources(paths: Sequence[Path]) -> list[Source]:
+    """Return the videos and recordings that paths name: files, or folders of them.
+
+    Raises `InputError` for a path that does not exist or holds neither, and where two have one id.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found += _inside(path)
+        elif path.exists():
+            found.append(path)
+        else:
+            raise InputError(f"{quote_path(path)} does not exist.")
+    found = list(dict.fromkeys(path.resolve() for path in found))
+    names = [_name(path, 1) for path in found]
+    names = [
+        name if names.count(name) == 1 else _name(path, 2)
+        for path, name in zip(found, names, strict=True)
+    ]
+    doubles = [
+        quote_path(path) for path, name in zip(found, names, strict=True) if names.count(name) > 1
+    ]
+    if doubles:
+        raise InputError(
+            f"Videos that would have one id: {listing(doubles)}. Ids are made of the file's and "
+            "its folder's name: rename some, or annotate them to different folders."
+        )
+    return [Source(name=name, path=path) for name, path in zip(names, found, strict=True)]
+
+
+def open_source(source: Source, depth_files: Path | None = None) -> Recording:
+    """Return the recording of a source; of a video, no more than its length, size and rate.
+
+    Depth maps of others are `depth_files`/ID/N.png (millimeters) or N.npy (meters), N being the
+    frame of the video, with or without the prefix `depth_`. Raises `InputError` if a file cannot be
+    read.
+    """
+    if source.path.is_dir():
+        recording = Recording.load(source.path)
+    else:
+        info = probe_long_video(source.path)
+        if info.hdr:
+            raise InputError(
+                f"{quote_path(source.path)} is HDR (PQ or HLG): only standard dynamic range is "
+                "read. Convert it with a tone curve, for instance FFmpeg's zscale and tonemap."
+            )
+        recording = Recording(
+            recording_id=source.name,
+            video=source.path,
+            frames=info.frames,
+            fps=info.fps,
+            height=info.height,
+            width=info.width,
+        )
+    return recording if depth_files is None else _with_depth(recording, depth_files)
+
+
+def _with_depth(recording: Recording, folder: Path) -> Recording:
+    from dataclasses import replace
+
+    own = folder / recording.recording_id
+    for suffix, unit_m in DEPTH_SUFFIXES.items():
+        stems = {f: f.stem.removeprefix("depth_") for f in own.glob(f"*{suffix}")}
+        files = {int(stem): file for file, stem in stems.items() if stem.isdigit()}
+        if files:
+            frames = range(recording.start, recording.start + recording.frames)
+            paths = tuple(files.get(frame) for frame in frames)
+            return replace(recording, depth=DepthFiles(paths=paths, unit_m=unit_m))
+    raise InputError(
+        f"{quote_path(own)} has no depth maps: they are named 000000.png (16 bits, millimeters) or "
+        "000000.npy (meters), by frame. (--depth)"
+    )
+
+
+def _inside(folder: Path) -> list[Path]:
+    """Return recordings and videos below a folder, without the videos of recordings."""
+    if (folder / DESCRIPTION).is_file():
+        return [folder]
+    recordings = sorted(path.parent for path in folder.rglob(DESCRIPTION))
+    videos = [
+        path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix.lower() in VIDEO_SUFFIXES
+        and path.is_file()
+        and not any(parent in path.parents for parent in recordings)
+    ]
+    if not recordings and not videos:
+        raise InputError(
+            f"{quote_path(folder)} holds no video ({', '.join(VIDEO_SUFFIXES)}) and no recording "
+            "(`egosim data import`)."
+        )
+    return recordings + videos
+
+
+def _name(path: Path, parts: int) -> str:
+    """Return an id made of the last parts of a path, without what is not allowed in ids.
+
+    Of `video.mp4`, as data sets name files, only the folders count.
+    """
+    last = path.name if path.is_dir() else path.stem
+    end = len(path.parts) - 1
+    kept = [*path.parts[max(1, end - parts) : end]] if last == "video" else [
+        *path.parts[max(1, end - parts + 1) : end], last
+    ]  # fmt: skip
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", "_".join(kept)).strip("_")
+    return name[:120] or "video"

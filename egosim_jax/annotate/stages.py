@@ -1,0 +1,321 @@
+"""Stages of an annotation: from the frames of a clip to a triplet and its scene.
+
+    hands -> silhouettes -> cameras -> depth -> scale -> plate -> scene -> caption
+
+Each is a function of the record so far, the estimators and the configuration, which returns the
+record with its fields added, and notes on what was chosen and why. What the recording knows
+(cameras, hands, depth, caption) is taken instead of estimated. A clip that no camera can be
+estimated for is refused; nothing is guessed silently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from einops import rearrange
+from jaxtyping import Bool
+
+from egosim_jax.annotate.config import AnnotateConfig, Estimators, Side
+from egosim_jax.annotate.prepare import RefusedError
+from egosim_jax.annotate.record import Record
+from egosim_jax.geometry import invert, project, transform
+from egosim_jax.perception.estimates import (
+    LEFT,
+    RIGHT,
+    CameraEstimate,
+    DepthEstimate,
+    HandTracks,
+    SparsePoints,
+    Verdict,
+)
+from egosim_jax.types import Cameras, InputError
+
+SIDES = ("left", "right")
+KEY_FRAMES = 6
+"""Frames that a fused scene is made of."""
+HOLD_S = 0.5
+"""Time for which the silhouette of a hand that is not found stays, in seconds."""
+Run = Callable[[Record, Estimators, AnnotateConfig], Record]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of an annotation."""
+
+    name: str
+    """Name, which is also that of its file."""
+    run: Run
+    """Function that adds fields to the record."""
+    stored: tuple[str, ...] = ()
+    """Fields that are stored, so that an interrupted clip resumes after this stage."""
+
+
+def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
+    """Add `hands`. Raises `RefusedError` if too few frames show one."""
+    given = record.recording.joints_m
+    if given is not None and record.recording.kind == "human":
+        hands, source = _project_given(record, given), "recording"
+    elif given is not None:
+        return record.add("hands", {"source": "recording", "kind": record.recording.kind})
+    else:
+        hands, source = _on_side(parts.hands(record.frames), config.side), "estimated"
+    seen = visible(hands)
+    shown = int(np.any(seen, axis=1).sum())
+    share = shown / len(seen)
+    notes = {
+        "source": source,
+        "side": config.side,
+        "frames": {side: int(seen[:, n].sum()) for n, side in enumerate(SIDES)},
+        "visible": share,
+    }
+    least = config.cutting.quality.min_hands
+    if share < least:
+        raise RefusedError(
+            "hands",
+            f"hands: visible in {shown} of {len(seen)} frames, less than "
+            f"{least:.0%}. (--min-hands)",
+            {"visible": share},
+        )
+    return record.add("hands", notes, hands=hands)
+
+
+def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
+    """Add `object_ids` and `names`: hands and arms, and objects where a network segments."""
+    if parts.segmenter is not None:
+        phrases = config.phrases or record.recording.names
+        if not phrases and parts.captioner is not None:
+            phrases = parts.captioner(record.frames)[1]
+        ids, names = parts.segmenter(record.frames, phrases, record.hands)
+        return record.add(
+            "silhouettes", {"masks": config.masks, "phrases": list(phrases)},
+            object_ids=ids.astype(np.int32), names=dict(names),
+        )  # fmt: skip
+    if record.hands is None:
+        from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
+
+        cameras = _given_cameras(record)
+        joints = record.recording.joints_m
+        if cameras is None or joints is None:
+            raise InputError(
+                "The recording has hands, but not the intrinsics of its cameras: both are needed. "
+                "Import it with its intrinsics."
+            )
+        joints = joints[_source_frames(record)]
+        moving = hand_silhouette(joints, record.recording.kind, cameras, HandShape()) >= 0
+    else:
+        from egosim_jax.perception.silhouettes import hand_silhouettes
+
+        moving = hand_silhouettes(record.frames, hold_hands(record.hands, record.fps))
+    ids = np.where(moving, -1, 0).astype(np.int32)
+    return record.add("silhouettes", {"masks": "geometry"}, object_ids=ids, names={})
+
+
+def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
+    """Return tracks in which a hand stays where it was found last, or first, for half a second.
+
+    For silhouettes only, so that a hand that is entering, leaving or not found for a moment is not
+    taken for the scene.
+    """
+    joints_px, joints_hand_m = hands.joints_px.copy(), hands.joints_hand_m.copy()
+    found, frames = visible(hands), np.arange(len(hands.presence))
+    for side in (LEFT, RIGHT):
+        known = np.flatnonzero(found[:, side])
+        if len(known):
+            nearest = known[np.abs(frames[:, None] - known).argmin(axis=1)]
+            near = np.abs(nearest - frames) <= HOLD_S * fps
+            joints_px[near, side] = hands.joints_px[nearest[near], side]
+            joints_hand_m[near, side] = hands.joints_hand_m[nearest[near], side]
+    return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
+
+
+def find_cameras(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
+    """Add `estimate`: what the recording knows, or what the ladder accepts; else refuse."""
+    from egosim_jax.perception.cameras import CameraLadder
+    from egosim_jax.perception.cameras.triangulate import triangulate
+
+    given = _given_cameras(record)
+    if given is not None:
+        verdict = Verdict(rung="given", reason="given by the recording", figures={})
+        estimate = CameraEstimate(
+            cameras=given,
+            metric=record.recording.metric,
+            verdict=verdict,
+            points=_given_points(record) or triangulate(record.frames, record.moving, given),
+        )
+        return record.add("cameras", _camera_notes(estimate, "recording"), estimate=estimate)
+    focal, source, estimator = record.device_focal_px, "estimated", parts.cameras
+    if config.focal_px is not None:
+        focal, source = config.focal_px * record.plan.scale, "--focal"
+    elif record.intrinsics is not None:
+        focal, source = float(record.intrinsics[0, 0]), "recording"
+    if source != "estimated" and isinstance(estimator, CameraLadder):
+        estimator = replace(estimator, focal_px=focal)  # known, not only likely
+    estimate = estimator(record.frames, record.moving, focal_px=focal)
+    if estimate.cameras is None:
+        verdict = estimate.verdict
+        raise RefusedError("cameras", f"cameras: {verdict.reason}", verdict.figures)
+    return record.add("cameras", _camera_notes(estimate, source), estimate=estimate)
+
+
+def undistort_clip(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
+    """Replace frames, hands and silhouettes by those of the pinhole camera, if the lens is none."""
+    from egosim_jax.perception.cameras import undistort, undistort_pixels
+
+    estimate, hands = record.require("estimate"), record.hands
+    if estimate.lens is None:
+        return record.add("lens", {"radial": 0.0})
+    if hands is not None:
+        hands = replace(hands, joints_px=undistort_pixels(hands.joints_px, estimate))
+    ids = undistort(record.require("object_ids").astype(np.int16), estimate)
+    return record.add(
+        "lens",
+        asdict(estimate.lens),
+        frames=undistort(record.frames, estimate),
+        hands=hands,
+        object_ids=ids.astype(np.int32),
+    )
+
+
+def find_depth(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
+    """Add `depth` of the first frame, and of key frames for a fused scene."""
+    wanted = [0]
+    if config.state == "fused":
+        wanted = sorted({int(k) for k in np.linspace(0, len(record.frames) - 1, KEY_FRAMES)})
+    maps = [_given_depth(record, frame) for frame in wanted]
+    if all(depth is not None for depth in maps):
+        known = np.stack([depth for depth in maps if depth is not None])
+        depth = DepthEstimate(
+            frames=np.array(wanted, np.int32),
+            depth_m=known,
+            confident=np.isfinite(known),
+            metric=True,
+        )
+        return record.add("depth", {"source": "recording"}, depth=depth)
+    depth = parts.depth(record.frames, record.moving, record.require("estimate"), wanted)
+    confident = float(depth.confident.mean())
+    notes = {"source": config.depth, "reason": depth.reason, "confident": confident}
+    return record.add("depth", notes, depth=depth)
+
+
+def visible(hands: HandTracks) -> Bool[np.ndarray, "f 2"]:
+    """Return in which frames each hand was found."""
+    return np.asarray(np.isfinite(hands.joints_px).all(axis=(2, 3)))
+
+
+def _on_side(hands: HandTracks, side: Side) -> HandTracks:
+    """Return tracks with all hands on one side, the most confident of each frame, if asked."""
+    if side == "auto":
+        return hands
+    own = LEFT if side == "left" else RIGHT
+    presence = np.where(visible(hands), hands.presence, -1)
+    best = np.argmax(presence, axis=1)
+    rows = np.arange(len(best))
+    moved: dict[str, Any] = {}
+    for name, missing in (("joints_px", np.nan), ("joints_hand_m", np.nan), ("presence", 0.0)):
+        values = getattr(hands, name)
+        moved[name] = np.full_like(values, missing)
+        moved[name][:, own] = values[rows, best]
+    return HandTracks(**moved)
+
+
+def _source_frames(record: Record) -> np.ndarray:
+    """Return the frame of the recording that each frame of the clip is."""
+    return record.plan.indices(0, len(record.frames))
+
+
+def _given_cameras(record: Record) -> Cameras | None:
+    """Return the recording's cameras at the rate and size of the clip."""
+    known, intrinsics = record.recording.world_from_camera, record.intrinsics
+    if known is None or intrinsics is None:
+        return None
+    return Cameras(
+        world_from_camera=np.asarray(known, float)[_source_frames(record)],
+        intrinsics_px=intrinsics,
+        height=record.plan.height,
+        width=record.plan.width,
+    )
+
+
+def _given_points(record: Record) -> SparsePoints | None:
+    """Return the recording's points with their observations in the pixels of the clip."""
+    points = record.recording.points
+    if points is None or points.frames is None or points.pixels_px is None:
+        return None
+    clip_frame = np.full(record.recording.frames, -1)
+    clip_frame[_source_frames(record)] = np.arange(len(record.frames))
+    kept = clip_frame[points.frames] >= 0
+    plan, pixels = record.plan, np.asarray(points.pixels_px)[kept].astype(float)
+    fitted = plan.scale * (pixels + 0.5) - 0.5 - np.array(plan.offset_px)
+    errors = points.error_px
+    return SparsePoints(
+        points_m=points.points_m.astype(float),
+        error_px=np.zeros(len(points.points_m)) if errors is None else plan.scale * errors,
+        frames=clip_frame[points.frames[kept]].astype(np.int32),
+        indices=points.indices[kept],
+        pixels_px=fitted,
+    )
+
+
+def _given_depth(record: Record, frame: int) -> np.ndarray | None:
+    """Return the recording's depth of a frame of the clip, in meters at the clip's size."""
+    import cv2
+
+    depth = record.recording.read_depth(int(_source_frames(record)[frame]))
+    if depth is None:
+        return None
+    plan = record.plan
+    size = round(depth.shape[1] * plan.scale), round(depth.shape[0] * plan.scale)
+    resized = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+    left, top = (round(offset) for offset in plan.offset_px)
+    return resized[top : top + plan.height, left : left + plan.width]
+
+
+def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:
+    """Return the recording's joints as tracks in the pixels of the clip."""
+    cameras = _given_cameras(record)
+    if cameras is None:
+        raise InputError(
+            "The recording has hands, but not the intrinsics of its cameras: both are needed. "
+            "Import it with its intrinsics."
+        )
+    joints = joints_m[_source_frames(record)][:, :2]
+    local = transform(rearrange(invert(cameras.world_from_camera), "f a b -> f 1 a b"), joints)
+    pixels = np.stack(project(cameras.intrinsics_px, local), axis=-1)
+    behind = (local[..., 2] <= 0).any(axis=-1)
+    local[behind], pixels[behind] = np.nan, np.nan
+    found = np.isfinite(local).all(axis=(2, 3))
+    padding = ((0, 0), (0, 2 - joints.shape[1]), (0, 0), (0, 0))
+    return HandTracks(
+        joints_px=np.pad(pixels, padding, constant_values=np.nan),
+        joints_hand_m=np.pad(local, padding, constant_values=np.nan),
+        presence=np.pad(found.astype(float), padding[:2]),
+    )
+
+
+def _camera_notes(estimate: CameraEstimate, focal_source: str) -> dict[str, Any]:
+    focal = None if estimate.cameras is None else float(estimate.cameras.intrinsics_px[0, 0])
+    return {
+        "rung": estimate.verdict.rung,
+        "reason": estimate.verdict.reason,
+        "figures": dict(estimate.verdict.figures),
+        "focal_px": focal,
+        "focal_source": focal_source,
+        "metric": estimate.metric,
+    }
+
+
+def joints_in_world(record: Record) -> np.ndarray:
+    """Return the joints in the world in meters: the recording's, or lifted from pixels."""
+    from egosim_jax.perception.hands import lift
+
+    given = record.recording.joints_m
+    if given is not None:
+        return given[_source_frames(record)].astype(float)
+    cameras = record.cameras
+    local = lift(record.require("hands"), cameras.intrinsics_px)
+    poses = rearrange(cameras.world_from_camera, "f a b -> f 1 a b")
+    return transform(poses, local)

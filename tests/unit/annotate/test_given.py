@@ -1,0 +1,102 @@
+"""Recordings of which cameras, hands or depth are known: these are taken, not estimated."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from egosim_jax.annotate.clip import ANNOTATION
+from egosim_jax.annotate.frames import Sampling
+from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.state import snapshot
+from tests.unit.annotate.stubs import DEPTH, config, mean_hand, textured_video, write
+from tests.unit.annotate.test_run import annotate
+
+ARRAYS = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64"}
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A recording of 17 frames whose camera moves to the right by a centimeter a frame."""
+    path = write(tmp_path / "source.mp4", textured_video(17))
+    poses = np.tile(np.eye(4), (17, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(17)
+    joints = np.full((17, 2, 21, 3), np.nan)
+    joints[:, 1] = mean_hand() + [0.08, 0.1, 0.6]
+    return Recording(
+        recording_id="take",
+        video=path,
+        frames=17,
+        fps=Fraction(16),
+        height=48,
+        width=80,
+        world_from_camera=poses,
+        intrinsics_px=np.array([[60.0, 0, 39.5], [0, 60, 23.5], [0, 0, 1]]),
+        metric=True,
+        joints_m=joints,
+        caption="put the cup down",
+        names=("cup",),
+    )
+
+
+def test_cameras_hands_and_caption_are_those_of_the_recording(recording, tmp_path):
+    recording.save(tmp_path / "imported/take")
+    out, log = tmp_path / "out", tmp_path / "calls"
+    annotate([tmp_path / "imported"], out, config(log=log))
+    assert log.read_text().split() == ["depth"]
+    about = read_json(out / "take" / ANNOTATION)
+    assert about["cameras"]["rung"] == "given"
+    assert about["hands"]["source"] == "recording"
+    assert about["scale"]["source"] == "cameras"
+    assert about["caption"] == {"source": "recording", "names": ["cup"]}
+    assert about["row"]["prompt"] == "put the cup down"
+    action = read_arrays(out / "take/action.npz", ARRAYS)
+    assert np.allclose(action["world_from_camera"], recording.world_from_camera)
+    assert np.array_equal(action["joints_m"], recording.joints_m, equal_nan=True)
+
+
+def test_another_rate_takes_the_poses_of_its_frames(recording, tmp_path):
+    recording.save(tmp_path / "imported/take")
+    settings = config(sampling=Sampling(fps=8.0, num_frames=9))
+    annotate([tmp_path / "imported"], tmp_path / "out", settings)
+    action = read_arrays(tmp_path / "out/take/action.npz", ARRAYS)
+    assert np.allclose(action["world_from_camera"][:, 0, 3], 0.02 * np.arange(9))
+
+
+def test_measured_depth_gives_the_scene_and_the_scale(recording, tmp_path):
+    files = []
+    for frame in range(17):
+        files.append(tmp_path / f"{frame}.npy")
+        np.save(files[-1], np.full((24, 40), 700.0, np.float32))
+    known = replace(
+        recording,
+        world_from_camera=None,
+        joints_m=None,
+        metric=False,
+        depth=DepthFiles(paths=tuple(files), unit_m=0.001),
+    )
+    known.save(tmp_path / "imported/take")
+    out, log = tmp_path / "out", tmp_path / "calls"
+    annotate([tmp_path / "imported"], out, config(log=log))
+    assert log.read_text().split() == ["hands", "cameras"]
+    about = read_json(out / "take" / ANNOTATION)
+    assert about["depth"]["source"] == "recording"
+    assert about["cameras"]["focal_source"] == "recording"
+    assert about["cameras"]["focal_px"] == 60
+    assert np.allclose(snapshot.load(out / "take/state").points_m[:, 2], 0.7)
+
+
+def test_a_fused_scene_has_what_later_frames_show(recording, tmp_path):
+    recording.save(tmp_path / "imported/take")
+    points = {}
+    for state in ("first", "fused"):
+        annotate([tmp_path / "imported"], tmp_path / state, config(state=state))
+        points[state] = snapshot.load(tmp_path / state / "take/state").points_m
+    first, fused = points["first"], points["fused"]
+    assert np.array_equal(fused[: len(first)], first)
+    assert len(fused) > len(first)
+    assert fused[len(first) :, 0].min() > first[:, 0].max() - 0.05
+    assert np.allclose(fused[:, 2], DEPTH)

@@ -1,0 +1,239 @@
+"""Annotation of videos, from files to metadata.csv."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egosim_jax.annotate import clip as clips
+from egosim_jax.annotate import run
+from egosim_jax.annotate.clip import ANNOTATION
+from egosim_jax.annotate.frames import Sampling
+from egosim_jax.annotate.prepare import Cutting, Quality
+from egosim_jax.annotate.sources import find_sources
+from egosim_jax.data.clips import check_clip
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.io.video import read_video
+from egosim_jax.state import snapshot
+from egosim_jax.types import InputError
+from tests.unit.annotate.stubs import DEPTH, FOCAL, config, textured_video, write
+
+
+def annotate(paths, out, settings=None, *, workers=1):
+    settings = settings or config()
+    run.require_config(out, settings)
+    scanned = list(run.scan_sources(find_sources(paths), out, settings, workers=workers))
+    jobs = run.choose_jobs(scanned, out, settings)
+    list(run.annotate_jobs(jobs, out, settings, workers=workers))
+    return run.write_report(scanned, out)
+
+
+@pytest.fixture
+def video(tmp_path):
+    return write(tmp_path / "cup.mp4", textured_video(17))
+
+
+def test_a_video_becomes_a_clip_that_passes_the_strict_checks(video, tmp_path):
+    out = tmp_path / "out"
+    report = annotate([video], out, config(caption="take the cup"))
+    assert report["clips"] == {"done": 1, "refused": 0, "failed": 0}
+    (files,) = read_metadata(out / "metadata.csv")
+    assert check_clip(files, None) == []
+    assert (files.video_id, files.prompt) == ("cup", "take the cup")
+    assert files.extra == {"split": "train", "source": "cup.mp4", "rung": "static"}
+    assert read_video(files.prior).fps == 16
+
+
+def test_the_scene_is_in_meters_and_the_prior_shows_it(video, tmp_path):
+    out = tmp_path / "out"
+    annotate([video], out, config(scale=0.5))
+    about = read_json(out / "cup" / ANNOTATION)
+    state = snapshot.load(out / "cup/state")
+    assert np.allclose(state.points_m[:, 2], DEPTH / 2)
+    prior = read_video(out / "cup/ego_prior_video.mp4").frames
+    first = read_video(video).frames[0]
+    outside = np.ones((48, 80), bool)
+    outside[8:, 20:60] = False
+    assert np.abs(prior[0].astype(int) - first)[outside].mean() < 6
+    assert np.abs(prior[-1].astype(int) - first)[outside].mean() < 6
+    assert about["scale"]["source"] == "given"
+    names = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64"}
+    action = read_arrays(out / "cup/action.npz", names)
+    assert action["joints_m"].shape == (17, 2, 21, 3)
+    assert np.isfinite(action["joints_m"][:, 1]).all()
+
+
+def test_an_annotation_says_what_was_chosen(video, tmp_path):
+    out = tmp_path / "out"
+    annotate([video], out)
+    about = read_json(out / "cup" / ANNOTATION)
+    assert about["status"] == "done"
+    assert about["cameras"]["rung"] == "static"
+    assert about["cameras"]["figures"] == {"still": 1.0}
+    assert about["caption"]["source"] == "rule"
+    assert (
+        about["row"]["prompt"] == "The wearer's right hand moves in view of a head-mounted camera."
+    )
+    assert about["hands"]["frames"] == {"left": 0, "right": 17}
+    assert set(about["seconds"]) >= {"hands", "cameras", "depth", "scale", "plate", "write"}
+    page = (out / "index.html").read_text()
+    assert "data:image/jpeg" in page
+    assert "<script" not in page
+    assert not (out / "work/cup").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "rule"),
+    [
+        ({"hands_until": 0.2}, "hands"),
+        ({"hands_until": 0.0}, "hands"),
+        ({"refuse": True}, "cameras"),
+    ],
+)
+def test_a_refused_clip_is_reported_and_not_listed(video, tmp_path, settings, rule):
+    out = tmp_path / "out"
+    report = annotate([video], out, config(**settings))
+    assert report["clips"] == {"done": 0, "refused": 1, "failed": 0}
+    assert report["annotations"][0]["rule"] == rule
+    assert not (out / "metadata.csv").exists()
+    assert "data:image/jpeg" in (out / "index.html").read_text()
+
+
+def test_hands_that_come_late_can_be_accepted(video, tmp_path):
+    few = Cutting(quality=Quality(min_hands=0.0))
+    report = annotate([video], tmp_path / "out", config(hands_until=0.2, cutting=few))
+    assert report["clips"]["done"] == 1
+    none = annotate([video], tmp_path / "none", config(hands_until=0.0, cutting=few))
+    assert none["annotations"][0]["scale"]["source"] == "median depth"
+
+
+def test_all_hands_can_be_put_on_one_side(video, tmp_path):
+    out = tmp_path / "out"
+    annotate([video], out, config(side="left"))
+    assert read_json(out / "cup" / ANNOTATION)["hands"]["frames"] == {"left": 17, "right": 0}
+
+
+def test_one_bad_video_does_not_stop_the_others(video, tmp_path):
+    (tmp_path / "bad.mp4").write_bytes(b"not a video")
+    write(tmp_path / "short.mp4", textured_video(5))
+    report = annotate([tmp_path / n for n in ("bad.mp4", "short.mp4", "cup.mp4")], tmp_path / "out")
+    assert report["clips"]["done"] == 1
+    assert "not a readable video" in report["videos"]["bad"]["problem"]
+    assert "a clip needs 9" in report["videos"]["short"]["problem"]
+    assert "not a readable video" in (tmp_path / "out/index.html").read_text()
+
+
+def test_another_configuration_in_the_same_folder_is_refused(video, tmp_path):
+    annotate([video], tmp_path / "out")
+    with pytest.raises(InputError, match=r"scale: recorded 'None', given '0\.5'"):
+        annotate([video], tmp_path / "out", config(scale=0.5))
+
+
+def test_a_replaced_video_is_refused(video, tmp_path):
+    annotate([video], tmp_path / "out")
+    write(video, textured_video(33))
+    with pytest.raises(InputError, match="is not the file that"):
+        annotate([video], tmp_path / "out")
+
+
+def test_finished_stages_and_clips_are_not_repeated(video, tmp_path, monkeypatch):
+    out, log = tmp_path / "out", tmp_path / "calls"
+    settings = config(log=log)
+
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(clips, "to_triplet", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            annotate([video], out, settings)
+    assert log.read_text().split() == ["hands", "cameras", "depth"]
+    assert annotate([video], out, settings)["clips"]["done"] == 1
+    assert log.read_text().split() == ["hands", "cameras", "depth"]
+    before = (out / "report.json").read_bytes()
+    annotate([video], out, settings)
+    assert (out / "report.json").read_bytes() == before
+
+
+def test_a_defect_is_reported_for_its_clip_alone_and_tried_again(video, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write(tmp_path / "dish.mp4", textured_video(17, seed=3))
+    real = clips.to_triplet
+
+    def broken(record, settings):
+        if record.video_id == "dish":
+            raise ZeroDivisionError("a defect")
+        return real(record, settings)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(clips, "to_triplet", broken)
+        report = annotate([video, tmp_path / "dish.mp4"], out)
+    assert report["clips"] == {"done": 1, "refused": 0, "failed": 1}
+    assert "ZeroDivisionError: a defect" in report["annotations"][1]["reason"]
+    assert "to_triplet" in (out / "work/dish/traceback.txt").read_text()
+    assert annotate([video, tmp_path / "dish.mp4"], out)["clips"]["done"] == 2
+
+
+def test_a_clip_without_cameras_is_tried_with_the_focal_length_of_its_video(tmp_path):
+    out, settings = (
+        tmp_path / "out",
+        config(sampling=Sampling(num_frames=9), cutting=Cutting(clips=True), refuse_dark=True),
+    )
+    frames = np.concatenate([textured_video(9), textured_video(9, seed=1) // 2])
+    path = write(tmp_path / "long.mp4", frames)
+    report = annotate([path], out, settings)
+    assert [about["status"] for about in report["annotations"]] == ["done", "refused"]
+    scanned = list(run.scan_sources(find_sources([path]), out, settings, workers=1))
+    (retry,) = run.choose_retries(scanned, out)
+    assert (retry.video_id, retry.focal_px) == ("long_9_17", FOCAL)
+    assert list(run.annotate_jobs([retry], out, settings, workers=1)) == ["done"]
+    assert run.choose_retries(scanned, out) == []
+
+
+def test_long_videos_are_cut_into_clips(tmp_path):
+    frames = np.concatenate([textured_video(20), textured_video(20, seed=1) // 2])
+    path = write(tmp_path / "long.mp4", frames)
+    settings = config(sampling=Sampling(num_frames=9), cutting=Cutting(clips=True))
+    report = annotate([path], tmp_path / "out", settings)
+    assert [about["start"] for about in report["annotations"]] == [0, 9, 20, 29]
+    (first, *_) = read_metadata(tmp_path / "out/metadata.csv")
+    assert first.video_id == "long_0_8"
+
+
+def test_killed_runs_continue(video, tmp_path):
+    """A process is killed while it annotates; the same command gives what one run gives."""
+    write(tmp_path / "dish.mp4", textured_video(17, seed=3))
+    program = f"""
+import os, sys
+sys.path.insert(0, {str(Path.cwd())!r})
+from pathlib import Path
+from egosim_jax.annotate import clip
+from tests.unit.annotate.stubs import config
+from tests.unit.annotate.test_run import annotate
+finish = clip.finish
+def killed(job, *rest):
+    if job.video_id == "cup":
+        os.kill(os.getpid(), 9)
+    finish(job, *rest)
+clip.finish = killed
+here = Path({str(tmp_path)!r})
+annotate([here / "cup.mp4", here / "dish.mp4"], here / "out")
+"""
+    ended = subprocess.run([sys.executable, "-c", program], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert not (tmp_path / "out/cup" / ANNOTATION).exists()
+    videos = [video, tmp_path / "dish.mp4"]
+    resumed = annotate(videos, tmp_path / "out")
+    straight = annotate(videos, tmp_path / "straight")
+    for report in (resumed, straight):
+        for about in report["annotations"]:
+            del about["seconds"]
+    assert json.dumps(resumed) == json.dumps(straight)
+    for name in ("cup/ego_prior_video.mp4", "dish/action.npz", "metadata.csv"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
