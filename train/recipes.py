@@ -9,6 +9,7 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.train.config import OptimizerConfig, Recipe, TrainConfig
 from egosim_jax.train.fine_tuning import FineTuning
 from egosim_jax.train.from_scratch import FromClips, FromTabletop
+from egosim_jax.train.refining import RefineVAE
 from egosim_jax.types import InputError
 
 _FULL = TrainConfig(
@@ -156,6 +157,26 @@ makes the clips, trains the VAE, encodes latents and trains the denoiser, on a C
 two cores. Every stage resumes: run the same command again after an interruption.
 """
 
+TABLETOP_VAE = RefineVAE(
+    config="tabletop",
+    vae=TrainConfig(
+        steps=4000,
+        batch_size=2,
+        optimizer=_muon(5e-4, 100),
+        log_every=25,
+        save_every=100,
+        validate_every=500,
+    ),
+)
+r"""The VAE of `tabletop`, trained further with LPIPS in its loss.
+
+    egosim-train tabletop_vae --frames runs/tabletop/frames --weights runs/tabletop/weights \
+        --out runs/vae
+    egosim-train tabletop --weights runs/vae/weights --out runs/further
+
+The second command trains the denoiser further, on latents of the new VAE.
+"""
+
 REAL_TINY = FromClips(
     config="real_tiny",
     stride=2,
@@ -205,6 +226,7 @@ RECIPES: dict[str, tuple[str, Recipe]] = {
     "debug": ("Train `debug` for a few updates on a few synthetic clips.", DEBUG),
     "real_tiny": ("Train `real_tiny` from scratch on the clips of a metadata file.", REAL_TINY),
     "tabletop": ("Train `tabletop` from scratch on scenes of the tabletop world.", TABLETOP),
+    "tabletop_vae": ("Train the VAE of `tabletop` further, with LPIPS.", TABLETOP_VAE),
     "egosim_14b": ("Train EgoSim's 14B transformer from Wan 2.1 Fun InP.", EGOSIM_14B),
     "egosim_1_3b": ("Train the 1.3B transformer with EgoSim's conditioning.", EGOSIM_1_3B),
     "egosim_14b_robot": ("Train EgoSim's 14B transformer on clips of a robot.", EGOSIM_14B_ROBOT),

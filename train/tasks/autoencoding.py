@@ -91,16 +91,22 @@ class Autoencoding:
         self, networks: Any, batch: Batch, keys: Key[Array, " b"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the loss of the module docstring, for sampled latents."""
-        video = to_model(batch["video"])
-        mean, logvar = networks.moments(video)
-        latents = mean + jnp.exp(logvar / 2) * jax.random.normal(keys[0], mean.shape)
-        decoded = networks.decode_whole(latents)
+        _, loss, metrics = self.reconstruct(networks, to_model(batch["video"]), keys[0])
+        return loss, metrics
+
+    def reconstruct(
+        self, vae: Any, video: Float[Array, "b f h w 3"], key: Key[Array, ""]
+    ) -> tuple[Float[Array, "b f h w 3"], jax.Array, Metrics]:
+        """Return the reconstruction of a video from sampled latents, its loss and its terms."""
+        mean, logvar = vae.moments(video)
+        latents = mean + jnp.exp(logvar / 2) * jax.random.normal(key, mean.shape)
+        decoded = vae.decode_whole(latents)
         mse = jnp.square(decoded - video).mean()
         edge_loss = _edge_error(decoded, video)
         kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
         psnr = _psnr(decoded, video)
         metrics = {"mse": mse, "edge_loss": edge_loss, "kl": kl, "psnr": psnr}
-        return mse + self.edge_weight * edge_loss + self.kl_weight * kl, metrics
+        return decoded, mse + self.edge_weight * edge_loss + self.kl_weight * kl, metrics
 
     def flops(self, samples: int) -> float:
         """Return NaN: not counted."""

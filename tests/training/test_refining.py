@@ -1,0 +1,111 @@
+"""Refining a VAE: its loss, what it trains, and its command."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.data.shards import ShardWriter
+from egosim_jax.io.mapped import read_safetensors
+from egosim_jax.networks import Networks
+from egosim_jax.train.config import TrainConfig
+from egosim_jax.train.refining import RefineVAE
+from egosim_jax.train.tasks.autoencoding import Autoencoding
+from egosim_jax.train.tasks.refining import Refining
+from egosim_jax.types import InputError, VideoSpec
+
+VAE = configs.get("debug").vae
+VIDEO = VideoSpec(frames=5, height=32, width=40)
+SIZES = {"vae": VAE, "video": VIDEO, "crop": (32, 32)}
+RECIPE = RefineVAE(
+    config="debug",
+    vae=TrainConfig(steps=3, batch_size=1, log_every=1, save_every=2, validate_every=2),
+    crop=(32, 32),
+    perceptual_frames=1,
+)
+
+
+def test_the_decoder_alone_is_trained_on_request():
+    task = Refining(**SIZES, part="decoder")
+    networks = nnx.eval_shape(lambda: task.networks(nnx.Rngs(0)))
+    _, trained, others = nnx.split(networks, task.trained, ...)
+    assert {path[:2] for path, _ in nnx.to_flat_state(trained)} == {
+        ("vae", "decoder"),
+        ("vae", "from_latents"),
+    }
+    assert {path[:2] for path, _ in nnx.to_flat_state(others)} == {
+        ("vae", "encoder"),
+        ("vae", "to_moments"),
+    }
+
+
+def test_lpips_is_added_to_the_loss_of_autoencoding():
+    vae = nnx.jit(lambda: VAE.build(rngs=nnx.Rngs(0)))()
+    crop = np.random.default_rng(0).integers(0, 256, (1, 5, 32, 32, 3), np.uint8)
+    task = Refining(**SIZES, perceptual_weight=0.25, perceptual_frames=5)
+
+    @jax.jit
+    def losses(vae, batch):
+        keys = task.keys(jax.random.key(0), 1)
+        plain, _ = Autoencoding(**SIZES).loss(vae, batch, keys)
+        return plain, *task.loss(Networks(vae=vae), batch, keys)
+
+    plain, loss, metrics = losses(vae, {"video": jnp.asarray(crop)})
+    assert 0.1 < metrics["lpips"] < 2
+    np.testing.assert_allclose(loss, plain + 0.25 * metrics["lpips"], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"crop": (32, 24)}, "too small for LPIPS"),
+        ({"perceptual_frames": 6}, "must compare 1 to 5 frames"),
+    ],
+)
+def test_what_lpips_cannot_compare_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        Refining(**{**SIZES, **change})
+
+
+def frames(folder, model):
+    rng, video = np.random.default_rng(0), model.video
+    size = (video.frames, video.height, video.width)
+    for split in ("train", "test"):
+        spec, grid = model.video, model.grid
+        with ShardWriter(folder / split, kind="frames", spec=spec, grid=grid) as writer:
+            arrays = {
+                name: rng.integers(0, 256, (*size, 3), np.uint8)
+                for name in ("target", "prior", "hands")
+            }
+            arrays["mask"] = np.zeros(size, np.uint8)
+            arrays["first_frame"] = arrays["prior"][0]
+            writer.add(arrays, {"video_id": split, "prompt": ""})
+    return folder
+
+
+@pytest.mark.slow
+def test_a_refined_decoder_reads_the_latents_of_before(tmp_path):
+    model = configs.get("debug")
+    start = tmp_path / "weights"
+    Networks.random(model, seed=0).save(start)
+    recipe = replace(
+        RECIPE,
+        frames=frames(tmp_path / "frames", model),
+        weights=start,
+        out=tmp_path / "out",
+        part="decoder",
+        weights_dtype="float32",
+    )
+    assert recipe.train() == 0
+    before, after = (
+        {name: tensor.array() for name, tensor in read_safetensors(folder).items()}
+        for folder in (start / "vae.safetensors", tmp_path / "out" / "weights" / "vae.safetensors")
+    )
+    changed = {name for name in before if not np.array_equal(before[name], after[name])}
+    assert {name.split(".")[0] for name in changed} == {"decoder", "from_latents"}
+    assert (tmp_path / "out" / "weights" / "dit.safetensors").exists()
+    assert recipe.train() == 0  # at its end: writes the same weights again

@@ -1,0 +1,102 @@
+"""Training a video VAE further, with a term that compares as eyes do.
+
+To the loss of `autoencoding` comes LPIPS (`metrics/lpips.py`, AlexNet) between some frames of the
+crop and of its reconstruction:
+
+    perceptual_weight * mean over frames of LPIPS(y_t, x_t)
+
+The squared error is smallest for the mean of all that a latent cell may stand for, which is a
+blur; LPIPS is smaller for any one of them. The decoder can be trained alone, which leaves the
+latents as they are, and with them denoisers that were trained on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+from flax import nnx
+from jaxtyping import Array, Float, Key
+
+from egosim_jax.conditioning.video import to_model
+from egosim_jax.metrics.lpips import Lpips
+from egosim_jax.networks import Networks
+from egosim_jax.train.tasks.autoencoding import Autoencoding
+from egosim_jax.train.update import Batch, Metrics
+from egosim_jax.types import InputError
+
+Part = Literal["all", "decoder"]
+"""Weights of a VAE that are trained."""
+DECODER = ("decoder", "from_latents")
+"""Modules that decode latents."""
+SMALLEST = 32
+"""Fewest rows and columns of a crop of which AlexNet's last layers see anything."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refining(Autoencoding):
+    """The task of training the VAE of a weights folder further."""
+
+    perceptual_weight: float = 0.1
+    """Weight of the perceptual term; above 0 it needs egosim-jax[metrics]."""
+    perceptual_frames: int = 4
+    """Frames of a crop that the perceptual term compares, drawn at random."""
+    part: Part = "all"
+    """Weights that are trained; decoder: the latents stay as they are."""
+
+    def __post_init__(self) -> None:
+        """Check what the perceptual term compares, too."""
+        super().__post_init__()
+        if self.perceptual_weight and min(self.crop) < SMALLEST:
+            raise InputError(
+                f"A crop of {self.crop[0]} x {self.crop[1]} pixels is too small for LPIPS: it must "
+                f"have at least {SMALLEST} rows and columns, or --perceptual-weight be 0. (--crop)"
+            )
+        if not 0 < self.perceptual_frames <= self.video.frames:
+            raise InputError(
+                f"The perceptual term must compare 1 to {self.video.frames} frames, which a crop "
+                f"has, not {self.perceptual_frames}. (--perceptual-frames)"
+            )
+
+    def networks(self, rngs: nnx.Rngs) -> Networks:
+        """Return the VAE with random weights, under its name."""
+        return Networks(vae=super().networks(rngs))
+
+    @property
+    def trained(self) -> Any:
+        """The nnx filter of all weights, or of those of the decoder."""
+        if self.part == "all":
+            return nnx.Param
+        return lambda path, value: isinstance(value, nnx.Param) and path[1] in DECODER
+
+    def loss(
+        self, networks: Networks, batch: Batch, keys: Key[Array, " b"]
+    ) -> tuple[jax.Array, Metrics]:
+        """Return the loss of the module docstring, for sampled latents."""
+        video = to_model(batch["video"])
+        decoded, loss, metrics = self.reconstruct(networks.vae, video, keys[0])
+        if self.perceptual_weight:
+            draw = jax.random.fold_in(keys[0], 1)
+            frames = jax.random.choice(
+                draw, self.video.frames, (self.perceptual_frames,), replace=False
+            )
+            lpips = _lpips(decoded[:, frames], video[:, frames])
+            metrics["lpips"] = lpips
+            loss = loss + self.perceptual_weight * lpips
+        return loss, metrics
+
+    def validate(self, networks: Networks, batch: Batch) -> Metrics:
+        """Return PSNR and LPIPS of the reconstruction from the mean latents."""
+        metrics = super().validate(networks.vae, batch)
+        if self.perceptual_weight:
+            video = to_model(batch["video"])
+            decoded = networks.vae.decode_whole(networks.vae.moments(video)[0])
+            metrics["lpips"] = _lpips(decoded.clip(-1, 1), video)
+        return metrics
+
+
+def _lpips(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) -> jax.Array:
+    """Return the mean distance between frames."""
+    images = (x.reshape(-1, *x.shape[2:]) for x in (decoded, video))
+    return Lpips.load("alex").compare(*images).mean()
