@@ -249,6 +249,8 @@ class FromTabletop(FromScratch):
     """Scenes to train on, two clips of each."""
     held_out: int = 48
     """Scenes to validate on, one clip of each."""
+    black_cloths: int | None = None
+    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
 
     def frames(self, out: Path) -> Mapping[str, Path]:
         """Make the clips of both splits."""
@@ -262,7 +264,13 @@ class FromTabletop(FromScratch):
         from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         model = configs.get(self.config)
-        plan = DatasetConfig(seeds=tuple(seeds), clips=clips, spec=model.video, kind="mixed")
+        plan = DatasetConfig(
+            seeds=tuple(seeds),
+            clips=clips,
+            spec=model.video,
+            kind="mixed",
+            black_cloths=self.black_cloths,
+        )
         frames = out / "frames" / split
         workers = os.cpu_count() or 1
         scenes = make_shards(plan, out=frames, workers=workers, grid=model.grid)

@@ -111,7 +111,7 @@ class Trained:
     networks: Any
     """Trained networks."""
     row: dict[str, float] = field(default_factory=dict)
-    """What was measured."""
+    """Measured numbers by name."""
 
 
 def main(settings: Settings) -> None:

@@ -24,7 +24,13 @@ from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.bodies import Part
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, RayCaster
-from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene, make_scene
+from egosim_jax.worlds.tabletop.scene import (
+    FIRST_BODY,
+    FIRST_HAND,
+    Scene,
+    make_scene,
+    with_cloths,
+)
 
 FIELD_OF_VIEW = 60.0
 """Horizontal field of view in degrees."""
@@ -76,15 +82,25 @@ class TabletopClip:
 
 
 def make_sequence(
-    seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human", bare: bool = False
+    seed: int,
+    *,
+    spec: VideoSpec,
+    clips: int = 1,
+    kind: Kind = "human",
+    bare: bool = False,
+    black_cloths: int | None = None,
 ) -> Iterator[TabletopClip]:
     """Yield the clips of a seed, each `spec.frames` long; a robot has one gripper.
 
     Equal seeds give equal clips at equal sizes, and the same events at any size. `bare` renders the
-    same clips without hands and manipulated body, which gives their background.
+    same clips without hands and manipulated body, which gives their background. `black_cloths` is
+    the most that lie on the table; they change nothing else.
     """
-    rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
+    stream = 0 if kind == "human" else 1
+    rng = np.random.default_rng([seed, stream])
     scene = make_scene(rng)
+    if black_cloths is not None:
+        scene = with_cloths(scene, np.random.default_rng([seed, stream, 1]), black_cloths)
     sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
     eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
     hands: tuple[Hand, ...] = ()

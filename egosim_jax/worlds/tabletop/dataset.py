@@ -36,6 +36,8 @@ class DatasetConfig:
     """Length and size of the clips."""
     kind: Kind | Literal["mixed"]
     """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
+    black_cloths: int | None = None
+    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
 
     def kind_of(self, seed: int) -> Kind:
         """Return the kind of hands of a scene."""
@@ -98,7 +100,13 @@ def make_shards(
 
 
 def _make(config: DatasetConfig, seed: int, parts: Path) -> None:
-    sequence = make_sequence(seed, spec=config.spec, clips=config.clips, kind=config.kind_of(seed))
+    sequence = make_sequence(
+        seed,
+        spec=config.spec,
+        clips=config.clips,
+        kind=config.kind_of(seed),
+        black_cloths=config.black_cloths,
+    )
     state = None
     for number, clip in enumerate(sequence):
         path = _part(parts, seed, number)

@@ -46,6 +46,12 @@ MIN_BODIES = 3
 """Minimum number of bodies on a table."""
 MAX_BODIES = 6
 """Maximum number of bodies on a table."""
+CLOTH_COLOR = (2, 2, 2)
+"""RGB of black cloths, which no picture distinguishes from unobserved pixels of a prior."""
+CLOTH_M = (0.08, 0.30)
+"""Shortest and longest side of a cloth in meters."""
+CLOTH_AREA_M = (-0.34, 0.34, 0.06, 0.52)
+"""Minimum and maximum x, then y, of the centers of cloths: within view or at its border."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +158,26 @@ def make_scene(rng: np.random.Generator) -> Scene:
     while len((scene := _scatter(rng)).bodies) < MIN_BODIES:
         pass  # no free place was found for enough bodies
     return scene
+
+
+def with_cloths(scene: Scene, rng: np.random.Generator, most: int) -> Scene:
+    """Return the scene with up to `most` black cloths on the table, under its bodies.
+
+    In a prior they look like unobserved places, from which only the mask distinguishes them: other
+    black is either a whole body or not observed, as the picture itself shows.
+    """
+    paint = Paint(color=CLOTH_COLOR, second=CLOTH_COLOR, pattern="plain", scale_m=1.0)
+    cloths = []
+    for number in range(rng.integers(most + 1)):
+        x, y = rng.uniform(*CLOTH_M, 2) / 2
+        height = 5e-4 * (number + 1)  # one above the other, where they overlap
+        vertices, triangles = box((-x, -y, 0), (x, y, height))
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_z(rng.uniform(-np.pi, np.pi))
+        pose[:2, 3] = rng.uniform(CLOTH_AREA_M[::2], CLOTH_AREA_M[1::2])
+        part = Part(name="cloth", vertices_m=vertices, triangles=triangles, paint=paint)
+        cloths.append(Placed(part=part, world_from_part=pose, number=TABLE))
+    return replace(scene, room=(*scene.room, *cloths))
 
 
 def _scatter(rng: np.random.Generator) -> Scene:

@@ -130,6 +130,27 @@ def test_a_bare_clip_differs_only_where_hands_or_target_are_or_throw_shadows(cli
     assert (darker.mean(axis=1) >= -1).mean() > 0.9
 
 
+def test_black_cloths_change_the_table_alone(clips):
+    with_cloths = list(make_sequence(3, spec=SPEC, clips=2, black_cloths=3))
+    for plain, clip in zip(clips, with_cloths, strict=True):
+        assert (clip.ids == plain.ids).mean() > 0.999  # a cloth hides the lowest half millimeter
+        np.testing.assert_array_equal(clip.joints_m, plain.joints_m)
+        assert clip.caption == plain.caption
+        changed = (clip.frames != plain.frames).any(axis=-1) & (plain.ids == TABLE)
+        assert clip.frames[changed].mean() < 12
+        assert changed.mean() > 0.01
+    again = next(make_sequence(3, spec=SPEC, black_cloths=0))
+    np.testing.assert_array_equal(again.frames, clips[0].frames)
+
+
+def test_a_prior_does_not_distinguish_a_black_cloth_from_an_unobserved_place():
+    spec = VideoSpec(frames=5, height=96, width=160)
+    triplet = to_triplet(next(make_sequence(3, spec=spec, black_cloths=3)))
+    black = triplet.prior[-1].max(axis=-1) < 4
+    assert (black & (triplet.mask[-1] == 0)).mean() > 0.01
+    assert (black & (triplet.mask[-1] == 255)).mean() > 0.01
+
+
 def test_only_the_target_moves(clips):
     for clip in clips:
         for name, poses in clip.world_from_body.items():
