@@ -119,7 +119,7 @@ class FromScratch(Recipe):
         latents = {split: self._encode(split, frames[split], out) for split in frames}
         trained = train(
             *self.stages()["denoiser"],
-            data=latents["train"],
+            data=_joined(latents, out / "latents" / "joined"),
             validation=latents["test"],
             out=out / "denoiser",
             weights=self.weights,
@@ -178,11 +178,25 @@ class FromScratch(Recipe):
                 out / "weights",
                 source=source,
                 out=latents,
-                stride=self.stride if split == "train" else max(1, last),
+                stride=self.stride if split != "test" else max(1, last),
                 batch_size=ENCODE_BATCH,
                 verb=f"encoding {split}",
             )
         return latents
+
+
+def _joined(latents: Mapping[str, Path], out: Path) -> Path:
+    """Return the folder of the latents to train on, into which those of several are moved."""
+    from egosim_jax.data.manifest import MANIFEST
+    from egosim_jax.data.shards import gather
+
+    parts = [folder for split, folder in latents.items() if split != "test"]
+    if len(parts) == 1:
+        return parts[0]
+    if not (out / MANIFEST).exists():
+        out.mkdir(exist_ok=True)
+        gather(parts, out)
+    return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,17 +265,34 @@ class FromTabletop(FromScratch):
     """Scenes to validate on, one clip of each."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    rollouts: int | None = None
+    """Further scenes to train on, with states of the given weights' own rollouts; None: none."""
+    rollout_clips: int = 4
+    """Clips of each of these scenes."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` if rollouts are wanted without a model that makes them."""
+        if self.rollouts is not None and (self.weights is None or self.rollouts < 1):
+            raise InputError(
+                f"{self.rollouts} scenes of rollouts cannot be made: there must be at least 1, and "
+                "weights of the model whose rollouts they are. (--rollouts, --weights)"
+            )
 
     def frames(self, out: Path) -> Mapping[str, Path]:
-        """Make the clips of both splits."""
-        train = range(FIRST_TRAINED, FIRST_TRAINED + self.scenes)
-        return {
-            "train": self._make("train", train, 2, out),
+        """Make the clips of all splits."""
+        first, last = FIRST_TRAINED, FIRST_TRAINED + self.scenes
+        frames = {
+            "train": self._make("train", range(first, last), 2, out),
             "test": self._make("test", range(self.held_out), 1, out),
         }
+        if self.rollouts is not None:
+            seeds = range(last, last + self.rollouts)
+            frames["rollouts"] = self._make("rollouts", seeds, self.rollout_clips, out)
+        return frames
 
     def _make(self, split: str, seeds: range, clips: int, out: Path) -> Path:
-        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
+        from egosim_jax.train.rollouts import OwnRollouts
+        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards, true_states
 
         model = configs.get(self.config)
         plan = DatasetConfig(
@@ -272,8 +303,11 @@ class FromTabletop(FromScratch):
             black_cloths=self.black_cloths,
         )
         frames = out / "frames" / split
-        workers = os.cpu_count() or 1
-        scenes = make_shards(plan, out=frames, workers=workers, grid=model.grid)
+        workers, states = os.cpu_count() or 1, true_states
+        if split == "rollouts" and self.weights is not None:
+            # A generator takes all cores by itself.
+            workers, states = 1, OwnRollouts.of(self.config, self.weights)
+        scenes = make_shards(plan, out=frames, workers=workers, grid=model.grid, states=states)
         for _ in track(scenes, f"making {split}", total=len(seeds)):
             pass
         return frames

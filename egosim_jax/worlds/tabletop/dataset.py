@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +20,11 @@ from egosim_jax.data.shards import ShardWriter, gather
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import quote_path
-from egosim_jax.types import WAN_GRID, InputError, Kind, VideoGrid, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, state_after, to_triplet
+from egosim_jax.types import WAN_GRID, InputError, Kind, SceneState, VideoGrid, VideoSpec
+from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
+
+States = Callable[[Sequence[TabletopClip]], Iterable[SceneState | None]]
+"""States that the priors of a sequence's clips are rendered from; None: the clip's own state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,17 +63,31 @@ def write_scenes(folder: Path, seeds: Iterable[int], *, spec: VideoSpec, kind: K
     return write_clips(folder, map(to_triplet, clips), fps=spec.fps)
 
 
+def true_states(clips: Sequence[TabletopClip]) -> Iterator[SceneState | None]:
+    """Yield the state of the first clip, then that state with its objects moved as they were."""
+    state = None
+    for clip in clips:
+        yield state
+        state = state_after(clip, state or clip.state)
+
+
 def make_shards(
-    config: DatasetConfig, *, out: Path, workers: int, grid: VideoGrid = WAN_GRID
+    config: DatasetConfig,
+    *,
+    out: Path,
+    workers: int,
+    grid: VideoGrid = WAN_GRID,
+    states: States = true_states,
 ) -> Iterator[int]:
     """Write the shards of a dataset; yield each seed when its scene is done.
 
     Finished scenes are kept in `out`/parts, so that the same call resumes an interrupted one.
-    The manifest names the latent `grid`, which the clips must fit.
+    The manifest names the latent `grid`, which the clips must fit. `states`, other than the default
+    a dataclass, which worker processes can be sent, is a part of the dataset's settings.
     """
     grid.check(config.spec)
     parts = out / "parts"
-    open_folder(out, config)
+    open_folder(out, config if states is true_states else {"dataset": config, "states": states})
     if (out / MANIFEST).exists():
         have = read_manifest(out).grid
         if have != grid:
@@ -90,7 +107,7 @@ def make_shards(
     pool = ProcessPoolExecutor(workers, mp_context=context)
     try:
         with interrupts.not_inherited():
-            jobs = {pool.submit(_make, config, seed, parts): seed for seed in missing}
+            jobs = {pool.submit(_make, config, seed, parts, states): seed for seed in missing}
         for job in as_completed(jobs):
             job.result()
             yield jobs[job]
@@ -99,7 +116,7 @@ def make_shards(
     _gather(config, grid, parts, out)
 
 
-def _make(config: DatasetConfig, seed: int, parts: Path) -> None:
+def _make(config: DatasetConfig, seed: int, parts: Path, states: States) -> None:
     sequence = make_sequence(
         seed,
         spec=config.spec,
@@ -107,12 +124,10 @@ def _make(config: DatasetConfig, seed: int, parts: Path) -> None:
         kind=config.kind_of(seed),
         black_cloths=config.black_cloths,
     )
-    state = None
-    for number, clip in enumerate(sequence):
-        path = _part(parts, seed, number)
-        with atomic_write(path) as temporary:
+    clips = list(sequence)
+    for clip, state in zip(clips, states(clips), strict=True):
+        with atomic_write(_part(parts, seed, clip.number)) as temporary:
             temporary.write_bytes(to_bytes(triplet_record(to_triplet(clip, state))))
-        state = state_after(clip, state or clip.state)
 
 
 def _part(parts: Path, seed: int, number: int) -> Path:

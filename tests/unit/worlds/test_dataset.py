@@ -1,5 +1,8 @@
 """Datasets of the tabletop world: complete, ordered and independent of interruptions."""
 
+from dataclasses import dataclass
+
+import numpy as np
 import pytest
 
 from egosim_jax.data.shards import ShardReader
@@ -40,6 +43,29 @@ def test_a_folder_of_an_earlier_version_is_continued(tmp_path):
     record = tmp_path / "config.json"
     record.write_text(record.read_text("utf-8").replace("DatasetConfig", "Plan"), "utf-8")
     assert list(make_shards(config, out=tmp_path, workers=1)) == [5]
+
+
+@dataclass(frozen=True)
+class OwnStates:
+    """Every clip starts from its own state."""
+
+    version: int = 1
+
+    def __call__(self, clips):
+        return [None for _ in clips]
+
+
+def test_priors_are_rendered_from_the_states_that_are_asked_for(tmp_path):
+    own, true = tmp_path / "own", tmp_path / "true"
+    config = DatasetConfig(seeds=(5,), clips=2, spec=SPEC, kind="human")
+    list(make_shards(config, out=own, workers=1, states=OwnStates()))
+    list(make_shards(config, out=true, workers=1))
+    (same, differing) = zip(ShardReader(own), ShardReader(true), strict=True)
+    np.testing.assert_array_equal(*(record.arrays["prior"] for record in same))
+    first_frames = [record.arrays["first_frame"] for record in differing]
+    assert (first_frames[0] != first_frames[1]).any()
+    with pytest.raises(InputError, match="version"):
+        list(make_shards(config, out=own, workers=1, states=OwnStates(2)))
 
 
 def test_every_fourth_mixed_scene_has_a_robot(tmp_path):
