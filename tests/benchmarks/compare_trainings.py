@@ -18,8 +18,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,6 +41,7 @@ from egosim_jax.train.recipes import TABLETOP, TABLETOP_VAE
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import Programs, Stage, TrainState
 from egosim_jax.types import InputError
+from tests.benchmarks.critic import Adversarial
 
 SHIPPED = Path(__file__).parents[2] / "egosim_jax" / "weights" / "tabletop"
 PROBE = 6
@@ -85,8 +85,9 @@ VAES: Mapping[str, Mapping[str, Any]] = {
     "decoder 0.3": {"part": "decoder", "perceptual_weight": 0.3},
     "all frames": {"perceptual_frames": 17},
     "large crops": {"crop": (96, 80)},
+    "adversarial": {"part": "decoder", "critic": True},
 }
-"""Changes of the recipe `tabletop_vae`."""
+"""Changes of the recipe `tabletop_vae`; `adversarial` has a critic, too (`critic.py`)."""
 DENOISERS: Mapping[str, Mapping[str, Any]] = {
     "float32": {},
     "bfloat16": {"dit": {"products": "bfloat16"}},
@@ -147,8 +148,13 @@ def train_vae(settings: Settings, changes: Mapping[str, Any]) -> Trained:
     """Refine the VAE."""
     assert settings.frames is not None
     optimizer = replace(TABLETOP_VAE.vae.optimizer, learning_rate=settings.learning_rate)
+    changes = dict(changes)
+    critic = changes.pop("critic", False)
     recipe = replace(TABLETOP_VAE, vae=replace(TABLETOP_VAE.vae, optimizer=optimizer), **changes)
-    return spend(settings, recipe.stages()["vae"], settings.frames, random=False)
+    task, training = recipe.stages()["vae"]
+    if critic:
+        task = Adversarial(**{f.name: getattr(task, f.name) for f in fields(task)})
+    return spend(settings, Stage(task, training), settings.frames, random=False)
 
 
 def train_denoiser(settings: Settings, changes: Mapping[str, Any]) -> Trained:
@@ -217,7 +223,7 @@ def run(
         if random:
             state, frozen = jax.jit(programs.create)(), programs.frozen
         else:
-            state, frozen = start(settings, programs, training)
+            state, frozen = start(settings, programs)
         source, spent = ShardReader(data / "train"), []
         sharding = batch_sharding(mesh)
         with closing(make_batches(source, stage.task, training, sharding)) as batches:
@@ -230,15 +236,17 @@ def run(
     yield programs, state, spent, frozen
 
 
-def start(settings: Settings, programs: Programs, training: Any) -> tuple[TrainState, Any]:
-    """Return state and frozen weights of the folder of weights."""
+def start(settings: Settings, programs: Programs) -> tuple[TrainState, Any]:
+    """Return state and frozen weights of the folder of weights; a critic's are random."""
     frozen, params = programs.frozen, programs.state.params
+    in_folder = lambda path, _: path[0] != "critic"  # noqa: E731
+    wanted, _ = nnx.split_state(nnx.merge_state(frozen, params), in_folder, ...)
     shardings = nnx.merge_state(programs.frozen_sharding, programs.state_sharding.params)
-    placed = place(settings.weights, nnx.merge_state(frozen, params), shardings)
+    shardings, _ = nnx.split_state(shardings, in_folder, ...)
+    placed = place(settings.weights, wanted, shardings)
     paths = {path for path, _ in nnx.to_flat_state(frozen)}
     frozen, loaded = nnx.split_state(placed, lambda path, _: path in paths, ...)
-    create = partial(TrainState.create, config=training.optimizer, steps=training.steps)
-    return jax.jit(create)(loaded), frozen
+    return jax.jit(programs.create)(loaded), frozen
 
 
 class Judge:

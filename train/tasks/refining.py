@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import jax
 from flax import nnx
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.metrics.lpips import Lpips
@@ -74,17 +74,26 @@ class Refining(Autoencoding):
         self, networks: Networks, batch: Batch, keys: Key[Array, " b"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the loss of the module docstring, for sampled latents."""
-        video = to_model(batch["video"])
-        decoded, loss, metrics = self.reconstruct(networks.vae, video, keys[0])
-        if self.perceptual_weight:
-            draw = jax.random.fold_in(keys[0], 1)
-            frames = jax.random.choice(
-                draw, self.video.frames, (self.perceptual_frames,), replace=False
-            )
-            lpips = _lpips(decoded[:, frames], video[:, frames])
-            metrics["lpips"] = lpips
-            loss = loss + self.perceptual_weight * lpips
+        draw = jax.random.fold_in(keys[0], 1)
+        frames = jax.random.choice(
+            draw, self.video.frames, (self.perceptual_frames,), replace=False
+        )
+        _, loss, metrics = self.perceived(networks.vae, to_model(batch["video"]), keys[0], frames)
         return loss, metrics
+
+    def perceived(
+        self,
+        vae: Any,
+        video: Float[Array, "b f h w 3"],
+        key: Key[Array, ""],
+        frames: Int[Array, " n"],
+    ) -> tuple[Float[Array, "b f h w 3"], jax.Array, Metrics]:
+        """Return what `reconstruct` does, with the perceptual term of some frames in the loss."""
+        decoded, loss, metrics = self.reconstruct(vae, video, key)
+        if self.perceptual_weight:
+            metrics["lpips"] = _lpips(decoded[:, frames], video[:, frames])
+            loss = loss + self.perceptual_weight * metrics["lpips"]
+        return decoded, loss, metrics
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return PSNR and LPIPS of the reconstruction from the mean latents."""
