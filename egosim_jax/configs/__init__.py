@@ -60,14 +60,17 @@ def releases() -> dict[str, hub.Release]:
     return {name: hub.Release(name=name, **fields) for name, fields in found.items()}
 
 
-def release(name: str) -> hub.Release:
-    """Return the release of a name; an unknown one raises `InputError` with the nearest."""
+def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
+    """Return the release of a name; an unknown one raises `InputError` with the nearest.
+
+    `others` are names of weights that are no releases, for the message.
+    """
     known = releases()
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+        near = difflib.get_close_matches(name, [*known, *others], n=1, cutoff=0.0)
         raise InputError(
             f"There are no released weights {name!r}. Nearest: {near[0]}. All: "
-            f"{', '.join(known)}. (egosim models list)"
+            f"{', '.join([*known, *others])}. (egosim models list)"
         )
     return known[name]
 

@@ -32,7 +32,9 @@ class HandTracks:
     joints_hand_m: Float[np.ndarray, "f 2 21 3"]
     """Keypoints of a mean hand in meters, in camera axes, up to a translation."""
     presence: Float[np.ndarray, "f 2"]
-    """Confidence from 0 to 1 that the hand is in the frame."""
+    """Confidence from 0 to 1 that the hand is in the frame; 0 where it was not seen."""
+    filled: Bool[np.ndarray, "f 2"] | None = None
+    """Hands that were not seen but interpolated between frames near by; None for none at all."""
 
 
 @no_type_check

@@ -90,7 +90,7 @@ def lift_tumbler(path: Path, estimator: LandmarkHands) -> None:
     start = time.perf_counter()
     tracks = estimator(frames)
     seconds = time.perf_counter() - start
-    there = np.isfinite(tracks.joints_px).all((-1, -2))
+    there = tracks.presence > 0
     inside = there[SPAN]
     middle = tracks.joints_px.mean(-2)
     steps = np.linalg.norm(np.diff(middle, axis=0), axis=-1)
@@ -150,7 +150,7 @@ def main() -> None:
         seconds = time.perf_counter() - start
         to_ours, to_published = compare(tracks, skeleton)
         totals[row["dataset"]].append(to_ours)
-        there = np.isfinite(tracks.joints_px).all((-1, -2))
+        there = tracks.presence > 0
         print(
             f"{row['dataset']:7}{row['video_id'][:44]:45} left {there[:, 0].sum():2} right "
             f"{there[:, 1].sum():2} of {len(frames)}, published joints {len(to_ours):5}, "

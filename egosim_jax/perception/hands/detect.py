@@ -14,7 +14,7 @@ from typing import Protocol, no_type_check, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from egosim_jax.perception.hands.palms import cut_tile, decode_palms, make_tiles
+from egosim_jax.perception.hands.palms import Palms, cut_tile, decode_palms, make_tiles
 from egosim_jax.perception.hands.regions import (
     Regions,
     crop_region,
@@ -26,6 +26,7 @@ from egosim_jax.perception.hands.regions import (
 
 BATCH = 64
 """Number of pictures that are given to a network at once."""
+_PALM = [0, 1, 2, 5, 9, 13, 17]
 
 
 @runtime_checkable
@@ -65,6 +66,8 @@ class Candidates:
     """Confidence from 0 to 1 that there is a hand."""
     right: Float[np.ndarray, " n"]
     """Probability that it is a right hand."""
+    palm: Float[np.ndarray, " n"]
+    """Confidence from 0 to 1 that its palm was detected where its joints say."""
 
     def __len__(self) -> int:
         """Return the number of candidates."""
@@ -96,8 +99,8 @@ def spread(joints_px: Float[np.ndarray, "*n 21 2"]) -> Float[np.ndarray, "*n"]:
 
 
 def relative_distance(
-    one: Float[np.ndarray, "*n 21 2"], other: Float[np.ndarray, "*n 21 2"]
-) -> Float[np.ndarray, "*n"]:
+    one: Float[np.ndarray, "*#n 21 2"], other: Float[np.ndarray, "*#n 21 2"]
+) -> Float[np.ndarray, ...]:
     """Return the mean distance of the joints of two hands, in sizes of the larger one."""
     distance = np.linalg.norm(one - other, axis=-1).mean(-1)
     return distance / np.maximum(np.maximum(spread(one), spread(other)), 1e-6)
@@ -118,7 +121,12 @@ def find_candidates(
     are detected in `wanted` frames only, and their hands followed through all of them.
     """
     searched = np.arange(len(frames)) if wanted is None else np.flatnonzero(wanted)
-    numbers, regions = _find_palms(frames, networks, searched, min_palm)
+    palms = _find_palms(frames, networks, searched, min_palm)
+    numbers = np.repeat(searched, [len(p.score) for p in palms])
+    regions = regions_of_palms(
+        np.concatenate([np.zeros((0, 4)), *(p.boxes_px for p in palms)]),
+        np.concatenate([np.zeros((0, 7, 2)), *(p.keypoints_px for p in palms)]),
+    )
     found = _find_joints(frames, networks, numbers, regions, min_presence)
     found = _once(found, same_hand)
     fresh = found
@@ -132,28 +140,38 @@ def find_candidates(
         )
         fresh = _new_ones(_once(fresh, same_hand), found, same_hand)
         found = found.join(fresh)
+    of_frame = dict(zip(searched.tolist(), palms, strict=True))
+    for i, frame in enumerate(found.frame):
+        found.palm[i] = _support(found.joints_px[i], of_frame[int(frame)])
     return found.take(np.argsort(found.frame, kind="stable"))
+
+
+def _support(joints_px: np.ndarray, palms: Palms) -> float:
+    """Return the score of the best palm that is where a hand's joints say, and of its size."""
+    size = float(spread(joints_px[None])[0])
+    away = np.linalg.norm(palms.boxes_px[:, :2] - joints_px[_PALM].mean(0), axis=-1)
+    ratio = palms.boxes_px[:, 2:].max(1) / max(size, 1e-6)
+    fits = (away < 0.6 * size) & (ratio > 0.5) & (ratio < 2)
+    return float(palms.score[fits].max(initial=0))
 
 
 def _find_palms(
     frames: np.ndarray, networks: HandNetworks, searched: np.ndarray, min_palm: float
-) -> tuple[np.ndarray, Regions]:
-    """Return the frames and regions of all detected palms."""
+) -> list[Palms]:
+    """Return the palms of the frames that are searched."""
     tiles = make_tiles(*frames.shape[1:3])
-    numbers, boxes, keypoints = [], [np.zeros((0, 4))], [np.zeros((0, 7, 2))]
+    palms = []
     step = max(BATCH // len(tiles), 1)
     for start in range(0, len(searched), step):
         batch = searched[start : start + step]
         pictures = np.stack([cut_tile(frames[f], tile) for f in batch for tile in tiles])
         raw_boxes, logits = networks.palms(pictures)
-        for i, frame in enumerate(batch):
-            of_frame = slice(i * len(tiles), (i + 1) * len(tiles))
-            palms = decode_palms(raw_boxes[of_frame], logits[of_frame], tiles, min_score=min_palm)
-            numbers += [frame] * len(palms.score)
-            boxes.append(palms.boxes_px)
-            keypoints.append(palms.keypoints_px)
-    regions = regions_of_palms(np.concatenate(boxes), np.concatenate(keypoints))
-    return np.array(numbers, int), regions
+        for i in range(0, len(pictures), len(tiles)):
+            of_frame = slice(i, i + len(tiles))
+            palms.append(
+                decode_palms(raw_boxes[of_frame], logits[of_frame], tiles, min_score=min_palm)
+            )
+    return palms
 
 
 def _find_joints(
@@ -181,6 +199,7 @@ def _find_joints(
         joints_hand_m=turned_back(regions, meters),
         presence=presence,
         right=right,
+        palm=np.zeros(len(numbers)),
     )
     return found.take(presence >= min_presence)
 
@@ -199,6 +218,7 @@ def _followed(
         joints_hand_m=both.joints_hand_m,
         presence=both.presence,
         right=both.right,
+        palm=both.palm,
     )
     return _new_ones(moved.take(inside), found, same_hand)
 
@@ -210,7 +230,7 @@ def _once(candidates: Candidates, same_hand: float) -> Candidates:
     by_frame: dict[int, list[int]] = {}
     for i in order:
         others = by_frame.setdefault(int(candidates.frame[i]), [])
-        near = relative_distance(candidates.joints_px[i], candidates.joints_px[others])
+        near = relative_distance(candidates.joints_px[i : i + 1], candidates.joints_px[others])
         if not len(others) or near.min() > same_hand:
             others.append(i)
             kept.append(i)
@@ -223,6 +243,6 @@ def _new_ones(candidates: Candidates, found: Candidates, same_hand: float) -> Ca
     for i in range(len(candidates)):
         there = found.joints_px[found.frame == candidates.frame[i]]
         new[i] = not len(there) or (
-            relative_distance(candidates.joints_px[i], there).min() > same_hand
+            relative_distance(candidates.joints_px[i : i + 1], there).min() > same_hand
         )
     return candidates.take(new)

@@ -14,7 +14,13 @@ from egosim_jax.perception.estimates import HandTracks
 from egosim_jax.perception.hands import weights as hand_weights
 from egosim_jax.perception.hands.detect import Candidates, HandNetworks, find_candidates
 from egosim_jax.perception.hands.litert import LiteRtNetworks
-from egosim_jax.perception.hands.track import TrackConfig, choose_tracks, smooth
+from egosim_jax.perception.hands.track import (
+    TrackConfig,
+    choose_tracks,
+    fill_gaps,
+    find_gaps,
+    smooth,
+)
 from egosim_jax.types import check_video
 
 SKIN_RGB = (224, 172, 140)
@@ -41,6 +47,8 @@ class LandmarkHands:
     """True to search frames without a hand again, painted in the color of skin."""
     min_gloved: float = 0.7
     """Minimum confidence of the landmark network in a painted frame."""
+    max_gap: int = 3
+    """Maximum number of frames of a gap that is interpolated, and marked as such."""
     tracking: TrackConfig = field(default_factory=TrackConfig)
     networks: HandNetworks | None = None
     """Networks to use instead of LiteRT on the CPU, such as the JAX program's."""
@@ -55,7 +63,7 @@ class LandmarkHands:
             gloved = self._candidates(paint_skin(frames), wanted=empty)
             found = found.join(gloved.take(gloved.presence >= self.min_gloved))
             path = self._choose(found, len(frames))
-        return _as_tracks(found, path)
+        return _as_tracks(found, path, max_gap=self.max_gap, max_motion=self.tracking.max_motion)
 
     @cached_property
     def _networks(self) -> HandNetworks:
@@ -85,8 +93,10 @@ def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w
     return table[gray]
 
 
-def _as_tracks(found: Candidates, path: np.ndarray) -> HandTracks:
-    """Return the chosen candidates, smoothed; NaN where there is none."""
+def _as_tracks(
+    found: Candidates, path: np.ndarray, *, max_gap: int, max_motion: float
+) -> HandTracks:
+    """Return the chosen candidates, smoothed, with short gaps filled; NaN where there is none."""
     joints_px = np.full((*path.shape, 21, 2), np.nan)
     joints_hand_m = np.full((*path.shape, 21, 3), np.nan)
     presence = np.zeros(path.shape)
@@ -94,6 +104,10 @@ def _as_tracks(found: Candidates, path: np.ndarray) -> HandTracks:
     joints_px[there] = found.joints_px[path[there]]
     joints_hand_m[there] = found.joints_hand_m[path[there]]
     presence[there] = found.presence[path[there]]
+    gaps = find_gaps(joints_px, most=max_gap, max_motion=max_motion)
     return HandTracks(
-        joints_px=smooth(joints_px), joints_hand_m=smooth(joints_hand_m), presence=presence
+        joints_px=smooth(fill_gaps(joints_px, gaps)),
+        joints_hand_m=smooth(fill_gaps(joints_hand_m, gaps)),
+        presence=presence,
+        filled=gaps,
     )

@@ -27,11 +27,13 @@ class TrackConfig:
     """Weight of the doubt in the side."""
     presence: float = 1.0
     """Weight of the doubt in presence."""
+    palm: float = 1.0
+    """Weight of the doubt in the palm, which the detector need not see in every frame."""
     missing: float = 2.5
     """Cost of a frame without the hand of a side."""
     change: float = 2.0
     """Cost of the appearance or disappearance of a hand."""
-    overlap: float = 3.0
+    overlap: float = 6.0
     """Cost of two hands at the same place; it falls to zero at a distance of one hand size."""
     motion: float = 3.0
     """Cost of a motion by one hand size from one frame to the next."""
@@ -89,6 +91,7 @@ def _state_cost(candidates: Candidates, states: np.ndarray, config: TrackConfig)
         right = candidates.right[chosen]
         doubt = _nats(right if side == RIGHT else 1 - right)
         cost[there] += config.side * doubt + config.presence * _nats(candidates.presence[chosen])
+        cost[there] += config.palm * _nats(np.clip(candidates.palm[chosen], 0.1, 1))
         cost[~there] += config.missing
     both = (states >= 0).all(1)
     cost[both] += config.overlap * _overlap(candidates, states[both])
@@ -135,6 +138,34 @@ def _without_short(candidates: Candidates, path: np.ndarray, config: TrackConfig
                 if last - first < min(config.min_frames, len(path)):
                     path[first:last, side] = -1
     return path
+
+
+def fill_gaps(
+    joints: Float[np.ndarray, "f 2 21 c"], gaps: Bool[np.ndarray, "f 2"]
+) -> Float[np.ndarray, "f 2 21 c"]:
+    """Return tracks with straight motion through some gaps, of which both ends are known."""
+    result = joints.copy()
+    for side in (LEFT, RIGHT):
+        for start, stop in runs(gaps[:, side]):
+            weight = np.arange(1, stop - start + 1)[:, None, None] / (stop - start + 1)
+            before, after = joints[start - 1, side], joints[stop, side]
+            result[start:stop, side] = (1 - weight) * before + weight * after
+    return result
+
+
+def find_gaps(
+    joints_px: Float[np.ndarray, "f 2 21 2"], *, most: int, max_motion: float
+) -> Bool[np.ndarray, "f 2"]:
+    """Return the frames of gaps between two hands that are near by in time and in the picture."""
+    missing = np.isnan(joints_px).any((2, 3))
+    gaps = np.zeros_like(missing)
+    for side in (LEFT, RIGHT):
+        for start, stop in runs(missing[:, side]):
+            if start == 0 or stop == len(missing) or stop - start > most:
+                continue
+            moved = relative_distance(joints_px[start - 1 : start, side], joints_px[[stop], side])
+            gaps[start:stop, side] = moved[0] <= max_motion
+    return gaps
 
 
 def runs(mask: Bool[np.ndarray, " f"]) -> list[tuple[int, int]]:

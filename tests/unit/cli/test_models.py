@@ -143,3 +143,21 @@ def interrupt_after_download():
         return real(*args)
 
     return as_record
+
+
+def test_networks_out_of_a_wheel_are_listed_and_shown_before_they_are_fetched(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(["models", "list"]) == ExitCode.DONE
+    assert "egosim models fetch hands" in capsys.readouterr().out
+    assert main(["models", "fetch", "hands", "--dry-run"]) == ExitCode.DONE
+    shown = capsys.readouterr().out
+    assert "sha256 1b14e9422c6ad006" in shown
+    assert "pip download --no-deps" in shown
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_name_is_refused_with_all_names(capsys):
+    assert main(["models", "fetch", "hand"]) == ExitCode.USAGE
+    assert "Nearest: hands. All: egosim_14b" in capsys.readouterr().err

@@ -1,0 +1,75 @@
+"""Painted hands, and networks that see them: a disc for each joint, whose color has its number."""
+
+import cv2
+import numpy as np
+
+from egosim_jax.perception.hands.palms import make_anchors
+
+PALM = [0, 1, 2, 5, 9, 13, 17]
+_VISIBLE, _HIDDEN = 250, 150
+
+
+def hand_px(*, center, angle=0.0, size=1.0):
+    """Return 21 joints of a hand around a center, turned clockwise; its fingers point up at 0."""
+    joints = [(0.0, 40.0)]
+    joints += [(-14 - 9 * i, 26 - 11 * i) for i in range(4)]
+    joints += [(x, 2 - 13 * i) for x in (-12, 0, 12, 24) for i in range(4)]
+    joints = size * np.array(joints)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return joints @ rotation.T + np.array(center)
+
+
+def paint(hands, *, right=True, hidden=(), shape=(240, 320)):
+    """Return frames with a list of hands each; palms of `hidden` frames are not detected."""
+    frames = np.zeros((len(hands), *shape, 3), np.uint8)
+    for number, (frame, joints) in enumerate(zip(frames, hands, strict=True)):
+        for hand in joints:
+            for j, point in enumerate(hand):
+                color = (
+                    20 + 10 * j,
+                    _HIDDEN if number in hidden else _VISIBLE,
+                    250 if right else 150,
+                )
+                at = tuple(round(16 * v) for v in point)
+                cv2.circle(frame, at, 5 * 16, color, -1, cv2.LINE_8, shift=4)
+    return frames
+
+
+def _joints(picture):
+    """Return the joints that a picture shows, in pixels from edge to edge, or None."""
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    sure = np.isin(green, (_HIDDEN, _VISIBLE)) & np.isin(blue, (150, 250))
+    joints = []
+    for j in range(21):
+        row, column = np.nonzero(sure & (red == 20 + 10 * j))
+        if not len(row):
+            return None
+        joints.append([column.mean() + 0.5, row.mean() + 0.5])
+    return np.array(joints), green[sure].max() == _VISIBLE, blue[sure].max() == 250
+
+
+class PaintedHands:
+    """Networks (`detect.HandNetworks`) that see one painted hand in a picture."""
+
+    def palms(self, pictures):
+        """Return a palm at the first anchor for each picture whose hand shows its palm."""
+        boxes = np.zeros((len(pictures), 2016, 18), np.float32)
+        logits = np.full((len(pictures), 2016), -50, np.float32)
+        for i, picture in enumerate(pictures):
+            if (seen := _joints(picture)) is not None and seen[1]:
+                joints = seen[0]
+                keypoints = joints[[0, 5, 9, 13, 17, 1, 2]] - 192 * make_anchors()[0]
+                center = joints[PALM].mean(0) - 192 * make_anchors()[0]
+                size = [np.ptp(joints[PALM]) / 2] * 2
+                boxes[i, 0], logits[i, 0] = [*center, *size, *keypoints.ravel()], 4
+        return boxes, logits
+
+    def landmarks(self, pictures):
+        """Return the joints in each picture."""
+        joints = np.zeros((len(pictures), 21, 3), np.float32)
+        presence = np.zeros(len(pictures), np.float32)
+        right = np.full(len(pictures), 0.5, np.float32)
+        for i, picture in enumerate(pictures):
+            if (seen := _joints(picture)) is not None:
+                joints[i, :, :2], presence[i], right[i] = seen[0], 0.9, 0.95 if seen[2] else 0.05
+        return joints, presence, right, 0.001 * (joints - joints[:, :1])

@@ -1,0 +1,152 @@
+"""Tracks of hands on synthetic candidates: crossings, doubles, gaps, noise in the side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.perception.estimates import LEFT, RIGHT, HandEstimator
+from egosim_jax.perception.hands import LandmarkHands
+from egosim_jax.perception.hands.detect import Candidates
+from egosim_jax.perception.hands.estimator import paint_skin
+from egosim_jax.perception.hands.track import (
+    TrackConfig,
+    choose_tracks,
+    fill_gaps,
+    find_gaps,
+    smooth,
+)
+from tests.hands import PaintedHands, hand_px, paint
+
+
+def candidates(*hands):
+    """Return candidates of (frame, center, probability of a right hand, presence, palm)."""
+    frame, centers, right, presence, palm = zip(*hands, strict=True)
+    joints = np.array([hand_px(center=center) for center in centers])
+    return Candidates(
+        frame=np.array(frame),
+        joints_px=joints,
+        joints_hand_m=np.concatenate([joints, 0 * joints[..., :1]], -1) * 0.001,
+        presence=np.array(presence, float),
+        right=np.array(right, float),
+        palm=np.array(palm, float),
+    )
+
+
+def chosen(found, frames, **options):
+    return choose_tracks(found, frames, TrackConfig(**options), same_hand=0.4)
+
+
+def test_each_hand_has_the_side_that_the_network_says():
+    found = candidates(
+        *[(f, (100, 100), 0.1, 0.9, 0.9) for f in range(4)],
+        *[(f, (300, 100), 0.9, 0.9, 0.9) for f in range(4)],
+    )
+    assert chosen(found, 4).tolist() == [[f, 4 + f] for f in range(4)]
+
+
+def test_a_side_that_is_wrong_in_a_few_frames_does_not_break_a_track():
+    right = [0.9, 0.9, 0.3, 0.1, 0.9, 0.9, 0.8, 0.9]
+    found = candidates(*[(f, (100 + 5 * f, 100), r, 0.9, 0.9) for f, r in enumerate(right)])
+    path = chosen(found, 8)
+    assert path[:, RIGHT].tolist() == list(range(8))
+    assert (path[:, LEFT] == -1).all()
+
+
+def test_hands_that_cross_keep_their_sides():
+    places = np.linspace(60, 340, 15)
+    found = candidates(
+        *[(f, (x, 100), 0.2, 0.9, 0.9) for f, x in enumerate(places)],
+        *[(f, (400 - x, 170), 0.7, 0.9, 0.9) for f, x in enumerate(places)],
+    )
+    path = chosen(found, 15)
+    assert path[:, LEFT].tolist() == list(range(15))
+    assert path[:, RIGHT].tolist() == list(range(15, 30))
+
+
+def test_one_hand_that_was_found_twice_is_one_hand():
+    found = candidates(
+        *[(f, (100, 100), 0.9, 0.9, 0.9) for f in range(6)],
+        *[(f, (125, 110), 0.1, 0.8, 0.9) for f in range(6)],
+    )
+    path = chosen(found, 6)
+    assert path[:, RIGHT].tolist() == list(range(6))
+    assert (path[:, LEFT] == -1).all()
+
+
+def test_a_gap_stays_a_gap():
+    found = candidates(*[(f, (100, 100), 0.9, 0.9, 0.9) for f in range(12) if not 4 <= f < 8])
+    path = chosen(found, 12)
+    assert (path[4:8] == -1).all()
+    assert (path[[0, 1, 2, 3, 8, 9, 10, 11], RIGHT] >= 0).all()
+
+
+def test_a_hand_of_one_frame_is_no_hand():
+    found = candidates((5, (100, 100), 0.9, 0.9, 0.9))
+    assert (chosen(found, 12) == -1).all()
+
+
+def test_what_looks_like_a_hand_but_has_no_palm_loses_against_one_that_has():
+    found = candidates(
+        *[(f, (100, 100), 0.95, 0.95, 0) for f in range(6)],
+        *[(f, (300, 100), 0.85, 0.85, 0.9) for f in range(6)],
+    )
+    assert chosen(found, 6)[:, RIGHT].tolist() == list(range(6, 12))
+
+
+def test_no_candidates_are_no_tracks():
+    nothing = candidates((0, (0, 0), 0, 0, 0)).take(np.zeros(0, int))
+    assert (chosen(nothing, 3) == -1).all()
+
+
+def moving(frames=9, missing=()):
+    joints = np.full((frames, 2, 21, 2), np.nan)
+    for f in set(range(frames)) - set(missing):
+        joints[f, RIGHT] = hand_px(center=(100 + 3 * f, 100))
+    return joints
+
+
+def test_only_short_gaps_with_two_ends_are_found():
+    gaps = find_gaps(moving(missing=[0, 2, 3, 8]), most=2, max_motion=1.0)
+    assert np.flatnonzero(gaps[:, RIGHT]).tolist() == [2, 3]
+    assert not gaps[:, LEFT].any()
+    assert not find_gaps(moving(missing=[2, 3, 4]), most=2, max_motion=1.0).any()
+    assert not find_gaps(moving(missing=[2, 3]), most=2, max_motion=0.01).any()
+
+
+def test_a_filled_gap_is_straight_motion():
+    broken = moving(missing=[2, 3, 7])
+    gaps = find_gaps(broken, most=2, max_motion=1.0)
+    np.testing.assert_allclose(fill_gaps(broken, gaps), moving(), atol=1e-9)
+
+
+def test_smoothing_keeps_straight_motion_and_halves_noise_but_crosses_no_gap():
+    straight = moving(missing=[4])
+    np.testing.assert_allclose(smooth(straight)[1:3], straight[1:3], atol=1e-9)
+    np.testing.assert_array_equal(np.isnan(smooth(straight)), np.isnan(straight))
+    noisy = np.random.default_rng(0).normal(0, 1, (400, 2, 21, 2))
+    assert smooth(noisy).std() == pytest.approx(np.sqrt(6) / 4, rel=0.02)
+
+
+def test_a_painted_video_has_its_hand_on_its_side_and_its_gap_is_marked():
+    hands = [[hand_px(center=(150 + 3 * f, 120))] for f in range(9)]
+    hands[4] = []
+    estimator = LandmarkHands(networks=PaintedHands())
+    assert isinstance(estimator, HandEstimator)
+    tracks = estimator(paint(hands, right=False))
+    assert (tracks.presence[:, LEFT] > 0).tolist() == [f != 4 for f in range(9)]
+    assert np.flatnonzero(tracks.filled[:, LEFT]).tolist() == [4]
+    assert np.isnan(tracks.joints_px[:, RIGHT]).all()
+    expected = [hand_px(center=(150 + 3 * f, 120)) for f in range(9)]
+    np.testing.assert_allclose(tracks.joints_px[1:8, LEFT], expected[1:8], atol=1)
+    honest = replace(estimator, max_gap=0)(paint(hands, right=False))
+    assert np.isnan(honest.joints_px[4]).all()
+
+
+def test_gloves_are_painted_in_the_color_of_skin_as_bright_as_they_were():
+    blue = np.zeros((1, 2, 2, 3), np.uint8)
+    blue[..., 2] = 255
+    painted = paint_skin(blue).astype(int)
+    assert (painted[..., 0] > painted[..., 1]).all()
+    assert (painted[..., 1] > painted[..., 2]).all()
+    assert not paint_skin(np.zeros((1, 2, 2, 3), np.uint8)).any()
