@@ -6,6 +6,7 @@ import difflib
 import importlib
 import json
 import pkgutil
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING

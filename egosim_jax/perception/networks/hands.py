@@ -21,7 +21,7 @@ class JaxHandNetworks:
     """Palm detector and landmark network (`hands.detect.HandNetworks`), in batches."""
 
     def __init__(self, palms: Path, landmarks: Path):
-        self._palms, self._landmarks = _Network(palms), _Network(landmarks)
+        self._palms, self._landmarks = BatchedNetwork(palms), BatchedNetwork(landmarks)
 
     def palms(
         self, pictures: UInt8[np.ndarray, "b 192 192 3"]
@@ -43,7 +43,7 @@ class JaxHandNetworks:
         return joints.reshape(-1, 21, 3), presence[:, 0], right[:, 0], meters.reshape(-1, 21, 3)
 
 
-class _Network:
+class BatchedNetwork:
     """Compiled network: weights on the device, one program per power of two of the batch size."""
 
     def __init__(self, path: Path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from egosim_jax.perception.networks.hands import _Network
+from egosim_jax.perception.networks.hands import BatchedNetwork
 from egosim_jax.perception.networks.tflite import read_program
 from egosim_jax.types import InputError
 
@@ -36,7 +36,9 @@ def litert(path, pictures):
 
 def test_every_operation_gives_the_numbers_of_litert_in_a_batch(network):
     pictures = np.random.default_rng(1).integers(0, 256, (3, 12, 12, 3), dtype=np.uint8)
-    for ours, theirs in zip(_Network(network)(pictures), litert(network, pictures), strict=True):
+    for ours, theirs in zip(
+        BatchedNetwork(network)(pictures), litert(network, pictures), strict=True
+    ):
         assert ours.shape == theirs.shape
         np.testing.assert_allclose(ours, theirs, atol=2e-5)
 
