@@ -239,10 +239,12 @@ def _once(candidates: Candidates, same_hand: float) -> Candidates:
 
 def _new_ones(candidates: Candidates, found: Candidates, same_hand: float) -> Candidates:
     """Return the candidates that are no hand that was found in the same frame."""
+    order = np.argsort(found.frame, kind="stable")
+    starts = np.searchsorted(found.frame[order], candidates.frame)
+    stops = np.searchsorted(found.frame[order], candidates.frame, side="right")
     new = np.ones(len(candidates), bool)
-    for i in range(len(candidates)):
-        there = found.joints_px[found.frame == candidates.frame[i]]
-        new[i] = not len(there) or (
-            relative_distance(candidates.joints_px[i : i + 1], there).min() > same_hand
-        )
+    for i, (start, stop) in enumerate(zip(starts, stops, strict=True)):
+        there = found.joints_px[order[start:stop]]
+        near = relative_distance(candidates.joints_px[i : i + 1], there)
+        new[i] = not len(there) or near.min() > same_hand
     return candidates.take(new)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -47,6 +47,8 @@ class LandmarkHands:
     """True to search frames without a hand again, painted in the color of skin."""
     min_gloved: float = 0.7
     """Minimum confidence of the landmark network in a painted frame."""
+    max_side: int = 1280
+    """Longest side in pixels of the frames that are searched; larger ones are made smaller."""
     max_gap: int = 3
     """Maximum number of frames of a gap that is interpolated, and marked as such."""
     tracking: TrackConfig = field(default_factory=TrackConfig)
@@ -56,6 +58,11 @@ class LandmarkHands:
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
         """Return the hands of a video."""
         check_video("The video", frames)
+        smaller, scale = _shrunk(frames, self.max_side)
+        tracks = self._track(smaller)
+        return replace(tracks, joints_px=(tracks.joints_px + 0.5) / scale - 0.5)
+
+    def _track(self, frames: np.ndarray) -> HandTracks:
         found = self._candidates(frames)
         path = self._choose(found, len(frames))
         empty = np.all(path < 0, axis=1)
@@ -84,6 +91,17 @@ class LandmarkHands:
 
     def _choose(self, found: Candidates, frames: int) -> np.ndarray:
         return choose_tracks(found, frames, self.tracking, same_hand=self.same_hand)
+
+
+def _shrunk(frames: np.ndarray, max_side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return frames of at most a size, and the scale of their columns and rows."""
+    height, width = frames.shape[1:3]
+    factor = min(1.0, max_side / max(height, width))
+    if factor == 1:
+        return frames, np.ones(2)
+    size = max(round(width * factor), 1), max(round(height * factor), 1)
+    smaller = np.stack([cv2.resize(f, size, interpolation=cv2.INTER_AREA) for f in frames])
+    return smaller, np.array(size) / [width, height]
 
 
 def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w 3"]:

@@ -143,6 +143,14 @@ def test_a_painted_video_has_its_hand_on_its_side_and_its_gap_is_marked():
     assert np.isnan(honest.joints_px[4]).all()
 
 
+def test_large_frames_are_searched_smaller_and_found_in_their_own_pixels():
+    frames = paint([[hand_px(center=(150, 120))]] * 3)
+    large = frames.repeat(2, axis=1).repeat(2, axis=2)
+    tracks = LandmarkHands(networks=PaintedHands(), max_side=320)(large)
+    expected = 2 * (hand_px(center=(150, 120)) + 0.5) - 0.5
+    np.testing.assert_allclose(tracks.joints_px[:, RIGHT], np.tile(expected, (3, 1, 1)), atol=1.5)
+
+
 def test_gloves_are_painted_in_the_color_of_skin_as_bright_as_they_were():
     blue = np.zeros((1, 2, 2, 3), np.uint8)
     blue[..., 2] = 255
