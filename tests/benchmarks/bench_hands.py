@@ -30,16 +30,17 @@ SPAN = slice(60, 231)
 """Frames of lift_tumbler.mp4 that have a hand."""
 HUMAN = SKELETONS["human"]
 FINGERS = np.stack([HUMAN.colors[4 * finger + 1] for finger in range(5)]).astype(np.float32)
-PALETTE = np.concatenate([FINGERS, np.zeros((1, 3), np.float32)])
+PALETTE = FINGERS * 255 / FINGERS.max(-1, keepdims=True)
 JOINTS = [[1, 2, 3, 4], [5, 6, 7, 8], [0, 9, 10, 11, 12], [13, 14, 15, 16], [17, 18, 19, 20]]
 """Joints that have the color of each finger: the wrist has that of the middle one."""
 
 
 def finger_masks(frame: np.ndarray) -> np.ndarray:
-    """Return the pixels of each finger's color, `5 h w`."""
+    """Return the pixels of each finger's color, `5 h w`, whatever their brightness at an edge."""
     masks = np.zeros((5, *frame.shape[:2]), bool)
-    bright = frame.max(-1) > 60
+    bright = frame.max(-1) > 90
     colors = frame[bright].astype(np.float32)
+    colors *= 255 / colors.max(-1, keepdims=True)
     distance = np.linalg.norm(colors[:, None] - PALETTE, axis=-1)
     nearest = distance.argmin(-1)
     for finger in range(5):
@@ -48,14 +49,19 @@ def finger_masks(frame: np.ndarray) -> np.ndarray:
 
 
 def sphere_centers(masks: np.ndarray) -> list[np.ndarray]:
-    """Return centers of each finger's spheres, `n 2`: wide places of its mask, tubes are narrow."""
+    """Return centers of each finger's spheres, `n 2`: places wider than the tubes around them."""
     depths = [cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in masks]
     radius = np.median([depth.max() for depth in depths if depth.max() > 2] or [np.inf])
+    reach = 2 * round(1.5 * min(radius, 20)) + 1
     centers = []
     for depth in depths:
         smooth = cv2.GaussianBlur(depth, (0, 0), 1)
-        window = np.ones((2 * round(1.2 * min(radius, 20)) + 1,) * 2, np.uint8)
-        peaks = (depth >= 0.75 * radius) & (smooth >= cv2.dilate(smooth, window))
+        ridge = (depth > 1) & (depth >= cv2.dilate(depth, np.ones((3, 3))) - 1e-3)
+        around = (2 * reach + 1,) * 2
+        count = cv2.boxFilter(ridge.astype(np.float32), -1, around, normalize=False)
+        width = cv2.boxFilter(depth * ridge, -1, around, normalize=False) / np.maximum(count, 1)
+        peaks = smooth >= cv2.dilate(smooth, np.ones((reach, reach)))
+        peaks &= (depth >= 0.6 * radius) & (depth >= 1.15 * width)
         centers.append(np.argwhere(peaks)[:, ::-1].astype(float))
     return centers
 

@@ -37,9 +37,9 @@ class LandmarkHands:
     """True to refuse instead of fetching weights."""
     threads: int = 2
     """Number of threads of each network on the CPU."""
-    min_palm: float = 0.5
+    min_palm: float = 0.3
     """Minimum confidence of a detected palm."""
-    min_presence: float = 0.5
+    min_presence: float = 0.4
     """Minimum confidence of the landmark network that there is a hand."""
     same_hand: float = 0.4
     """Distance in hand sizes below which two hands of a frame are the same one."""

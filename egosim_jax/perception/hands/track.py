@@ -29,7 +29,7 @@ class TrackConfig:
     """Weight of the doubt in presence."""
     palm: float = 1.0
     """Weight of the doubt in the palm, which the detector need not see in every frame."""
-    missing: float = 2.5
+    missing: float = 3.5
     """Cost of a frame without the hand of a side."""
     change: float = 2.0
     """Cost of the appearance or disappearance of a hand."""
@@ -37,6 +37,8 @@ class TrackConfig:
     """Cost of two hands at the same place; it falls to zero at a distance of one hand size."""
     motion: float = 3.0
     """Cost of a motion by one hand size from one frame to the next."""
+    max_break: int = 3
+    """Maximum number of missing frames after which a hand near by is the same one."""
     max_motion: float = 1.0
     """Largest motion in hand sizes; beyond it a hand disappears and another one appears."""
     min_frames: int = 3
@@ -64,7 +66,7 @@ def choose_tracks(
     for pointers in reversed(back):
         chosen.append(int(pointers[chosen[-1]]))
     path = np.array([s[i] for s, i in zip(states, reversed(chosen), strict=True)])
-    return _without_short(candidates, path, config)
+    return _without_short(candidates, _of_one_side(candidates, path, config), config)
 
 
 def _best(candidates: Candidates, frame: int, most: int) -> np.ndarray:
@@ -124,6 +126,39 @@ def _step_cost(
 
 def _nats(probability: np.ndarray) -> np.ndarray:
     return -np.log(np.clip(probability, 0.01, 1))
+
+
+def _of_one_side(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
+    """Return the path with each hand on one side.
+
+    Where a hand of one side ends and one of the other side begins in the same place, both are one
+    hand, of the side that the network says over all of its frames.
+    """
+    path = path.copy()
+    odds = _nats(1 - candidates.right) - _nats(candidates.right)
+    parts = [(start, stop, side) for side in (0, 1) for start, stop in runs(path[:, side] >= 0)]
+    for start, stop, side in sorted(parts):
+        for begin, end, _ in parts:
+            other = 1 - side
+            ends_before = 0 <= start - end <= config.max_break and path[begin, other] >= 0
+            if not ends_before or path[end - 1, other] < 0 or path[start, side] < 0:
+                continue
+            if not _in_one_place(candidates, path[end - 1, other], path[start, side], config):
+                continue
+            earlier, later = path[begin:end, other], path[start:stop, side]
+            is_right = odds[earlier].sum() + odds[later].sum() > 0
+            wrong = slice(start, stop) if is_right != (side == RIGHT) else slice(begin, end)
+            column = side if is_right != (side == RIGHT) else other
+            if (path[wrong, 1 - column] < 0).all():
+                path[wrong] = path[wrong, ::-1]
+    return path
+
+
+def _in_one_place(candidates: Candidates, one: int, other: int, config: TrackConfig) -> bool:
+    """Return whether the means of two hands are near, whatever side the network took them for."""
+    pair = candidates.take(np.array([one, other]))
+    apart = np.linalg.norm(np.diff(pair.joints_px.mean(1), axis=0))
+    return bool(apart < config.max_motion * pair.size_px.max())
 
 
 def _without_short(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
