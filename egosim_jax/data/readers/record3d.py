@@ -33,6 +33,7 @@ from PIL import Image
 
 from egosim_jax.data.readers import Entry, make_id, natural_order
 from egosim_jax.data.readers.lenses import Lens
+from egosim_jax.data.readers.lzfse import unpack
 from egosim_jax.data.readers.pictures import MAX_PICTURES, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
 from egosim_jax.data.recording import DepthFiles, Recording
@@ -237,26 +238,14 @@ def _write_depth(
     paths: list[Path | None] = [None] * frames
     for number in range(frames):
         if found[number]:
-            data = _unpack(read(f"rgbd/{number}.depth"), 4 * rows * columns, path)
+            name = f"rgbd/{number}.depth"
+            try:
+                data = unpack(read(name), 4 * rows * columns)
+            except ValueError as error:
+                raise InputError(f"{quote_path(path)}: {name} is damaged: {error}.") from error
             meters = np.frombuffer(data, "<f4").reshape(rows, columns)
             meters = np.where(np.isfinite(meters) & (meters > 0) & (meters < 65), meters, 0)
             paths[number] = target = folder / "depth" / f"{number:06d}.png"
             with atomic_write(target) as temporary:
                 Image.fromarray(np.rint(1000 * meters).astype(np.uint16)).save(temporary)
     return DepthFiles(paths=tuple(paths), unit_m=0.001), "LiDAR"
-
-
-def _unpack(data: bytes, size: int, path: Path) -> bytes:
-    """Return the values of a depth map, which some apps store as they are."""
-    if len(data) != size:
-        import liblzfse  # pyright: ignore[reportMissingImports]
-
-        try:
-            data = liblzfse.decompress(data)
-        except (liblzfse.error, ValueError) as error:
-            raise InputError(f"{quote_path(path)}: a depth map is damaged.") from error
-    if len(data) != size:
-        raise InputError(
-            f"{quote_path(path)}: a depth map has {len(data):,} bytes, {size:,} are expected."
-        )
-    return data

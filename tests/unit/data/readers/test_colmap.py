@@ -1,6 +1,9 @@
 """COLMAP: both file formats give the scene's cameras and points; damaged models are refused."""
 
+import json
 import struct
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -152,3 +155,44 @@ def test_a_name_that_leaves_the_folder_of_pictures_is_not_found(world, tmp_path,
 def test_a_rate_that_is_none_is_refused(world, tmp_path, imported):
     write_model(tmp_path / "room", world, binary=True)
     assert "--fps" in imported(Colmap(source=tmp_path / "room", fps=0.0))[1]["room"]
+
+
+def test_models_of_colmap_itself_are_read_as_it_reads_them(tmp_path):
+    """COLMAP makes a scene and writes it in both formats, in a process without cv2."""
+    program = (
+        "import json, sys, numpy as np, pycolmap\n"
+        "options = pycolmap.SyntheticDatasetOptions()\n"
+        "options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 25\n"
+        "model = pycolmap.synthesize_dataset(options)\n"
+        "model.write_binary(sys.argv[1]); model.write_text(sys.argv[2])\n"
+        "images = {i.name: i.cam_from_world().inverse().matrix().tolist()\n"
+        "          for i in model.images.values()}\n"
+        "camera = model.cameras[1]\n"
+        "points = {n: [*p.xyz.tolist(), p.error] for n, p in model.points3D.items()}\n"
+        "rays = [np.array([x, y, 1.0]) for x, y in json.load(sys.stdin)]\n"
+        "seen = [camera.img_from_cam(ray).tolist() for ray in rays]\n"
+        "print(json.dumps([images, points, seen]))\n"
+    )
+    folders = [tmp_path / "binary", tmp_path / "text"]
+    for folder in folders:
+        folder.mkdir()
+    rays = [[0.1, -0.2], [0.3, 0.2], [0.0, 0.0]]
+    run = subprocess.run(
+        [sys.executable, "-c", program, *map(str, folders)],
+        input=json.dumps(rays),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert run.returncode == 0, run.stderr
+    images, points, seen = json.loads(run.stdout)
+    for folder in folders:
+        model = read_model(folder)
+        assert {image.name for image in model.images} == images.keys()
+        for image in model.images:
+            np.testing.assert_allclose(image.world_from_camera[:3], images[image.name], atol=1e-9)
+        found = np.column_stack([model.points_m, model.error_px])
+        expected = [points[str(number)] for number in model.point_ids.tolist()]
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+        pixels = model.lenses[1].project(np.array([[*ray, 1.0] for ray in rays]))
+        np.testing.assert_allclose(pixels + 0.5, seen, atol=1e-9)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import struct
 import sys
 import types
 import zipfile
@@ -11,10 +12,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from egosim_jax.data.readers.lzfse import unpacked_size
 from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.types import InputError
 from tests.captures import quaternions
 
+ZEROS = (
+    "6276783200c0000004000000001600700000000000280040820000003b0c800f2f42290000004001000000e04b"
+    "786e8e000000000000000000000000000000e0d107000000000000000000000000000000000000000000000000"
+    "000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000"
+    "0000000078f6ffffffffffffffffffffffffffffffffffffffffffffffffefffe8ff0262767824"
+)
+STORED = "6276782d10000000000102030405060708090a0b0c0d0e0f62767824"
+"""Streams of the reference implementation, in hexadecimal."""
 FLIP = np.diag([1.0, -1, -1, 1])
 
 
@@ -22,6 +32,12 @@ def jpeg(frame):
     data = io.BytesIO()
     Image.fromarray(frame).save(data, "JPEG", quality=95)
     return data.getvalue()
+
+
+def pack(data):
+    """One block of LZFSE's stream, whose payload is zlib's: only the library below unpacks it."""
+    payload = zlib.compress(data)
+    return b"bvxn" + struct.pack("<II", len(data), len(payload)) + payload + b"bvx$"
 
 
 def write_capture(path, world, *, per_frame=True, pictures="rgbd", **changes):
@@ -45,14 +61,14 @@ def write_capture(path, world, *, per_frame=True, pictures="rgbd", **changes):
             archive.writestr(f"{pictures}/{number}.jpg", jpeg(frame))
             depth = np.full((3, 4), 0.5 + 0.1 * number, np.float32)
             depth[0, 0] = np.nan
-            archive.writestr(f"rgbd/{number}.depth", zlib.compress(depth.tobytes()))
+            archive.writestr(f"rgbd/{number}.depth", pack(depth.tobytes()))
 
 
 @pytest.fixture
 def unpacker(monkeypatch):
     """A substitute for the optional library, whose compression is zlib's."""
     module = types.ModuleType("liblzfse")
-    module.decompress, module.error = zlib.decompress, zlib.error
+    module.decompress, module.error = lambda data: zlib.decompress(data[12:-4]), zlib.error
     module.__spec__ = types.SimpleNamespace(name="liblzfse")
     monkeypatch.setitem(sys.modules, "liblzfse", module)
 
@@ -77,6 +93,34 @@ def test_depth_is_in_meters_and_unknown_where_it_is_not_finite(world, tmp_path, 
     assert depth.shape == (world.height, world.width)
     assert depth[-1, -1] == pytest.approx(0.8)
     assert np.isinf(depth[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (pack(bytes(48))[:9], "cut off"),
+        (b"bvxn" + struct.pack("<II", 1 << 31, 0) + pack(bytes(48)), "2,147,483,696 bytes"),
+        (b"nothing" * 3, "not an LZFSE stream"),
+        (b"bvxn" + struct.pack("<II", 48, 5) + b"wrong" + b"bvx$", "damaged"),
+    ],
+)
+def test_depth_that_is_not_what_it_should_be_is_refused(
+    world, tmp_path, imported, unpacker, data, message
+):
+    write_capture(tmp_path / "scan.r3d", world)
+    with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
+        archive.extractall(tmp_path / "room")
+    (tmp_path / "room/rgbd/4.depth").write_bytes(data)
+    problem = imported(Record3D(source=tmp_path / "room"))[1]["room"]
+    assert message in problem
+
+
+def test_the_size_of_streams_of_the_reference_implementation_is_known():
+    """Packed by Apple's library: 49,152 zeros, and 16 bytes that do not shrink."""
+    zeros = bytes.fromhex(ZEROS)
+    assert unpacked_size(zeros) == 49_152
+    stored = bytes.fromhex(STORED)
+    assert unpacked_size(stored) == 16
 
 
 def test_without_the_library_depth_is_unknown_and_that_is_recorded(world, tmp_path, imported):
