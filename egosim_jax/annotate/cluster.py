@@ -13,6 +13,7 @@ only and sends no usage statistics.
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -94,6 +95,7 @@ def _connect(address: str) -> None:
     """Connect to a cluster, or start one that only this machine can reach."""
     import ray
 
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
     if address == "auto" and not os.environ.get(ADDRESS):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         ray.init(

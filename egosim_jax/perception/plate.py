@@ -1,9 +1,10 @@
 """First frame without hands: hidden pixels are taken from the frames that see them.
 
 A pixel that a hand hides in the first frame shows the scene at its depth there. Each is taken from
-the nearest frame in time whose view of that point is free, so that what a hand moves later stays
-where it was: a temporal median would erase it. What no frame shows is filled with patches of the
-rest of the picture (PatchMatch; Barnes et al. 2009), or by Telea's method without that library.
+the nearest frame in time whose view of that point is free, and which looks alike around it, so that
+what a hand moves later stays where it was: a temporal median would erase it. What no frame shows is
+filled with patches of the rest of the picture (PatchMatch; Barnes et al. 2009), or by Telea's
+method without that library.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
 from egosim_jax.types import Cameras
@@ -23,6 +24,12 @@ PATCH = 5
 """Radius of the compared patches in pixels."""
 RING_PX = 7
 """Width in pixels of the ring around the hidden pixels in which brightness is compared."""
+AROUND = 0.08
+"""Reach in pictures within which visible pixels decide whether another frame shows the same."""
+MAX_DIFFERENCE = 40
+"""Largest difference in gray levels of pixels that look alike."""
+MIN_AGREEMENT = 0.7
+"""Smallest fraction of pixels that look alike, around one that is taken from another frame."""
 MAX_GAIN = 1.25
 """Largest factor on the colors of another frame."""
 
@@ -70,7 +77,8 @@ def clean_plate(
         colors, free = _look_up(frames[frame], hide[frame], cameras, frame, points)
         border = free & ~hide[0][rows, columns]
         gain = _gain(image[rows, columns][border], colors[border])
-        taken = free & wanted
+        alike = _agreement(image, colors * gain, rows, columns, border)
+        taken = free & wanted & (alike >= MIN_AGREEMENT)
         image[rows[taken], columns[taken]] = np.clip(colors[taken] * gain + 0.5, 0, 255)
         missing[rows[taken], columns[taken]] = False
     image, method = _inpaint(image, missing)
@@ -115,6 +123,30 @@ def _gain(here: np.ndarray, there: np.ndarray) -> Float[np.ndarray, " 3"]:
         return np.ones(3)
     ratio = np.median(here.astype(float) + 1, axis=0) / np.median(there + 1, axis=0)
     return np.clip(ratio, 1 / MAX_GAIN, MAX_GAIN)
+
+
+def _agreement(
+    image: UInt8[np.ndarray, "h w 3"],
+    colors: Float[np.ndarray, "n 3"],
+    rows: Int[np.ndarray, " n"],
+    columns: Int[np.ndarray, " n"],
+    border: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Return the fraction of the visible pixels around each one that look alike in both frames.
+
+    Where it is low, something has moved: the other frame does not show what was there before.
+    """
+    import cv2
+
+    size = 2 * round(AROUND * image.shape[1]) + 1
+    counts = np.zeros((2, *image.shape[:2]), np.float32)
+    difference = np.abs(colors - image[rows, columns]).max(axis=1)
+    counts[0][rows[border], columns[border]] = difference[border] < MAX_DIFFERENCE
+    counts[1][rows[border], columns[border]] = 1
+    total = counts.sum(axis=(1, 2)) / max(counts[1].sum(), 1)  # for those far from any
+    counts += 1e-6 * total[:, None, None]
+    alike, seen = (cv2.blur(c, (size, size), borderType=cv2.BORDER_CONSTANT) for c in counts)
+    return (alike / np.maximum(seen, 1e-9))[rows, columns].astype(float)
 
 
 def _inpaint(

@@ -184,10 +184,11 @@ def _scene_depth(
     unit = np.median(scene.depth_m[np.isfinite(scene.depth_m)])  # within the renderer's range
     poses = small.world_from_camera.copy()
     poses[:, :3, 3] /= unit
+    poses, view = np.unique(poses, axis=0, return_inverse=True)  # one view of a still camera
     depth, _ = splat(
         np.concatenate(points) / unit, replace(small, world_from_camera=poses), point_px=1
     )
-    return small, depth * np.float32(unit)
+    return small, (depth * np.float32(unit))[view.reshape(-1)]
 
 
 def _from_height(cameras: Cameras, scene: DepthEstimate, height_m: float) -> Scale:

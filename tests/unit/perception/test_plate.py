@@ -47,6 +47,16 @@ def test_an_object_that_is_carried_away_stays(clip):
     np.testing.assert_array_equal(plate.image[body], clip.frames[0][body])
 
 
+def test_frames_in_which_the_surroundings_have_moved_are_not_used(clip, covered):
+    frames, moving, cameras = covered
+    changed = frames.copy()
+    changed[1:, 10:75, 20:110] = np.random.default_rng(0).integers(0, 255, (4, 65, 90, 3))
+    changed[moving] = (20, 10, 5)
+    plate = clean_plate(changed, moving, cameras, clip.first.depth_m)
+    assert not plate.seen.any()
+    assert plate.method == "patchmatch"
+
+
 def test_what_no_frame_shows_is_filled_by_patches(clip, covered):
     frames, moving, cameras = covered
     always = moving | moving[0]
