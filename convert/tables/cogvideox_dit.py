@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from einops import rearrange
@@ -11,10 +11,19 @@ from einops import rearrange
 from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
+from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.networks import ModelConfig
 
 TEXT_TOKENS = 226
 """Text tokens of a reference forward."""
+SCHEDULER = "CogVideoXDDIMScheduler"
+"""Class of the scheduler in diffusers."""
+PREDICTIONS = {"v": "v_prediction", "epsilon": "epsilon", "x0": "sample"}
+"""Names of the predictions in diffusers."""
 
 
 def diffusers(config: CogVideoXDiTConfig) -> list[Rule]:
@@ -99,6 +108,36 @@ def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     return have, rearrange(prediction.numpy(), "b f c h w -> b f h w c")
 
 
+def pipeline(config: ModelConfig) -> dict[str, dict[str, Any]]:
+    """Return the JSON files of a diffusers pipeline around the transformer.
+
+    Raises `InputError` for a diffusion process that diffusers' scheduler lacks.
+    """
+    process = config.process
+    if not isinstance(process, VariancePreserving):
+        raise InputError(f"{SCHEDULER} has no {type(process).__name__}. (--layout diffusers)")
+    scheduler = {
+        "_class_name": SCHEDULER,
+        "num_train_timesteps": process.train_timesteps,
+        "beta_start": process.beta_start,
+        "beta_end": process.beta_end,
+        "beta_schedule": process.beta_schedule,
+        "clip_sample": False,
+        "prediction_type": PREDICTIONS[process.prediction],
+        "rescale_betas_zero_snr": process.zero_terminal_snr,
+        "snr_shift_scale": process.snr_shift,
+        "timestep_spacing": process.spacing,
+    }
+    return {
+        "model_index.json": {
+            "_class_name": "CogVideoXPipeline",
+            "scheduler": ["diffusers", SCHEDULER],
+            "tokenizer": [None, None],  # it holds no weights: the caller passes it
+        },
+        "scheduler/scheduler_config.json": scheduler,
+    }
+
+
 def _linear(theirs: str, ours: str) -> list[Rule]:
     return [
         Rule(f"{theirs}.weight", f"{ours}.kernel", "linear"),
@@ -136,5 +175,6 @@ TABLE = Table(
         outputs=outputs,
     ),
     base=COGVIDEOX_INPAINT,
+    pipeline=pipeline,
 )
 """Conversions of CogVideoX's transformer; its base models are CogVideoX-Fun's InP models."""

@@ -11,37 +11,15 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.layout import DWM
-from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
-from egosim_jax.diffusion import DDIM, Guidance, VariancePreserving
+from egosim_jax.diffusion import Guidance
 from egosim_jax.generator import Generator, Inputs, encode_condition
-from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
-from egosim_jax.models.cogvideox.t5 import T5Config
-from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
-from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.networks import Networks
 from egosim_jax.program import CompiledFn
 from egosim_jax.testing import random_triplet
 from egosim_jax.train.encode import Encoding, example_shapes
 from egosim_jax.train.tasks.denoising import Denoising, condition_of
-from egosim_jax.types import InputError, VideoSpec
-
-TINY = ModelConfig(
-    name="dwm_tiny",
-    video=VideoSpec(frames=9, height=32, width=48, fps=8),
-    dit=CogVideoXDiTConfig(
-        in_channels=49, dim=32, heads=2, layers=2, text_dim=16, time_dim=16, base_rows=2,
-        base_columns=3,
-    ),
-    vae=CogVideoXVAEConfig(dims=(4, 4, 8, 8), res_blocks=1, groups=2),
-    text=T5Config(vocab=BYT5_VOCAB, dim=16, ffn_dim=32, heads=2, head_dim=8, layers=1),
-    image=None,
-    layout=DWM,
-    tokenizer=PromptTokenizer(clean=False, max_tokens=16),
-    process=VariancePreserving(),
-    solver=DDIM(),
-    guidance=Guidance(scale=6.0),
-    unconditional_prompt="",
-    steps=2,
-)  # fmt: skip
+from egosim_jax.types import InputError
+from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
 
 
 @pytest.fixture(scope="module")
