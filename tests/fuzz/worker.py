@@ -20,7 +20,7 @@ from egosim_jax.types import InputError
 from tests.fuzz.mutations import BYTES
 from tests.fuzz.target import Target
 
-MODULES = ("targets_run", "targets_convert", "targets_media")
+MODULES = ("targets_run", "targets_convert", "targets_media", "targets_recordings")
 MAX_SECONDS, MAX_BYTES, MAX_MESSAGE = 20, 1 << 30, 4000
 
 

@@ -1,7 +1,7 @@
 """LZFSE: the size of what a stream unpacks to, checked before it is unpacked.
 
 A stream is a row of blocks, each with a magic number and the number of bytes that it unpacks to,
-and ends with `bvx$`. The library that unpacks it has no limit of its own. Followed: Apple's
+and ends with `bvx$`. The library that unpacks it sets no limit. Followed: Apple's
 reference implementation, `lzfse_internal.h`.
 """
 
