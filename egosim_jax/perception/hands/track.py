@@ -23,18 +23,20 @@ from egosim_jax.perception.hands.detect import Candidates, relative_distance
 class TrackConfig:
     """Costs of tracking, in nats where a probability is behind them."""
 
-    side: float = 0.7
+    side: float = 0.5
     """Weight of the doubt in the side."""
     presence: float = 1.0
     """Weight of the doubt in presence."""
-    palm: float = 1.0
+    palm: float = 0.5
     """Weight of the doubt in the palm, which the detector need not see in every frame."""
     missing: float = 3.5
     """Cost of a frame without the hand of a side."""
     change: float = 2.0
     """Cost of the appearance or disappearance of a hand."""
-    overlap: float = 6.0
-    """Cost of two hands at the same place; it falls to zero at a distance of one hand size."""
+    overlap: float = 8.0
+    """Cost of two hands in the same place."""
+    apart: float = 0.8
+    """Distance of two hands, in hand sizes, at which that cost has fallen to zero."""
     motion: float = 3.0
     """Cost of a motion by one hand size from one frame to the next."""
     max_break: int = 3
@@ -96,16 +98,17 @@ def _state_cost(candidates: Candidates, states: np.ndarray, config: TrackConfig)
         cost[there] += config.palm * _nats(np.clip(candidates.palm[chosen], 0.1, 1))
         cost[~there] += config.missing
     both = (states >= 0).all(1)
-    cost[both] += config.overlap * _overlap(candidates, states[both])
+    near = np.clip(1 - _apart(candidates, states[both]) / config.apart, 0, None)
+    cost[both] += config.overlap * near
     return cost
 
 
-def _overlap(candidates: Candidates, pairs: np.ndarray) -> np.ndarray:
-    """Return the nearness of two hands: 1 at the same place, 0 beyond one hand size."""
+def _apart(candidates: Candidates, pairs: np.ndarray) -> np.ndarray:
+    """Return the distance of the means of two hands, in sizes of the larger one."""
     middle = candidates.joints_px.mean(1)
     apart = np.linalg.norm(middle[pairs[:, LEFT]] - middle[pairs[:, RIGHT]], axis=-1)
     size = candidates.size_px[pairs].max(1)
-    return np.clip(1 - apart / np.maximum(size, 1e-6), 0, None)
+    return apart / np.maximum(size, 1e-6)
 
 
 def _step_cost(

@@ -67,7 +67,7 @@ def test_hands_that_cross_keep_their_sides():
 def test_one_hand_that_was_found_twice_is_one_hand():
     found = candidates(
         *[(f, (100, 100), 0.9, 0.9, 0.9) for f in range(6)],
-        *[(f, (125, 110), 0.1, 0.8, 0.9) for f in range(6)],
+        *[(f, (120, 108), 0.1, 0.8, 0.9) for f in range(6)],
     )
     path = chosen(found, 6)
     assert path[:, RIGHT].tolist() == list(range(6))
@@ -91,7 +91,7 @@ def test_what_looks_like_a_hand_but_has_no_palm_loses_against_one_that_has():
         *[(f, (100, 100), 0.95, 0.95, 0) for f in range(6)],
         *[(f, (300, 100), 0.85, 0.85, 0.9) for f in range(6)],
     )
-    assert chosen(found, 6)[:, RIGHT].tolist() == list(range(6, 12))
+    assert chosen(found, 6, side=2.0)[:, RIGHT].tolist() == list(range(6, 12))
 
 
 def test_no_candidates_are_no_tracks():
