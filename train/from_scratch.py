@@ -67,6 +67,11 @@ class FromScratch(Recipe):
     """Dtype to which the denoiser's training rounds the factors of products; None: the model's."""
     weights: Path | None = None
     """Weights folder to start from: its autoencoder is kept, its denoiser is trained further."""
+    bundle: Path | None = None
+    """Write code, latents and weights to this new folder, to train the denoiser elsewhere.
+
+    `train/bundled.py` trains there, where little is installed. Starts from the weights that come
+    with the package, if it has some; clips and latents are kept in OUT, by default BUNDLE_data."""
 
     @abstractmethod
     def frames(self, out: Path) -> Mapping[str, Path]:
@@ -104,23 +109,38 @@ class FromScratch(Recipe):
         return replace(model, dit=replace(model.dit, products=self.products))
 
     def train(self) -> int:
-        """Make the clips, train stage after stage, and write the weights."""
+        """Make the clips, train stage after stage, and write the weights, or a bundle."""
+        if self.bundle is not None and (given := self._for_bundle(self.bundle)) != self:
+            return given.train()
         (out,) = self.require("out")
         from egosim_jax.io.run import open_folder
         from egosim_jax.networks import Networks
         from egosim_jax.train.loop import train
 
         require_single_process(self.config)
-        mutable = [*resume_mutable("vae", "denoiser"), "products", "preflight", "json", "search"]
-        open_folder(out, self, mutable=mutable)
+        free = ("products", "preflight", "json", "search", "bundle")
+        open_folder(out, self, mutable=[*resume_mutable("vae", "denoiser"), *free])
         frames = self.frames(out)
         networks = Networks.random(configs.get(self.config), seed=0)
         networks.vae = self._autoencoder(frames, out)
         latents = {split: self._encode(split, frames[split], out) for split in frames}
+        joined = {"train": _joined(latents, out / "latents" / "joined"), "test": latents["test"]}
+        if self.bundle is not None:
+            from egosim_jax.train.bundle import write_bundle
+
+            write_bundle(
+                self.bundle,
+                self.stages()["denoiser"],
+                latents=joined,
+                weights=self.weights or out / "weights",
+                dtype=self.weights_dtype,
+            )
+            print(self.bundle)
+            return ExitCode.DONE
         trained = train(
             *self.stages()["denoiser"],
-            data=_joined(latents, out / "latents" / "joined"),
-            validation=latents["test"],
+            data=joined["train"],
+            validation=joined["test"],
             out=out / "denoiser",
             weights=self.weights,
         )
@@ -128,6 +148,17 @@ class FromScratch(Recipe):
         networks.save(out / "weights", dtype=self.weights_dtype)
         print(out / "weights")
         return ExitCode.DONE
+
+    def _for_bundle(self, bundle: Path) -> FromScratch:
+        """Return this recipe with the defaults of a bundle. Raises `InputError` if that exists."""
+        from egosim_jax.train.bundle import check_new
+
+        check_new(bundle)
+        return replace(
+            self,
+            out=self.out or bundle.with_name(f"{bundle.name}_data"),
+            weights=self.weights or configs.shipped_weights(self.config),
+        )
 
     def _autoencoder(self, frames: Mapping[str, Path], out: Path) -> WanVAE:
         """Return the trained VAE, with latents of mean 0 and standard deviation 1."""
@@ -213,7 +244,7 @@ class FromClips(FromScratch):
     def train(self) -> int:
         """Train on the clips. Raises `InputError` if there are none."""
         if not self.clips:
-            self.require("out", "metadata")
+            self.require(*(("metadata",) if self.bundle else ("out", "metadata")))
         return super().train()
 
     def frames(self, out: Path) -> Mapping[str, Path]:

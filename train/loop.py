@@ -35,8 +35,8 @@ from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Wr
 from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
-from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog, average, mean_metrics
-from egosim_jax.train.update import Programs, Task, TrainState
+from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
+from egosim_jax.train.update import Programs, Task, TrainState, average, mean_metrics
 from egosim_jax.types import InputError
 
 Use = Literal["train", "peek", "validate"]

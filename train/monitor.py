@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,6 +32,7 @@ from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.targets import peak
 from egosim_jax.sharding import batch_sharding, parts
 from egosim_jax.train.tasks.denoising import condition_of
+from egosim_jax.train.update import MAX_CONSECUTIVE_SKIPS
 
 Phase = Literal["start", "compile", "data", "step", "validate", "sample", "save"]
 PHASES: dict[Phase, str] = {
@@ -162,10 +163,6 @@ class Watchdog:
                 os._exit(ExitCode.HUNG)
 
 
-MAX_CONSECUTIVE_SKIPS = 3
-"""Number of updates skipped in a row at which the run stops."""
-
-
 class SkipMonitor:
     """Reports skipped updates with their records, once they are done.
 
@@ -202,24 +199,6 @@ class SkipMonitor:
                 "before them: inspect the records above, or lower the learning rate.",
                 ExitCode.FAILED,
             )
-
-
-def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
-    """Return the means over updates, fetched from the devices at once.
-
-    Skipped updates are only counted, as `skipped_updates`.
-    """
-    fetched = jax.device_get(rows)
-    kept = [row for row in fetched if not row["consecutive_skips"]]
-    names = [name for name in fetched[0] if name != "consecutive_skips"]
-    metrics = {name: average(kept, name) for name in names if kept}
-    skipped = len(fetched) - len(kept)
-    return {**metrics, "skipped_updates": float(skipped)} if skipped else metrics
-
-
-def average(rows: Sequence[Mapping[str, np.ndarray]], name: str) -> float:
-    """Return the mean of one metric over rows."""
-    return float(np.mean([row[name] for row in rows]))
 
 
 SHEET_FRAMES = 6

@@ -8,12 +8,13 @@ norm is far above its running mean; a skipped update changes no weight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from einops import rearrange
 from flax import nnx
@@ -30,6 +31,10 @@ GUARD_WARMUP = 50
 """Updates before the guard compares a gradient norm with the running mean."""
 GRAD_NORM_DECAY = 0.98
 """Decay of the running mean of gradient norms, which averages over some 50 updates."""
+
+
+MAX_CONSECUTIVE_SKIPS = 3
+"""Number of updates skipped in a row at which the run stops."""
 
 
 @runtime_checkable
@@ -219,6 +224,24 @@ def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[.
         return jax.tree.map(lambda x: x / parts, total)
 
     return mean
+
+
+def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
+    """Return the means over updates, fetched from the devices at once.
+
+    Skipped updates are only counted, as `skipped_updates`.
+    """
+    fetched = jax.device_get(rows)
+    kept = [row for row in fetched if not row["consecutive_skips"]]
+    names = [name for name in fetched[0] if name != "consecutive_skips"]
+    metrics = {name: average(kept, name) for name in names if kept}
+    skipped = len(fetched) - len(kept)
+    return {**metrics, "skipped_updates": float(skipped)} if skipped else metrics
+
+
+def average(rows: Sequence[Mapping[str, np.ndarray]], name: str) -> float:
+    """Return the mean of one metric over rows."""
+    return float(np.mean([row[name] for row in rows]))
 
 
 def make_validation(

@@ -58,12 +58,20 @@ def environment() -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "system": platform.platform(),
-        "packages": {name: metadata.version(name) for name in ("egosim-jax", *PACKAGES)},
+        "packages": {name: _version(name) for name in ("egosim-jax", *PACKAGES)},
         "devices": [device.device_kind for device in jax.devices()],
         "processes": jax.process_count(),
         "cpus": os.cpu_count(),
         "commit": _commit(),
     }
+
+
+def _version(package: str) -> str | None:
+    """Return the version of a package, or None if it is not installed, as in a bundle."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _commit() -> str | None:

@@ -17,7 +17,9 @@ from egosim_jax import configs
 from egosim_jax.convert.lora import ADAPTER, read_lora
 from egosim_jax.convert.source import sources
 from egosim_jax.io import weights
+from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import CODES, Tensor, read_safetensors
+from egosim_jax.io.pickled_arrays import read_pickled_arrays
 from egosim_jax.models.lora import Delta
 from tests.fuzz.target import Mutate, Target
 
@@ -61,6 +63,11 @@ def make_pth(folder: Path) -> None:
     whole = torch.arange(12.0).reshape(3, 4)
     tree = {"model": arrays, "views": [whole, whole.T], "epoch": 3, "name": "x", "rate": 0.5}
     torch.save(tree, folder / "x.pth")
+
+
+def make_pickled(folder: Path) -> None:
+    tree = {"a": tensors()["ids"], "b": {"c": tensors()["blocks.0.w"].T, "d": [tensors()["none"]]}}
+    (folder / "x.pickle").write_bytes(pickle.dumps(tree, 3))
 
 
 def make_foreign(folder: Path) -> None:
@@ -116,6 +123,11 @@ def read_folder(folder: Path) -> dict[str, np.ndarray]:
 
 def read_sealed(folder: Path) -> dict[str, np.ndarray]:
     return arrays_of(read_safetensors(folder / "x.safetensors"))
+
+
+def read_pickled(folder: Path) -> dict[str, np.ndarray]:
+    path = folder / "x.pickle"
+    return read_pickled_arrays(path, sha256=sha256(path))
 
 
 def read_one(name: str) -> Callable[[Path], dict[str, np.ndarray]]:
@@ -283,7 +295,8 @@ def json_value(data: bytes, rng: random.Random) -> bytes:
 
 
 def in_pickle(data: bytes) -> tuple[int, int]:
-    begin = data.find(b"\x80\x02")
+    start = re.search(rb"\x80[\x02-\x05]", data)
+    begin = start.start() if start else 0
     return begin, max(data.find(b"PK", begin), begin + 1)
 
 
@@ -324,6 +337,14 @@ TARGETS: list[Target] = [
         files=("x.pth",),
         reference=theirs_pth,
         mutations=PTH,
+    ),
+    Target(
+        name="pickled-arrays",
+        make=make_pickled,
+        read=read_pickled,
+        files=("x.pickle",),
+        lossy="numbers of a pickle are as it says; the SHA-256 of the real file is known",
+        mutations=(opcode, pickled_number),
     ),
     Target(
         name="safetensors",

@@ -145,6 +145,20 @@ def _numbers() -> Any:
     return iter(grain.MapDataset.range(100).shuffle(seed=1).repeat().to_iter_dataset())
 
 
+def _make_parts(folder: Path) -> None:
+    from egosim_jax.io.parts import cut
+
+    (folder / "x.bin").write_bytes(bytes(range(256)))
+    cut([folder / "x.bin"], folder / "parts", part_bytes=100)
+    (folder / "x.bin").unlink()
+
+
+def _read_parts(folder: Path) -> Any:
+    from egosim_jax.io.parts import join
+
+    return [path.read_bytes() for path in join(folder / "parts", folder / "joined")]
+
+
 def _make_checkpoint(folder: Path) -> None:
     import jax.numpy as jnp
 
@@ -244,6 +258,14 @@ TARGETS = [
         read=_read_program,
         files=("program",),
         sealed=True,
+    ),
+    Target(
+        name="parts",
+        make=_make_parts,
+        read=_read_parts,
+        files=("parts/*",),
+        lossy="files have the names that parts.json gives them",
+        mutations=(json_value, json_line),
     ),
     Target(
         name="checkpoint",

@@ -1,0 +1,313 @@
+"""Training from a bundle (`train/bundle.py`) on a machine that has jax and little else.
+
+    cd BUNDLE
+    python -m egosim_jax.train.bundled train --out run --minutes 10
+    python -m egosim_jax.train.bundled join run/weights --out weights
+
+needs jax, flax, optax, orbax-checkpoint, einops, jaxtyping, safetensors, numpy and pillow, and no
+installation: the code is in the bundle. The first command trains for so many minutes and exits with
+code 75, saved; again, it resumes, bit for bit, and with 0 at the end. On a GPU it takes the model
+and the batches of `gpu` in `recipe.json`. Checkpoint and weights are folders of parts of at most
+16 MiB, which the second command joins, here or elsewhere.
+
+Batch k has the positions k n to k n + n - 1 of an endless sequence, each epoch of which is a
+permutation that depends on seed and epoch alone; so the state is the whole checkpoint.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import jax
+import numpy as np
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.command import CommandExit, ExitCode, run_with_exit_codes
+from egosim_jax.io import parts, weights
+from egosim_jax.io.executables import share_with_jax
+from egosim_jax.io.mapped import digest, read_safetensors
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.run import open_folder
+from egosim_jax.io.untrusted import quote_path, read_bytes, read_json
+from egosim_jax.metric_writers import JsonLines
+from egosim_jax.models.layers import init_sharded
+from egosim_jax.sharding import batch_sharding, make_mesh
+from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.update import (
+    MAX_CONSECUTIVE_SKIPS,
+    Programs,
+    TrainState,
+    average,
+    mean_metrics,
+)
+from egosim_jax.types import InputError
+
+RECIPE, FILES, LATENTS, WEIGHTS = "recipe.json", "files.json", "latents", "weights"
+"""Names in a bundle: the recipe, the SHA-256 of all files, and two folders."""
+SHARD_BYTES = 30 << 20
+"""Largest shard of latents in bytes."""
+CHECKPOINT, STATE = "checkpoint", "state.safetensors"
+"""Folder of parts with the training state, in a run folder, and the file that they are cut from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundleRecipe:
+    """Training of a bundle on one kind of machine."""
+
+    task: Denoising
+    """Networks, examples and loss."""
+    training: TrainConfig
+    """Hyper-parameters of the training."""
+    weights: Path | None
+    """Folder of weights to start from; None for random ones, as for a wider model."""
+    dtype: str
+    """Dtype of the weights that are written."""
+
+    @classmethod
+    def read(cls, bundle: Path, machine: str, *, steps: int | None = None) -> BundleRecipe:
+        """Read the recipe of a machine, `cpu` or `gpu`, with another number of updates if given."""
+        recipe = read_json(bundle / RECIPE)
+        changes = recipe[machine]
+        task = changed(Denoising(model=configs.get(recipe["config"])), recipe["task"])
+        task = replace(task, model=changed(task.model, changes.get("model", {})))
+        training = changed(TrainConfig(steps=1), recipe["training"])
+        training = changed(training, changes.get("training", {}))
+        start = bundle / WEIGHTS
+        fits = not changes.get("model") and (start / "dit.safetensors").exists()
+        return cls(
+            task=task,
+            training=replace(training, steps=steps or training.steps),
+            weights=start if fits else None,
+            dtype=recipe["dtype"],
+        )
+
+
+def changed(value: Any, changes: Mapping[str, Any]) -> Any:
+    """Return a config with fields replaced by those of a JSON object, nested ones too."""
+    known = {field.name: getattr(value, field.name) for field in fields(value)}
+    found = {}
+    for name, new in changes.items():
+        if name not in known:
+            raise InputError(f"{type(value).__name__} has no field {name}. ({RECIPE})")
+        if is_dataclass(known[name]) and isinstance(new, Mapping):
+            new = changed(known[name], new)
+        found[name] = tuple(new) if isinstance(new, list) else new
+    return replace(value, **found)
+
+
+class Latents:
+    """The records of one split of a bundle, in memory."""
+
+    def __init__(self, bundle: Path, split: str):
+        hashes = read_json(bundle / FILES)["sha256"]
+        shards = sorted((bundle / LATENTS).glob(f"{split}-*.npz"))
+        if not shards:
+            raise InputError(f"{quote_path(bundle / LATENTS)} has no shards {split}-*.npz.")
+        found = [read_shard(shard, hashes.get(str(shard.relative_to(bundle)))) for shard in shards]
+        self.arrays = {name: np.concatenate([x[name] for x in found]) for name in found[0]}
+
+    def __len__(self) -> int:
+        return len(next(iter(self.arrays.values())))
+
+    def batch(self, number: int, *, size: int, seed: int) -> dict[str, np.ndarray]:
+        """Return batch `number`, from 0, of the shuffled endless sequence."""
+        places = (divmod(p, len(self)) for p in range(number * size, (number + 1) * size))
+        return self.take(np.array([order(len(self), seed, epoch)[row] for epoch, row in places]))
+
+    def take(self, records: np.ndarray) -> dict[str, np.ndarray]:
+        """Return some records as a batch; latents, which are float16 on disk, are float32."""
+        rows = {name: array[records] for name, array in self.arrays.items()}
+        return {
+            name: row.astype(np.float32) if row.dtype == np.float16 else row
+            for name, row in rows.items()
+        }
+
+
+@lru_cache(maxsize=2)
+def order(count: int, seed: int, epoch: int) -> np.ndarray:
+    """Return the order of the records in an epoch."""
+    return np.random.default_rng([seed, epoch]).permutation(count)
+
+
+def read_shard(path: Path, sha256: str | None) -> dict[str, np.ndarray]:
+    """Read a shard of latents. Raises `InputError` if its SHA-256 is another."""
+    if digest(read_bytes(path, limit=SHARD_BYTES)) != sha256:
+        raise InputError(f"{quote_path(path)} is damaged: not the SHA-256 in {FILES}. Copy it.")
+    with np.load(path, allow_pickle=False) as shard:
+        names = shard.files
+    return read_arrays(path, {}, others=names)
+
+
+class BundleRun:
+    """A training from a bundle: its programs, its data and its folder."""
+
+    def __init__(self, bundle: Path, recipe: BundleRecipe, out: Path):
+        self.bundle, self.recipe, self.out = bundle, recipe, out
+        task, training = recipe.task, recipe.training
+        settings = {"task": task, "training": training, "dtype": recipe.dtype}
+        free = [*resume_mutable("training"), *numerics_only(task, "task")]
+        open_folder(out, settings, mutable=free)
+        self.data = {split: Latents(bundle, split) for split in ("train", "test")}
+        self.mesh = make_mesh(training.mesh)
+        self.sharding = batch_sharding(self.mesh)
+        self.programs = Programs.of(task, training, self.mesh)
+        self.frozen = self.programs.frozen  # empty: the denoiser and its encoders are trained
+
+    def start(self) -> TrainState:
+        """Return the state of the checkpoint, or the initial one."""
+        programs, sharding = self.programs, self.programs.state_sharding
+        if (self.out / CHECKPOINT).exists():
+            return self._restore()
+        loaded = None
+        if self.recipe.weights is not None:
+            params = programs.state.params
+            loaded = weights.place(self.recipe.weights, params, sharding.params)
+        return init_sharded(partial(programs.create, loaded), out_shardings=sharding)
+
+    def train(self, state: TrainState, *, until: float) -> TrainState:
+        """Update until the end, or until a time of `time.monotonic`, and save."""
+        training, step = self.recipe.training, int(state.step)
+        log = JsonLines(self.out / "metrics.jsonl", resume_after=step)
+        rate = learning_rate(training.optimizer, training.steps)
+        pending: list[Mapping[str, jax.Array]] = []
+        began = time.monotonic()
+        while step < training.steps:
+            batch = self.data["train"].batch(step, size=training.batch_size, seed=training.seed)
+            state, metrics = self.programs.update(state, self.frozen, self._to_devices(batch))
+            step += 1
+            if pending:
+                jax.block_until_ready(pending[-1])  # one update runs while the next is prepared
+            pending.append(metrics)
+            last = step == training.steps or time.monotonic() > until
+            if last or step % training.log_every == 0:
+                means = mean_metrics(pending)
+                seconds = (time.monotonic() - began) / len(pending)
+                values = {**means, "lr": float(np.asarray(rate(step - 1))), "step_time_s": seconds}
+                self._log(log, step, values)
+                _check_skips(metrics)
+                pending, began = [], time.monotonic()
+            if last or step % training.validate_every == 0:
+                self._log(log, step, self._validate(state))
+            if last or step % training.save_every == 0:
+                self.save(state)
+            if last:
+                break
+        return state
+
+    def save(self, state: TrainState) -> None:
+        """Write the state and the weights, each as a folder of parts."""
+        with TemporaryDirectory(dir=self.out) as folder:
+            path = Path(folder) / STATE
+            weights.write(path, {name: np.asarray(leaf) for name, leaf in _named(state)})
+            parts.cut([path], self.out / CHECKPOINT)
+        networks = nnx.merge(self.programs.graph, state.eval_params, self.frozen)
+        with TemporaryDirectory(dir=self.out) as folder:
+            networks.save(Path(folder), dtype=self.recipe.dtype)
+            vae = self.bundle / WEIGHTS / "vae.safetensors"
+            parts.cut([*sorted(Path(folder).glob("*.safetensors")), vae], self.out / WEIGHTS)
+
+    def _restore(self) -> TrainState:
+        with TemporaryDirectory(dir=self.out) as folder:
+            (path,) = parts.join(self.out / CHECKPOINT, Path(folder))
+            tensors = read_safetensors(path)
+            shapes = {name: tuple(leaf.shape) for name, leaf in _named(self.programs.state)}
+            if problems := weights.mismatches(tensors, shapes):
+                raise weights.WeightsError(problems, source=str(self.out / CHECKPOINT))
+            arrays = [np.array(tensors[name].array()) for name in shapes]
+        state = jax.tree.unflatten(jax.tree.structure(self.programs.state), arrays)
+        return jax.device_put(state, self.programs.state_sharding)
+
+    def _validate(self, state: TrainState) -> dict[str, float]:
+        test, size = self.data["test"], self.recipe.training.batch_size
+        count = max(1, len(test) // size)
+        rows = [
+            jax.device_get(self.programs.validate(state.eval_params, self.frozen, batch))
+            for batch in (
+                self._to_devices(test.take(np.arange(n * size, (n + 1) * size) % len(test)))
+                for n in range(count)
+            )
+        ]
+        return {f"validation_{name}": average(rows, name) for name in rows[0]}
+
+    def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
+        return {name: jax.device_put(value, self.sharding) for name, value in batch.items()}
+
+    def _log(self, log: JsonLines, step: int, values: Mapping[str, float]) -> None:
+        log.write(step, values)
+        numbers = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
+        print(f"step {step:>6}  {numbers}", file=sys.stderr, flush=True)
+
+
+def _named(state: Any) -> list[tuple[str, Any]]:
+    """Return the arrays of a training state by their paths."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    return [(jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
+
+
+def _check_skips(metrics: Mapping[str, jax.Array]) -> None:
+    """Stop the run if several updates in a row were skipped."""
+    if (count := int(metrics["consecutive_skips"])) >= MAX_CONSECUTIVE_SKIPS:
+        raise CommandExit(
+            f"{count} updates in a row were skipped, so the run stops. The checkpoint is older: "
+            "lower the learning rate.",
+            ExitCode.FAILED,
+        )
+
+
+def train(bundle: Path, out: Path, *, machine: str, minutes: float, steps: int | None) -> int:
+    """Train for some minutes, compilation included, and return the exit code."""
+    until = time.monotonic() + 60 * minutes
+    recipe = BundleRecipe.read(bundle, machine, steps=steps)
+    run = BundleRun(bundle, recipe, out)
+    with jax.set_mesh(run.mesh):
+        state = run.start()
+        total = recipe.training.steps
+        verb = f"step {int(state.step)} of {total}, {machine}, {jax.devices()[0].device_kind}"
+        print(f"{out}: {verb}", file=sys.stderr, flush=True)
+        state = run.train(state, until=until)
+    done = int(state.step) == total
+    print(f"{out}: step {int(state.step)} of {total} saved", file=sys.stderr)
+    return ExitCode.DONE if done else ExitCode.RESUBMIT
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Parse the command line and run it; without tyro, which a bare machine lacks."""
+    parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.bundled")
+    commands = parser.add_subparsers(dest="command", required=True)
+    training = commands.add_parser("train", help="train from the bundle, or resume")
+    training.add_argument("--bundle", type=Path, default=Path(), help="folder of the bundle")
+    training.add_argument("--out", type=Path, required=True, help="folder of the run")
+    training.add_argument("--minutes", type=float, default=10.0, help="stop after so many, saved")
+    training.add_argument("--machine", choices=("cpu", "gpu"), help="recipe, if not the backend's")
+    training.add_argument("--steps", type=int, help="updates in all, if not the recipe's")
+    joining = commands.add_parser("join", help="join a folder of parts")
+    joining.add_argument("parts", type=Path, help="folder of parts")
+    joining.add_argument("--out", type=Path, required=True, help="folder of the joined files")
+    given = parser.parse_args(args)
+
+    def run() -> int:
+        if given.command == "join":
+            for path in parts.join(given.parts, given.out):
+                print(path)
+            return ExitCode.DONE
+        share_with_jax()
+        machine = given.machine or ("cpu" if jax.default_backend() == "cpu" else "gpu")
+        return train(
+            given.bundle, given.out, machine=machine, minutes=given.minutes, steps=given.steps
+        )
+
+    return run_with_exit_codes(run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
