@@ -202,7 +202,7 @@ class Lora:
     """
 
     source: Annotated[Path, tyro.conf.Positional]
-    """LoRA file, or PEFT's folder of one."""
+    """LoRA file, or folder of one with PEFT's config or with weights in full (DWM's)."""
     config: str
     """Name of the model that it is for."""
     out: Path

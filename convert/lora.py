@@ -7,6 +7,9 @@ files, underscores, and then the role of the tensor: `lora_A` or `lora_down`, `l
 an alpha it is the rank, unless PEFT's `adapter_config.json` or the file's header has one. Files are
 written in the naming that has a `lora_prefix`, with an alpha for each layer, and rank, alpha and
 the hash of the base weights in the header.
+
+A folder may also have weights that were trained in full, in a file `non_lora_weights`: DWM's, whose
+patch projection replaces that of its base.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from egosim_jax.models.lora import (
     MOST_RANK,
     Change,
     Delta,
+    Value,
     check,
     from_tensors,
     misfit,
@@ -57,6 +61,8 @@ LOW_RANK = {
 """Role of a low-rank tensor by the suffix of its name."""
 FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
 """Weight that a full difference is added to by the suffix of its name."""
+IN_FULL = "non_lora_weights"
+"""Stem of the file, next to a LoRA, of weights that replace those of the base."""
 SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
 ADAPTER, ADAPTER_ENTRY = "adapter_config.json", "lora_adapter_metadata"
 """Settings of PEFT: file next to the weights, and diffusers' entry in a header."""
@@ -102,12 +108,12 @@ class Settings:
 def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
     """Return the changes of a LoRA by path, in float32; files in our format have the same paths.
 
-    `path` is a file, or PEFT's folder of one with its config. Missing blocks are 0, and ranks lower
-    than the highest of a stack are padded with 0. Layers of a text encoder are skipped with a
-    message. Raises `InputError` listing every tensor that is not of the network or does not fit,
-    and every value that is not finite.
+    `path` is a file, or a folder of one with PEFT's config or weights in full. Missing blocks are
+    0, and ranks lower than the highest of a stack are padded with 0. Layers of a text encoder are
+    skipped with a message. Raises `InputError` listing every tensor that is not of the network or
+    does not fit, and every value that is not finite.
     """
-    source = _only(path)
+    source, in_full = _found(path)
     want = weight_shapes(config)
     metadata = metadata_of(source.files[0])
     if metadata.get("format") == OURS:
@@ -119,6 +125,8 @@ def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
     else:
         with np.errstate(over="ignore", invalid="ignore"):  # `check` refuses values not finite
             changes = _translated(source, config, want, _settings(path, metadata))
+    if in_full is not None:
+        changes |= _values(in_full, config, want)
     if not changes:
         raise InputError(f"{quote_path(path)} has no layers of this network. (--lora)")
     check(want, changes)
@@ -132,7 +140,7 @@ def metadata_of(file: Path) -> dict[str, str]:
 
 def check_base(path: Path, known: Collection[str]) -> None:
     """Raise `InputError` if a LoRA's header names base weights of another hash."""
-    base = metadata_of(_only(path).files[0]).get(BASE)
+    base = metadata_of(_found(path)[0].files[0]).get(BASE)
     if base is not None and base not in known:
         raise InputError(
             f"{quote_path(path)} was trained on other weights: their {BASE} is "
@@ -141,13 +149,40 @@ def check_base(path: Path, known: Collection[str]) -> None:
         )
 
 
-def _only(path: Path) -> Source:
+def _found(path: Path) -> tuple[Source, Source | None]:
+    """Return the LoRA of a file or folder, and the weights in full next to it, if any."""
     found = list(sources(path))
-    if len(found) != 1:
+    in_full = [source for source in found if source.files[0].stem == IN_FULL]
+    low_rank = [source for source in found if source not in in_full]
+    if len(low_rank) != 1 or len(in_full) > 1:
         raise InputError(
-            f"{quote_path(path)} holds {len(found)} weight files; expected one. (--lora)"
+            f"{quote_path(path)} holds {len(found)} weight files; expected one, and at most one "
+            f"{IN_FULL}. (--lora)"
         )
-    return found[0]
+    return low_rank[0], in_full[0] if in_full else None
+
+
+def _values(
+    source: Source, config: NetworkConfig, want: Mapping[str, tuple[int, ...]]
+) -> dict[str, Change]:
+    """Return the weights in full of a file by path."""
+    known = _locations(config, want, PREFIXES)
+    changes: dict[str, Change] = {}
+    problems = []
+    for key, tensor in source.tensors.items():
+        location = known.get(_plain(key, PREFIXES))
+        if location is None or location.layer is not None:
+            problems.append(f"{key}: not a weight of this network outside its blocks")
+            continue
+        try:
+            array = location.rule.to_jax(tensor.array()).astype(np.float32)
+        except (EinopsError, ValueError):
+            problems.append(f"{key}: has shape {tensor.shape}; expected {want[location.target]}")
+            continue
+        changes[location.target] = Value(array=array)
+    if problems:
+        raise InputError(f"{source.name} does not fit this network: {listing(problems)}.")
+    return changes
 
 
 def _settings(path: Path, metadata: Mapping[str, str]) -> Settings:
@@ -317,6 +352,11 @@ def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, 
     naming = next((naming for naming in namings if naming.lora_prefix is not None), None)
     if naming is None:
         raise InputError(f"{config.table} has no naming of LoRA files.")
+    if values := [path for path, change in changes.items() if isinstance(change, Value)]:
+        raise InputError(
+            f"{listing(values)} replace weights of the base, which a LoRA file cannot: merge them "
+            "into it. (--merge)"
+        )
     tensors, prefix = {}, naming.lora_prefix
     suffixes = {kind: suffix for suffix, kind in FULL.items()}
     known = _by_name(naming.rules(config), weight_shapes(config))

@@ -118,6 +118,10 @@ def merged(
             added.append(low_rank.down[at] @ low_rank.up[at])
         if isinstance(full, np.ndarray):
             added.append(full[at])
+        elif isinstance(full, lora.Value):
+            if scale == 1:
+                return full.array[at]
+            added.append(full.array[at] - weight.astype(np.float32))
         return weight.astype(np.float32) + scale * sum(added) if added else weight
 
     table = table_of(config)

@@ -164,6 +164,7 @@ TABLE = Table(
             layout="diffusers",
             folder="transformer",
             stem="diffusion_pytorch_model",
+            lora_prefix="transformer.",
         ),
     },
     reference=Reference(

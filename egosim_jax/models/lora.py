@@ -31,8 +31,8 @@ from egosim_jax.types import InputError
 T = TypeVar("T")
 BASE = "base_sha256"
 """Metadata key of the hash of the weights that the LoRA was trained on."""
-DIFF = ".diff"
-"""End of the name of a change to a weight in full, in a file."""
+DIFF, VALUE = ".diff", ".value"
+"""Ends of the names of a change to a weight in full and of its new value, in a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +45,16 @@ class Delta:
     """Matrix B, multiplied by alpha / r."""
 
 
-Change = Delta | np.ndarray
-"""Low-rank change of the linear layer at a path, or difference of the weight at a path in full."""
+@dataclass(frozen=True, kw_only=True)
+class Value:
+    """Value in full that replaces a weight, such as DWM's patch projection."""
+
+    array: np.ndarray
+    """New value of the weight."""
+
+
+Change = Delta | Value | np.ndarray
+"""Low-rank change of the linear layer at a path, or value or difference of the weight at a path."""
 MOST_RANK = 2048
 """Highest rank that is read; with the network's own widths it bounds the memory."""
 
@@ -73,7 +81,8 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
     for path, change in changes.items():
         if not isinstance(change, Delta):
             value = weights[path].get_value()
-            weights[path].set_value((value + scale * jnp.asarray(change)).astype(value.dtype))
+            full = change.array - value if isinstance(change, Value) else jnp.asarray(change)
+            weights[path].set_value((value + scale * full).astype(value.dtype))
     nnx.update(network, state)
     for path, change in changes.items():
         if isinstance(change, Delta):
@@ -102,11 +111,13 @@ def full_weights(network: Any, patterns: Sequence[str]) -> dict[str, Any]:
 
 
 def tensors(changes: Mapping[str, Change]) -> dict[str, np.ndarray]:
-    """Return changes as the tensors of a file: a layer's path with `down` or `up`, or `diff`."""
+    """Return changes as a file's tensors: a path with `down` and `up`, `diff` or `value`."""
     named = {}
     for path, change in changes.items():
         if isinstance(change, Delta):
             named |= {f"{path}.down": change.down, f"{path}.up": change.up}
+        elif isinstance(change, Value):
+            named[f"{path}{VALUE}"] = change.array
         else:
             named[f"{path}{DIFF}"] = change
     return named
@@ -116,15 +127,20 @@ def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Change]:
     """Return the changes of a file's tensors. Raises `InputError` naming incomplete pairs."""
     low = {path: Delta(down=down, up=up) for path, (down, up) in pairs(tensors).items()}
     full = {n.removesuffix(DIFF): tensor for n, tensor in tensors.items() if n.endswith(DIFF)}
-    return {**low, **full}
+    values = {
+        name.removesuffix(VALUE): Value(array=tensor)
+        for name, tensor in tensors.items()
+        if name.endswith(VALUE)
+    }
+    return {**low, **full, **values}
 
 
 def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
     """Return the tensors named `down` and `up` by path.
 
-    Raises `InputError` naming incomplete pairs; names that end with `diff` are skipped.
+    Raises `InputError` naming incomplete pairs; those of weights in full are skipped.
     """
-    names = {name for name in tensors if not name.endswith(DIFF)}
+    names = {name for name in tensors if not name.endswith((DIFF, VALUE))}
     paths = sorted({name.rpartition(".")[0] for name in names})
     both = {name for path in paths for name in (f"{path}.down", f"{path}.up")}
     if odd := sorted(both ^ names):
@@ -200,9 +216,9 @@ def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) 
             why = misfit(shapes, path, change.down.shape, change.up.shape)
             arrays = (change.down, change.up)
         else:
-            arrays, want = (change,), shapes.get(path)
-            mismatch = f"has shape {change.shape}; expected {want}"
-            why = mismatch if change.shape != want else None
+            full = change.array if isinstance(change, Value) else change
+            arrays, want = (full,), shapes.get(path)
+            why = None if full.shape == want else f"has shape {full.shape}; expected {want}"
         if why is None and not all(np.isfinite(array).all() for array in arrays):
             why = "has values that are not finite"
         if why is not None:
