@@ -128,7 +128,7 @@ def _best(
     """Return the accepted motion of least cost among the candidates of one hand."""
     best: ObjectMotion | None = None
     for number in _near_tips(joints_m, action.kind, state, config):
-        model = _object_model(number, state, config)
+        model = object_model(number, state, config)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
         still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
@@ -159,7 +159,7 @@ def _near_tips(
     return near
 
 
-def _object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
+def object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
     """Return the model of an object; without a surface around it, its plane faces up."""
     own = state.object_ids == number
     points = state.points_m[own].astype(float)

@@ -26,6 +26,7 @@ from egosim_jax.types import InputError
 C = TypeVar("C", bound=type)
 _MODULES = {
     "classical": "egosim_jax.perception.classical",
+    "networks": "egosim_jax.perception.networks.closed_loop",
     "oracle": "egosim_jax.perception.oracle",
     "recorded": "egosim_jax.perception.recorded",
 }

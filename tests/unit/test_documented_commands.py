@@ -18,6 +18,7 @@ DOCUMENTS = [
     "docs/train.md",
     "docs/gpu.md",
     "docs/video.md",
+    "docs/networks.md",
     "egosim_jax/weights/tabletop/README.md",
 ]
 RECIPES = [ROOT / "train" / "recipes.py"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from egosim_jax.perception.object_motion import TrackObjects, _object_model, _support_plane
+from egosim_jax.perception.object_motion import TrackObjects, _support_plane, object_model
 from egosim_jax.types import SceneState
 
 
@@ -32,6 +32,6 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
         intrinsics_px=np.eye(3),
         provenance=provenance,
     )
-    plane = _object_model(1, state, TrackObjects()).plane
+    plane = object_model(1, state, TrackObjects()).plane
     np.testing.assert_array_equal(plane[:3], up)
     assert np.isnan(plane[3])

@@ -63,7 +63,9 @@ def test_the_oracle_needs_ground_truth(ground_truth):
 
 @pytest.mark.parametrize("text", ["clasical", "", "nowhere_to_be_found:mine"])
 def test_an_unknown_pipeline_is_named_with_those_that_exist(text):
-    with pytest.raises(InputError, match=r"classical, oracle, recorded|cannot be imported"):
+    with pytest.raises(
+        InputError, match=r"classical, networks, oracle, recorded|cannot be imported"
+    ):
         registry.parse(text)
 
 

@@ -1,0 +1,124 @@
+"""Depth Anything 3: depth of many views at once, consistent with each other and given cameras.
+
+Checkpoints: depth-anything/DA3-SMALL and DA3-BASE (Apache-2.0), DA3-LARGE, DA3-GIANT and
+DA3NESTED-GIANT-LARGE-1.1 (CC BY-NC 4.0), of which the last one is in meters. Its package demands
+an old NumPy and is installed without its dependencies: see docs/networks.md. Source: Lin et al.,
+Depth Anything 3, 2025.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from egosim_jax.geometry import invert
+from egosim_jax.io.untrusted import quote, quote_path
+from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
+from egosim_jax.perception.networks.checkpoint import Network, check_device
+from egosim_jax.perception.networks.child import Run
+from egosim_jax.types import InputError, check_counts
+
+MIN_VIEWS = 2
+"""Fewest views from which the scale of given cameras is found."""
+
+
+@dataclass(frozen=True)
+class DepthAnything3(Network):
+    """Multi-view depth by Depth Anything 3; a `DepthEstimator`."""
+
+    needs: ClassVar[str] = "Depth Anything 3 (depth-anything/DA3*)"
+    packages: ClassVar[tuple[str, ...]] = ("torch", "torchvision", "depth_anything_3")
+    install: ClassVar[str] = (
+        "pip install 'egosim-jax[networks]' torchvision einops omegaconf addict && pip install "
+        "--no-deps depth-anything-3 (docs/networks.md)"
+    )
+
+    _: KW_ONLY
+    context: int = 8
+    """Frames of the video that are seen besides the wanted ones, evenly spaced."""
+    resolution_px: int = 504
+    """Longer side of the images that the network sees, in pixels."""
+
+    def __post_init__(self) -> None:
+        """Check the folder, and that sizes and numbers are positive."""
+        super().__post_init__()
+        check_counts({"context": self.context, "resolution_px": self.resolution_px})
+
+    def check_config(self, config: Mapping[str, Any]) -> None:
+        """Raise `InputError` unless the config names a model of Depth Anything 3."""
+        name = config.get("model_name")
+        if not (isinstance(name, str) and name.startswith("da3")):
+            found = quote(config.get("model_type", name))
+            raise InputError(
+                f"{quote_path(self.folder)} is a checkpoint of {found}: {self.needs} needs a "
+                "config.json with a model_name such as da3nested-giant-large. Give its folder."
+            )
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        moving: Bool[np.ndarray, "f h w"],
+        estimate: CameraEstimate,
+        wanted: Sequence[int],
+    ) -> DepthEstimate:
+        """Return depth of the wanted frames, in the unit of the cameras if they move.
+
+        Without cameras, or with those of a single place, it is in the network's unit: meters if
+        the checkpoint is a metric one.
+        """
+        chosen = np.asarray(wanted, np.int32)
+        context = np.linspace(0, len(frames) - 1, min(self.context, len(frames))).astype(int)
+        views = np.unique([*chosen, *context])
+        arrays = {"frames": frames[views]}
+        aligned = estimate.cameras is not None and _moves(estimate, views)
+        if estimate.cameras is not None and aligned:
+            poses = estimate.cameras.world_from_camera[views]
+            arrays["extrinsics"] = invert(poses).astype(np.float32)
+            matrix = estimate.cameras.intrinsics_px.astype(np.float32)
+            arrays["intrinsics"] = np.repeat(matrix[None], len(views), axis=0)
+        found, about = self.ask(arrays, resolution_px=self.resolution_px)
+        depth = found["depth"][np.searchsorted(views, chosen)]
+        valid = np.isfinite(depth) & (depth > 0)
+        return DepthEstimate(
+            frames=chosen,
+            depth_m=np.where(valid, depth, np.inf).astype(np.float32),
+            confident=valid,
+            metric=estimate.metric if aligned else bool(about["metric"]),
+        )
+
+
+def _moves(estimate: CameraEstimate, views: np.ndarray) -> bool:
+    """Return whether the cameras of some views are at different places."""
+    if estimate.cameras is None or len(views) < MIN_VIEWS:
+        return False
+    centers = estimate.cameras.world_from_camera[views, :3, 3]
+    return bool(np.ptp(centers, axis=0).max() > 1e-6)
+
+
+def load(folder: str, device: str, dtype: str) -> Run:
+    """Load the network in a worker; its package chooses the precision."""
+    import torch
+    from torch.nn.functional import interpolate
+
+    program = importlib.import_module("depth_anything_3.api").DepthAnything3
+    network = program.from_pretrained(folder, local_files_only=True, strict=True)
+    network = network.to(check_device(device)).eval()
+
+    def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
+        size = arrays["frames"].shape[1:3]
+        found = network.inference(
+            list(arrays["frames"]),
+            extrinsics=arrays.get("extrinsics"),
+            intrinsics=arrays.get("intrinsics"),
+            process_res=options["resolution_px"],
+        )
+        maps = torch.from_numpy(np.asarray(found.depth, np.float32))[:, None]
+        maps = interpolate(maps, size=size, mode="bilinear", align_corners=False)[:, 0]
+        return {"depth": maps.numpy()}, {"metric": bool(found.is_metric)}
+
+    return run

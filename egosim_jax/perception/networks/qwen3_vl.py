@@ -1,0 +1,171 @@
+"""Qwen3-VL: a caption of a video, and the names of the objects that the wearer moves.
+
+Checkpoints: Qwen/Qwen3-VL-2B-Instruct, -4B- and -8B- (Apache-2.0). Key frames are shown as images,
+because the processor of videos needs torchvision. Source: Qwen team, Qwen3-VL technical report,
+2025.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.worker import NetworkError
+from egosim_jax.state.filter import is_hand
+from egosim_jax.types import InputError, check_counts
+
+MAX_CAPTION = 600
+"""Longest caption in characters."""
+MAX_NAMES, MAX_NAME = 12, 40
+"""Most names of objects, and the longest one in characters."""
+PROMPT = (
+    "These are {count} frames, in order, of a video that a person recorded with a camera on the "
+    "head. Describe in one or two sentences what the hands do, with which objects, and where. Then "
+    "name each object that the hands touch or move, as short as is unambiguous (color and noun). "
+    'Reply with JSON only: {{"caption": "...", "objects": ["...", "..."]}}'
+)
+IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
+TURN = "<|im_start|>user\n{content}<|im_end|>\n<|im_start|>assistant\n"
+"""Chat template of the instruction-tuned checkpoints, for one turn of the user."""
+PAD = "<|image_pad|>"
+ARTICLE = re.compile(r"^(a|an|the|some)\s+")
+
+
+@dataclass(frozen=True)
+class Qwen3VL(Network):
+    """Captions and names of objects by Qwen3-VL; a `Captioner`."""
+
+    needs: ClassVar[str] = "Qwen3-VL (Qwen/Qwen3-VL-4B-Instruct)"
+    model_types: ClassVar[tuple[str, ...]] = ("qwen3_vl",)
+    files: ClassVar[tuple[str, ...]] = ("preprocessor_config.json", "tokenizer_config.json")
+
+    _: KW_ONLY
+    images: int = 8
+    """Frames that are shown, evenly spaced."""
+    max_new_tokens: int = 256
+    """Longest reply in tokens."""
+    prompt: str = PROMPT
+    """Question; {count} is the number of frames."""
+
+    def __post_init__(self) -> None:
+        """Check the folder and that the numbers are positive."""
+        super().__post_init__()
+        check_counts({"images": self.images, "max_new_tokens": self.max_new_tokens})
+
+    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> tuple[str, tuple[str, ...]]:
+        """Return the caption and the names of moved objects.
+
+        Raises `NetworkError` for a reply that has no caption.
+        """
+        return parse_reply(self.reply(frames))
+
+    def reply(self, frames: UInt8[np.ndarray, "f h w 3"]) -> str:
+        """Return the network's reply to the question about a video, as it is."""
+        count = min(self.images, len(frames))
+        chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
+        try:
+            question = self.prompt.format(count=count)
+        except (KeyError, IndexError, ValueError) as error:
+            raise InputError(
+                f"The question cannot be filled in: {error!r}. Only {{count}} is replaced; write "
+                "other braces twice. (--prompt)"
+            ) from error
+        _, text = self.ask(
+            {"frames": frames[chosen]}, question=question, max_new_tokens=self.max_new_tokens
+        )
+        return text
+
+
+def parse_reply(text: str) -> tuple[str, tuple[str, ...]]:
+    """Return the caption and the names of objects in a reply, both bounded and on one line each.
+
+    Names are in lower case without articles, each once, and none is of hands. Raises
+    `NetworkError` if the reply has no caption.
+    """
+    found = _json_object(text)
+    caption = found.get("caption")
+    if not isinstance(caption, str) or not (caption := _one_line(caption, MAX_CAPTION)):
+        raise NetworkError(
+            f"Qwen3-VL replied without a caption: {_one_line(text, 200)!r}. Give a caption "
+            "(--caption), or use a larger checkpoint."
+        )
+    objects = found.get("objects")
+    names = [n for n in objects if isinstance(n, str)] if isinstance(objects, list) else []
+    clean = [ARTICLE.sub("", _one_line(name, MAX_NAME).lower()).strip(" .") for name in names]
+    kept = [name for name in dict.fromkeys(clean) if name and not is_hand(name)]
+    return caption, tuple(kept[:MAX_NAMES])
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    """Return the first JSON object in a text that has a caption; empty if there is none."""
+    decoder = json.JSONDecoder()
+    for start in (match.start() for match in re.finditer(r"\{", text)):
+        try:
+            value, _ = decoder.raw_decode(text, start)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(value, dict) and "caption" in value:
+            return value
+    return {}
+
+
+def _one_line(text: str, limit: int) -> str:
+    """Return text on one line without unprintable characters, cut at a word within a limit."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return line if len(line) <= limit else line[:limit].rpartition(" ")[0] or line[:limit]
+
+
+def load(folder: str, device: str, dtype: str) -> Run:
+    """Load the network, its image processor and its tokenizer in a worker."""
+    import torch
+    from transformers import (
+        Qwen2Tokenizer,
+        Qwen2VLImageProcessorPil,
+        Qwen3VLForConditionalGeneration,
+    )
+
+    network: Any = load_network(
+        Qwen3VLForConditionalGeneration, Path(folder), device=device, dtype=dtype
+    )
+    processor = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
+    tokenizer: Any = Qwen2Tokenizer.from_pretrained(folder, local_files_only=True)
+
+    def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
+        images: Any = processor(images=list(arrays["frames"]), return_tensors="pt")
+        grid = images["image_grid_thw"]
+        tokens = (grid.prod(dim=1) // processor.merge_size**2).tolist()
+        text = tokenizer(chat(options["question"], tokens), return_tensors="pt")
+        pad = tokenizer.convert_tokens_to_ids(PAD)
+        inputs = {
+            "input_ids": text["input_ids"],
+            "attention_mask": text["attention_mask"],
+            "mm_token_type_ids": (text["input_ids"] == pad).int(),
+            "pixel_values": images["pixel_values"].to(network.dtype),
+            "image_grid_thw": grid,
+        }
+        with torch.inference_mode():
+            output = network.generate(
+                **{name: value.to(device) for name, value in inputs.items()},
+                max_new_tokens=options["max_new_tokens"],
+                do_sample=False,
+            )
+        new = output[:, text["input_ids"].shape[1] :]
+        return {}, tokenizer.batch_decode(new, skip_special_tokens=True)[0]
+
+    return run
+
+
+def chat(question: str, image_tokens: Sequence[int]) -> str:
+    """Return the text of one turn: images, each of so many tokens, and a question about them."""
+    shown = "".join(IMAGE.replace(PAD, count * PAD) for count in image_tokens)
+    clean = question.replace("<|", "< |")  # a question does not end its turn
+    return TURN.format(content=shown + clean)

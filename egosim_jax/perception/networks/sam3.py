@@ -1,0 +1,157 @@
+"""SAM 3: masks of all that phrases name, followed through a video, by one network.
+
+Checkpoint: facebook/sam3 (SAM license; access on request). Its processor needs torchvision, and
+its suppression of duplicates a compiled kernel from a hub; both are done here. Source: Carion et
+al., SAM 3: Segment Anything with Concepts, 2025.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Int32, UInt8
+
+from egosim_jax.perception.estimates import HandTracks
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.grounding_dino import clean_phrases
+from egosim_jax.perception.networks.pixels import PixelSettings
+from egosim_jax.perception.networks.tracking import SAM3_PIXELS, PreparedFrames
+from egosim_jax.state.filter import is_hand
+
+if TYPE_CHECKING:
+    import torch
+
+MAX_TOKENS = 32
+"""Length of a phrase in tokens, as the network was trained."""
+
+
+@dataclass(frozen=True)
+class Sam3(Network):
+    """Segmentation and tracking of what phrases name by SAM 3; a `Segmenter`."""
+
+    needs: ClassVar[str] = "SAM 3 (facebook/sam3)"
+    model_types: ClassVar[tuple[str, ...]] = ("sam3_video",)
+    files: ClassVar[tuple[str, ...]] = ("tokenizer_config.json",)
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        phrases: Sequence[str],
+        hands: HandTracks | None = None,
+    ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
+        """Return instance ids and their names; those of phrases for hands and arms are negative.
+
+        Known hands are not used: the network takes phrases.
+        """
+        phrases = clean_phrases(phrases)
+        found, instances = self.ask({"frames": frames}, phrases=phrases)
+        names = {
+            (-1 if is_hand(phrase) else 1) * number: phrase
+            for number, phrase in enumerate(instances, start=1)
+        }
+        signs = np.array([0, *(np.sign(number) for number in names)], np.int32)
+        return found["labels"] * signs[found["labels"]], names
+
+
+def load(folder: str, device: str, dtype: str) -> Run:
+    """Load the network and its tokenizer in a worker."""
+    import torch
+    from transformers import CLIPTokenizer, Sam3VideoInferenceSession, Sam3VideoModel
+    from transformers.models.sam3_video import modeling_sam3_video
+
+    modeling_sam3_video.cv_utils_kernel = MaskTools()
+    network: Any = load_network(Sam3VideoModel, Path(folder), device=device, dtype=dtype)
+    tokenizer: Any = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
+    pixels = PixelSettings.read(Path(folder), SAM3_PIXELS)
+
+    def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
+        frames = arrays["frames"]
+        height, width = frames.shape[1:3]
+        session: Any = Sam3VideoInferenceSession(
+            video_height=height,
+            video_width=width,
+            inference_device=device,
+            inference_state_device=device,
+            dtype=network.dtype,
+        )
+        session.processed_frames = PreparedFrames(frames, pixels, network.dtype)
+        for phrase in options["phrases"]:
+            number = session.add_prompt(phrase)
+            text = tokenizer(
+                phrase, return_tensors="pt", padding="max_length", max_length=MAX_TOKENS,
+                truncation=True,
+            ).to(device)  # fmt: skip
+            session.prompt_input_ids[number] = text["input_ids"]
+            session.prompt_attention_masks[number] = text["attention_mask"]
+        labels = np.zeros(frames.shape[:3], np.int32)
+        numbers: dict[int, int] = {}
+        phrase_of: dict[int, str] = {}
+        with torch.inference_mode():
+            for output in network.propagate_in_video_iterator(session):
+                for found, mask in visible_masks(output, session, (height, width)):
+                    label = numbers.setdefault(found, len(numbers) + 1)
+                    labels[output.frame_idx][mask] = label
+                for found, prompt in session.obj_id_to_prompt_id.items():
+                    phrase_of[found] = session.prompts[prompt]  # forgotten once it is removed
+        return {"labels": labels}, [phrase_of[number] for number in numbers]
+
+    return run
+
+
+def visible_masks(output: Any, session: Any, size: tuple[int, int]) -> list[tuple[int, np.ndarray]]:
+    """Return the objects of a frame and their masks `h w`, those that cover others last.
+
+    Objects that the network suppressed are left away; where masks overlap, the one with the larger
+    score of the tracker counts.
+    """
+    from torch.nn.functional import interpolate
+
+    hidden = {*(output.suppressed_obj_ids or ()), *session.hotstart_removed_obj_ids}
+    scores = output.obj_id_to_tracker_score or {}
+    found = []
+    for number in sorted(output.obj_id_to_mask, key=lambda n: (float(scores.get(n, 0.0)), n)):
+        if number not in hidden:
+            logits = output.obj_id_to_mask[number][None].float()
+            mask = interpolate(logits, size=size, mode="bilinear", align_corners=False)[0, 0] > 0
+            if mask.any():
+                found.append((number, mask.cpu().numpy()))
+    return found
+
+
+class MaskTools:
+    """The two functions of the kernel that SAM 3's postprocessing looks for, on the CPU."""
+
+    @staticmethod
+    def generic_nms(
+        ious: torch.Tensor, scores: torch.Tensor, threshold: float, *, use_iou_matrix: bool
+    ) -> torch.Tensor:
+        """Return the indices of the detections that none of a larger score overlaps too much."""
+        import torch
+
+        kept: list[int] = []
+        overlaps = ious.cpu().numpy()
+        for index in torch.argsort(scores, descending=True, stable=True).tolist():
+            if not kept or overlaps[index, kept].max() <= threshold:
+                kept.append(index)
+        return torch.tensor(kept, dtype=torch.long, device=ious.device)
+
+    @staticmethod
+    def cc_2d(masks: torch.Tensor, *, get_counts: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return label and area in pixels of the connected component at each pixel of each mask."""
+        import cv2
+        import torch
+
+        labels = np.zeros(masks.shape, np.int32)
+        areas = np.zeros(masks.shape, np.int32)
+        for place in np.ndindex(*masks.shape[:-2]):
+            found: Any = cv2.connectedComponentsWithStats(
+                masks[place].cpu().numpy(), connectivity=8
+            )
+            labels[place] = found[1]
+            areas[place] = np.where(found[1] > 0, found[2][:, cv2.CC_STAT_AREA][found[1]], 0)
+        return torch.from_numpy(labels).to(masks.device), torch.from_numpy(areas).to(masks.device)

@@ -1,0 +1,172 @@
+"""Tracking of objects through a video from boxes in one frame, by networks of the SAM family.
+
+Checkpoints: yonigozlan/EdgeTAM-hf and facebook/sam2.1-hiera-tiny to -large (Apache-2.0),
+facebook/sam3 (SAM license; access on request). Sources: Zhou et al., EdgeTAM, 2025; Ravi et al.,
+SAM 2, 2024; Carion et al., SAM 3, 2025.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Int32, UInt8
+
+from egosim_jax.perception.networks.checkpoint import CONFIG, Network, load_network
+from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.pixels import (
+    PixelSettings,
+    normalize,
+    resize_levels,
+    to_images,
+)
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+BOX_LABELS = (2, 3)
+"""Labels of a box's first and last corner among point prompts."""
+SAM2_PIXELS = PixelSettings(
+    height=1024, width=1024, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
+)
+SAM3_PIXELS = PixelSettings(height=1008, width=1008, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Tracker(Network):
+    """Tracker of objects from their boxes in one frame."""
+
+    def __call__(
+        self, frames: UInt8[np.ndarray, "f h w 3"], frame: int, boxes_px: Sequence[Box]
+    ) -> Int32[np.ndarray, "f h w"]:
+        """Return the number of the box, from 1, whose object each pixel shows; 0 for none.
+
+        The boxes are those of objects in one frame, from which they are followed forwards and
+        backwards.
+        """
+        found, _ = self.ask(
+            {"frames": frames, "boxes_px": np.asarray(boxes_px, np.float32)}, frame=frame
+        )
+        return found["labels"]
+
+
+@dataclass(frozen=True)
+class EdgeTam(Tracker):
+    """EdgeTAM, a small tracker."""
+
+    needs: ClassVar[str] = "EdgeTAM (yonigozlan/EdgeTAM-hf)"
+    model_types: ClassVar[tuple[str, ...]] = ("edgetam_video",)
+
+    def check_installed(self) -> None:
+        """Raise `InputError` naming missing packages: RepViT, its image encoder, is in timm."""
+        super().check_installed()
+        vision = self._read_config().get("vision_config") or {}
+        encoder = (vision.get("backbone_config") or {}).get("model_type")
+        if encoder == "timm_wrapper" and find_spec("timm") is None:
+            raise InputError(
+                f"{self.needs} cannot run: timm must be installed. pip install timm, or use SAM 2 "
+                "(--masks grounded-sam2)."
+            )
+
+
+@dataclass(frozen=True)
+class Sam2Tracker(Tracker):
+    """SAM 2 and 2.1."""
+
+    needs: ClassVar[str] = "SAM 2 (facebook/sam2.1-hiera-tiny)"
+    model_types: ClassVar[tuple[str, ...]] = ("sam2_video",)
+
+
+@dataclass(frozen=True)
+class Sam3Tracker(Tracker):
+    """Tracker of SAM 3, from the checkpoint that also finds objects by text."""
+
+    needs: ClassVar[str] = "SAM 3 (facebook/sam3)"
+    model_types: ClassVar[tuple[str, ...]] = ("sam3_video", "sam3_tracker_video")
+
+
+def load(folder: str, device: str, dtype: str) -> Run:
+    """Load the network that the folder holds in a worker."""
+    import torch
+    import transformers
+
+    kind = json.loads((Path(folder) / CONFIG).read_text())["model_type"]
+    name, default = {
+        "edgetam_video": ("EdgeTamVideo", SAM2_PIXELS),
+        "sam2_video": ("Sam2Video", SAM2_PIXELS),
+    }.get(kind, ("Sam3TrackerVideo", SAM3_PIXELS))
+    network_type = getattr(transformers, f"{name}Model")
+    module = importlib.import_module(network_type.__module__)
+    session_type = getattr(module, f"{name}InferenceSession")
+    network = load_network(network_type, Path(folder), device=device, dtype=dtype)
+    pixels = PixelSettings.read(Path(folder), default)
+
+    def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
+        frames = arrays["frames"]
+        height, width = frames.shape[1:3]
+        session = session_type(
+            video_height=height,
+            video_width=width,
+            inference_device=device,
+            inference_state_device=device,
+            dtype=network.dtype,
+        )
+        session.processed_frames = PreparedFrames(frames, pixels, network.dtype)
+        scale = np.array([pixels.width / width, pixels.height / height] * 2, np.float32)
+        for number, box in enumerate(arrays["boxes_px"] * scale, start=1):
+            points = torch.from_numpy(box).to(device, network.dtype).reshape(1, 1, 2, 2)
+            labels = torch.tensor(BOX_LABELS, dtype=torch.int32, device=device).reshape(1, 1, 2)
+            inputs = {"point_coords": points, "point_labels": labels}
+            session.add_point_inputs(session.obj_id_to_idx(number), options["frame"], inputs)
+            session.obj_with_new_inputs.append(number)
+        labels = np.zeros(frames.shape[:3], np.int32)
+        with torch.inference_mode():
+            for output in _propagate(network, session, options["frame"]):
+                labels[output.frame_idx] = to_labels(output.pred_masks[:, 0], (height, width))
+        return {"labels": labels}, None
+
+    return run
+
+
+def _propagate(network: Any, session: Any, start: int) -> Iterator[Any]:
+    """Yield the outputs of all frames, from a start forwards and then backwards."""
+    yield from network.propagate_in_video_iterator(session, start_frame_idx=start)
+    if start > 0:
+        yield from network.propagate_in_video_iterator(session, start_frame_idx=start, reverse=True)
+
+
+class PreparedFrames:
+    """Frames of a video as a network's inputs, each prepared when it is asked for."""
+
+    def __init__(self, frames: np.ndarray, pixels: PixelSettings, dtype: torch.dtype):
+        """Remember the frames `f h w 3`, and the size, statistics and type to prepare them to."""
+        self._frames, self._pixels, self._dtype = frames, pixels, dtype
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, number: int) -> torch.Tensor:
+        pixels = self._pixels
+        images = to_images(self._frames[number][None], "cpu")
+        images = resize_levels(images, (pixels.height, pixels.width))
+        return normalize(images, pixels.mean, pixels.std)[0].to(self._dtype)
+
+
+def to_labels(logits: torch.Tensor, size: tuple[int, int]) -> np.ndarray:
+    """Return the number, from 1, of the mask `n h w` of largest positive logit at each pixel."""
+    from torch.nn.functional import interpolate
+
+    resized = interpolate(logits[:, None].float(), size=size, mode="bilinear", align_corners=False)[
+        :, 0
+    ]
+    best, index = resized.max(dim=0)
+    return (((index + 1) * (best > 0)).cpu().numpy()).astype(np.int32)

@@ -1,0 +1,80 @@
+"""Depth Anything 3 is called as its package asks, here with a small one of the same interface."""
+
+import json
+
+import numpy as np
+import pytest
+import torch  # noqa: F401
+
+from egosim_jax.perception.estimates import CameraEstimate, Verdict
+from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3
+from egosim_jax.perception.networks.worker import close_workers
+from egosim_jax.types import Cameras, InputError
+
+PACKAGE = """
+from types import SimpleNamespace
+import numpy as np, torch
+
+class DepthAnything3(torch.nn.Module):
+    @classmethod
+    def from_pretrained(cls, folder, *, local_files_only, strict):
+        assert local_files_only and strict
+        return cls()
+
+    def inference(self, image, extrinsics=None, intrinsics=None, process_res=504):
+        assert all(frame.dtype == np.uint8 for frame in image)
+        depth = np.stack([np.full((5, 7), frame.mean()) for frame in image])
+        if extrinsics is not None:  # the distance of each camera, to be seen in the result
+            assert extrinsics.shape == (len(image), 4, 4) and intrinsics.shape == (len(image), 3, 3)
+            depth = depth + 100 * np.linalg.norm(extrinsics[:, :3, 3], axis=1)[:, None, None]
+        return SimpleNamespace(depth=depth, is_metric=1)
+"""
+FRAMES = np.repeat(np.arange(10, dtype=np.uint8), 8 * 12 * 3).reshape(10, 8, 12, 3)
+STILL = np.zeros(FRAMES.shape[:3], bool)
+
+
+def estimate(step=None, *, metric=False):
+    cameras = None
+    if step is not None:
+        poses = np.stack([np.eye(4)] * 10)
+        poses[:, 0, 3] = step * np.arange(10)
+        matrix = np.array([[12.0, 0, 5.5], [0, 12, 3.5], [0, 0, 1]])
+        cameras = Cameras(world_from_camera=poses, intrinsics_px=matrix, height=8, width=12)
+    verdict = Verdict(rung="given", reason="", figures={})
+    return CameraEstimate(cameras=cameras, metric=metric, verdict=verdict)
+
+
+@pytest.fixture
+def network(tmp_path, monkeypatch):
+    package = tmp_path / "path" / "depth_anything_3"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "api.py").write_text(PACKAGE)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "path"))
+    monkeypatch.setattr(DepthAnything3, "packages", ("torch",))
+    (tmp_path / "config.json").write_text(json.dumps({"model_name": "da3nested-giant-large"}))
+    (tmp_path / "model.safetensors").write_bytes(b"weights")
+    yield DepthAnything3(tmp_path, context=3)
+    close_workers()
+
+
+@pytest.mark.slow
+def test_wanted_frames_get_depth_in_the_unit_of_moving_cameras(network):
+    found = network(FRAMES, STILL, estimate(0.5), [7, 2])
+    assert found.frames.tolist() == [7, 2]
+    np.testing.assert_allclose(found.depth_m[:, 4, 5], [7 + 350, 2 + 100])
+    assert found.depth_m.shape == (2, 8, 12)
+    assert not found.metric
+    for still in (estimate(), estimate(0.0)):
+        found = network(FRAMES, STILL, still, [3])
+        assert found.depth_m[0, 4, 5] == pytest.approx(3)
+        assert found.metric
+
+
+def test_another_folder_and_a_missing_package_are_refused(network, monkeypatch):
+    monkeypatch.setattr(DepthAnything3, "packages", ("depth_anything_3_that_is_not_there",))
+    with pytest.raises(InputError, match=r"must be installed.*--no-deps depth-anything-3"):
+        network(FRAMES, STILL, estimate(), [0])
+    (network.folder / "config.json").write_text(json.dumps({"model_type": "depth_anything"}))
+    with pytest.raises(InputError, match=r"is a checkpoint of 'depth_anything'.*model_name"):
+        DepthAnything3(network.folder)
