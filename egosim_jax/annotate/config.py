@@ -3,7 +3,8 @@
 An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
 
     hands     landmarks                                   perception.hands
-    masks     geometry, sam3=FOLDER                       perception.silhouettes, networks
+    masks     geometry, sam3=FOLDER, grounded-sam3=FOLDER, grounded-sam2=FOLDER,
+              grounded-edgetam=FOLDER                     perception.silhouettes, networks
     cameras   ladder                                      perception.cameras
     depth     sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER
     caption   any text, or qwen=FOLDER
@@ -40,8 +41,16 @@ _DEPTH = {
     "depth-anything-3": "perception.networks.depth_anything_3:DepthAnything3",
     "files": "",
 }
-_MASKS = {"geometry": "", "sam3": "perception.networks:GroundedSam3"}
-_CAPTIONS = {"qwen": "perception.networks:Qwen3VL"}
+_MASKS = {
+    "geometry": "",
+    "sam3": "perception.networks.sam3:Sam3",
+    "grounded-sam3": "perception.networks.grounded:GroundedSam3",
+    "grounded-sam2": "perception.networks.grounded:GroundedSam2",
+    "grounded-edgetam": "perception.networks.grounded:GroundedEdgeTam",
+}
+_CAPTIONS = {"qwen": "perception.networks.qwen3_vl:Qwen3VL"}
+_BARE = ("sweep", "geometry")
+"""Estimators without weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +64,21 @@ class Estimators:
     """None for silhouettes drawn from the hands."""
     captioner: Captioner | None = None
     """None for captions from the recording or the command."""
+
+    def prepare(self) -> None:
+        """Fetch what is fetched at the first use; raise `InputError` naming missing packages."""
+        from egosim_jax.perception.cameras import CameraLadder
+        from egosim_jax.perception.cameras.colmap import require_pycolmap
+        from egosim_jax.perception.hands import LandmarkHands
+        from egosim_jax.perception.hands.weights import files
+
+        for part in vars(self).values():
+            if isinstance(part, LandmarkHands):
+                files(part.weights, offline=part.offline)
+            elif isinstance(part, CameraLadder) and part.rung not in ("static", "rotation"):
+                require_pycolmap()
+            elif hasattr(part, "check_installed"):
+                part.check_installed()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +98,9 @@ class AnnotateConfig:
     masks: str = "geometry"
     """Silhouettes of hands, arms and objects."""
     detector: Path | None = None
-    """Folder of the detector that prompts sam3."""
+    """Folder of Grounding DINO, which finds what a tracker follows."""
+    device: str = "cpu"
+    """Device of the networks: cpu, cuda or cuda:N."""
     phrases: tuple[str, ...] = ()
     """Objects to segment, where no network names them."""
     focal_px: float | None = None
@@ -113,10 +139,10 @@ class AnnotateConfig:
             raise InputError(f"--rung must be one of {', '.join(get_args(Rung))}.")
         _find(_DEPTH, self.depth, "--depth")
         name, _ = _find(_MASKS, self.masks, "--masks")
-        if (name == "sam3") != (self.detector is not None):
+        if name.startswith("grounded-") != (self.detector is not None):
             raise InputError(
-                "--masks sam3=FOLDER and --detector FOLDER belong together: the detector finds "
-                "what is segmented."
+                "--masks grounded-...=FOLDER and --detector FOLDER belong together: the detector "
+                "finds what the tracker follows."
             )
 
     @property
@@ -141,21 +167,22 @@ class AnnotateConfig:
 
         ladder: dict[str, Any] = {} if self.rung is None else {"rung": self.rung}
         segmenter = captioner = None
-        if self.masks != "geometry":
-            _, folder = _find(_MASKS, self.masks, "--masks")
-            kind = _import(_MASKS["sam3"])
-            segmenter = cast(Segmenter, kind(detector=self.detector, segmenter=folder))
+        name, folder = _find(_MASKS, self.masks, "--masks")
+        if folder is not None:
+            folders = [folder] if self.detector is None else [self.detector, folder]
+            segmenter = cast(Segmenter, _import(_MASKS[name])(*folders, device=self.device))
         if self._captioner:
             name, folder = _find(_CAPTIONS, self.caption or "", "--caption")
-            captioner = cast(Captioner, _import(_CAPTIONS[name])(folder))
+            captioner = cast(Captioner, _import(_CAPTIONS[name])(folder, device=self.device))
         name, folder = _find(_DEPTH, self.depth, "--depth")
         if name == "files":  # frames without a map are estimated
             name, folder = "sweep", None
-        depth = _import(_DEPTH[name])
+        kind = _import(_DEPTH[name])
+        depth = kind() if folder is None else kind(folder, device=self.device)
         return Estimators(
             hands=LandmarkHands(weights=self.hand_weights, offline=self.offline),
             cameras=CameraLadder(**ladder),
-            depth=cast(DepthEstimator, depth() if folder is None else depth(folder)),
+            depth=cast(DepthEstimator, depth),
             segmenter=segmenter,
             captioner=captioner,
         )
@@ -164,9 +191,9 @@ class AnnotateConfig:
 def _find(known: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:
     """Return name and folder of an estimator. Raises `InputError` naming all that are known."""
     name, equals, folder = text.partition("=")
-    bare = name in ("sweep", "geometry")
+    bare = name in _BARE
     if name not in known or bool(equals) == bare or (equals and not folder):
-        shown = ", ".join(n if n in ("sweep", "geometry") else f"{n}=FOLDER" for n in known)
+        shown = ", ".join(n if n in _BARE else f"{n}=FOLDER" for n in known)
         raise InputError(f"{option} {quote(text)} must be one of {shown}.")
     if equals and not Path(folder).is_dir():
         raise InputError(f"{option} {quote(text)}: {quote(folder)} is not a folder.")

@@ -37,6 +37,8 @@ from egosim_jax.types import Cameras, InputError
 SIDES = ("left", "right")
 KEY_FRAMES = 6
 """Frames that a fused scene is made of."""
+HAND_PHRASES = ("hand", "arm")
+"""Names of hands and arms for a network that segments."""
 HOLD_S = 0.5
 """Time for which the silhouette of a hand that is not found stays, in seconds."""
 Run = Callable[[Record, Estimators, AnnotateConfig], Record]
@@ -89,11 +91,14 @@ def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) 
         phrases = config.phrases or record.recording.names
         if not phrases and parts.captioner is not None:
             phrases = parts.captioner(record.frames)[1]
-        ids, names = parts.segmenter(record.frames, phrases, record.hands)
+        asked = tuple(dict.fromkeys((*phrases, *HAND_PHRASES)))
+        ids, names = parts.segmenter(record.frames, asked, record.hands)
         return record.add(
-            "silhouettes", {"masks": config.masks, "phrases": list(phrases)},
-            object_ids=ids.astype(np.int32), names=dict(names),
-        )  # fmt: skip
+            "silhouettes",
+            {"masks": config.masks, "phrases": list(asked)},
+            object_ids=ids.astype(np.int32),
+            names={number: name for number, name in names.items() if number > 0},
+        )
     if record.hands is None:
         from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 

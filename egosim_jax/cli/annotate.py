@@ -66,9 +66,13 @@ class Annotate:
     side: Literal["auto", "left", "right"] = "auto"
     """Side of all hands, instead of what is recognized."""
     masks: str = "geometry"
-    """Silhouettes of hands and objects: geometry, or sam3=FOLDER with --detector."""
+    """Silhouettes of hands and objects: geometry, sam3=FOLDER, or a tracker with --detector.
+
+    Trackers are grounded-sam3=FOLDER, grounded-sam2=FOLDER and grounded-edgetam=FOLDER."""
     detector: Path | None = None
-    """Folder of Grounding DINO, which finds what sam3 segments."""
+    """Folder of Grounding DINO, which finds what a tracker follows."""
+    device: str = "cpu"
+    """Device of the networks: cpu, cuda or cuda:N."""
     phrases: tuple[str, ...] = ()
     """Objects to segment, by name."""
     focal: float | None = None
@@ -111,6 +115,7 @@ class Annotate:
         check_counts({"--workers": self.workers})
         config = self._config()
         sources = find_sources(self.videos)
+        config.build().prepare()
         with lock_folder(self.out):
             run.require_config(self.out, config)
             scans = run.scan_sources(sources, self.out, config, workers=self.workers)
@@ -180,6 +185,7 @@ class Annotate:
             side=self.side,
             masks=self.masks,
             detector=self.detector,
+            device=self.device,
             phrases=self.phrases,
             focal_px=self.focal,
             rung=self.rung,
