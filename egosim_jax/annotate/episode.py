@@ -24,7 +24,9 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     are the ground truth. Raises `InputError` if the clip was refused, or is too short.
     """
     about = read_json(folder / ANNOTATION)
-    if not isinstance(about, dict) or about.get("status") != "done":
+    row = about.get("row") if isinstance(about, dict) else None
+    prompt = row.get("prompt") if isinstance(row, dict) else None
+    if not isinstance(prompt, str) or about.get("status") != "done":
         raise InputError(
             f"{quote_path(folder)} is not an accepted clip of `egosim data annotate`. Choose "
             "another one of its metadata.csv."
@@ -59,7 +61,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
                 ),
                 joints_m=_reachable(arrays["joints_m"][k]),
                 kind=kinds[arrays["joints_m"].shape[2]],
-                prompt=about["row"]["prompt"],
+                prompt=prompt,
             )
             for k in picked
         ),

@@ -93,6 +93,20 @@ class StubDepth:
         )
 
 
+@dataclass(frozen=True)
+class StubSegmenter:
+    """A hand on the left, and a cup on the right."""
+
+    log: Path | None
+
+    def __call__(self, frames, phrases, hands=None):
+        note(self.log, "+".join(phrases))
+        ids = np.zeros(frames.shape[:3], np.int32)
+        ids[:, 10:20, 10:20] = -1
+        ids[:, 10:20, 60:70] = 5
+        return ids, {-1: "hand", 5: "cup"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class StubConfig(AnnotateConfig):
     """Configuration whose estimators are stubs; `log` has a line per call."""
@@ -100,6 +114,7 @@ class StubConfig(AnnotateConfig):
     hands_until: float = 1.0
     refuse: bool = False
     refuse_dark: bool = False
+    segment: bool = False
     log: Path | None = None
 
     def build(self) -> Estimators:
@@ -108,6 +123,7 @@ class StubConfig(AnnotateConfig):
             hands=StubHands(self.hands_until, self.log),
             cameras=StubCameras(self.refuse, self.log, self.refuse_dark),
             depth=StubDepth(self.log),
+            segmenter=StubSegmenter(self.log) if self.segment else None,
         )
 
 

@@ -13,11 +13,12 @@ from tests.unit.annotate.test_run import annotate
 SMALL = VideoSpec(frames=5, height=32, width=48, fps=8)
 
 
-@pytest.fixture
-def clip(tmp_path):
-    path = write(tmp_path / "cup.mp4", textured_video(33))
-    annotate([path], tmp_path / "out", config())
-    return tmp_path / "out/cup"
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("annotated")
+    path = write(folder / "cup.mp4", textured_video(33))
+    annotate([path], folder / "out", config())
+    return folder / "out/cup"
 
 
 def test_the_rest_of_the_video_becomes_actions(clip, tmp_path):

@@ -105,6 +105,18 @@ def test_a_refused_clip_is_reported_and_not_listed(video, tmp_path, settings, ru
     assert "data:image/jpeg" in (out / "index.html").read_text()
 
 
+def test_segmented_objects_are_instances_of_the_scene(video, tmp_path):
+    out, log = tmp_path / "out", tmp_path / "calls"
+    annotate([video], out, config(segment=True, phrases=("cup",), log=log))
+    assert log.read_text().split()[1] == "cup+hand+arm"
+    state = snapshot.load(out / "cup/state")
+    assert state.names == {5: "cup"}
+    assert sorted(set(state.object_ids.tolist())) == [0, 5]
+    about = read_json(out / "cup" / ANNOTATION)
+    assert about["row"]["prompt"].endswith("camera near cup.")
+    assert about["plate"]["hand_px"] == 100
+
+
 def test_hands_that_come_late_can_be_accepted(video, tmp_path):
     few = Cutting(quality=Quality(min_hands=0.0))
     report = annotate([video], tmp_path / "out", config(hands_until=0.2, cutting=few))
