@@ -17,6 +17,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ from egosim_jax.types import InputError
 
 ADDRESS = "RAY_ADDRESS"
 """Variable that names the cluster of a submitted job."""
+
+
+LOOPBACK = "127.0.0.1"
 
 
 class FirstStages:
@@ -64,18 +68,18 @@ def annotate_on_ray(
 
     `address` is that of a cluster; `auto` is the one that RAY_ADDRESS names, or a new local one.
     """
-    try:
-        import ray
-    except ModuleNotFoundError as error:
+    if find_spec("ray") is None:
         raise InputError(
             "Ray is not installed: --ray needs it. Run pip install 'egosim-jax[cluster]'."
-        ) from error
+        )
     out = out.resolve()
     rows = [_row(job) for job in jobs if not clip.is_final(job, out)]
     yield from ["done"] * (len(jobs) - len(rows))
     if not rows:
         return
     _connect(address)
+    import ray
+
     try:
         data = ray.data.from_items(rows, override_num_blocks=min(len(rows), 1000))
         for stage, gpu, most in zip((FirstStages, LastStages), gpus, actors, strict=True):
@@ -93,21 +97,24 @@ def annotate_on_ray(
 
 def _connect(address: str) -> None:
     """Connect to a cluster, or start one that only this machine can reach."""
+    alone = address == "auto" and not os.environ.get(ADDRESS)
+    if alone:  # before ray is imported, which decides then what it listens on
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     import ray
 
     logging.getLogger("ray.data").setLevel(logging.ERROR)
-    if address == "auto" and not os.environ.get(ADDRESS):
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level="ERROR",
-            _node_ip_address="127.0.0.1",
-        )
-    else:
+    if not alone:
         ray.init(address=None if address == "auto" else address, log_to_driver=False)
-    ray.data.DataContext.get_current().enable_progress_bars = False
+        return
+    ray.init(address="local", include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    if (listens := ray.util.get_node_ip_address()) != LOOPBACK:
+        ray.shutdown()
+        raise InputError(
+            f"Ray would listen on {listens}, not on the loopback device alone: this version, or a "
+            "program that imported Ray before, decides so. Start a cluster yourself and give its "
+            "address. (--ray)"
+        )
 
 
 def _row(job: Job) -> dict[str, Any]:

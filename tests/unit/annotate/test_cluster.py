@@ -2,6 +2,7 @@
 
 import json
 import os
+from importlib.util import find_spec
 
 import pytest
 
@@ -12,10 +13,9 @@ from tests.system.test_sockets import LOOPBACK, listening
 from tests.unit.annotate.stubs import config, textured_video, write
 from tests.unit.annotate.test_run import annotate
 
-pytest.importorskip("ray")
-
 
 @pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="the extra cluster is not installed")
 @pytest.mark.filterwarnings("ignore")
 def test_ray_makes_the_same_annotations_as_a_local_run(tmp_path):
     videos = [
