@@ -44,11 +44,6 @@ def import_recordings(
     return len(entries), _import(reader.dataset, entries, out)
 
 
-def find_recordings(folder: Path) -> list[Path]:
-    """Return the folders of all recordings at or below a folder, in order."""
-    return sorted(path.parent for path in folder.rglob(DESCRIPTION))
-
-
 def _import(dataset: str, entries: Iterable[Entry], out: Path) -> Iterator[Outcome]:
     seen: dict[str, Path] = {}
     with lock_folder(out):

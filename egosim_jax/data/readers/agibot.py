@@ -127,10 +127,10 @@ class AgiBot:
         info = probe_long_video(files.video)
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
-        joints, notes = _read_grippers(files.states)
+        joints, tools, notes = _read_grippers(files.states)
         span = _span(part, {"frames": info.frames, "poses": len(matrices), "states": len(joints)})
         joints, matrices = joints[span], matrices[span]
-        poses, decision = self._decide(matrices, joints, lens)
+        poses, decision = self._decide(matrices, tools[span], lens)
         remap = None if lens.is_pinhole() else Remap.of(lens)
         cameras = Cameras(
             world_from_camera=poses,
@@ -153,7 +153,7 @@ class AgiBot:
             world_from_camera=poses,
             intrinsics_px=cameras.intrinsics_px,
             metric=True,
-            joints_m=joints,
+            joints_m=None if np.isnan(joints).all() else joints,
             kind="robot",
             depth=_find_depth(files.depth, span) if remap is None else None,
             caption=part.caption,
@@ -166,13 +166,13 @@ class AgiBot:
         )
 
     def _decide(
-        self, matrices: Float[np.ndarray, "f 4 4"], joints: Float[np.ndarray, "f 2 3 3"], lens: Lens
+        self, matrices: Float[np.ndarray, "f 4 4"], tools: Float[np.ndarray, "f 2 3"], lens: Lens
     ) -> tuple[Float[np.ndarray, "f 4 4"], dict[str, str]]:
         """Return camera poses in the base by the reading that sees the grippers, and its shares."""
         readings: dict[Reading, np.ndarray] = {
             "camera_to_base": matrices, "base_to_camera": invert(matrices),
         }  # fmt: skip
-        shares = {name: share_in_view(poses, joints, lens) for name, poses in readings.items()}
+        shares = {name: share_in_view(poses, tools, lens) for name, poses in readings.items()}
         best, other = sorted(readings, key=lambda name: -shares[name])
         written = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
         chosen = self.extrinsics or best
@@ -188,16 +188,15 @@ class AgiBot:
 
 
 def share_in_view(
-    poses: Float[np.ndarray, "f 4 4"], joints: Float[np.ndarray, "f 2 3 3"], lens: Lens
+    poses: Float[np.ndarray, "f 4 4"], tools: Float[np.ndarray, "f 2 3"], lens: Lens
 ) -> float:
-    """Return the share of points between fingertips that camera poses put into the picture."""
-    tips = joints[:, :, 1:].mean(axis=2)
-    local = transform(invert(poses), tips)
+    """Return the share of points between the fingers that camera poses put into the picture."""
+    local = transform(invert(poses), tools)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = project(lens.intrinsics_px, local)
         inside = (local[..., 2] > 0.05) & (u > -0.5) & (u < lens.width - 0.5)
         inside &= (v > -0.5) & (v < lens.height - 0.5)
-    given = np.isfinite(tips).all(axis=2)
+    given = np.isfinite(tools).all(axis=2)
     return float(inside[given].mean()) if given.any() else 0.0
 
 
@@ -288,8 +287,10 @@ def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"]:
     return matrices
 
 
-def _read_grippers(path: Path) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, str]]:
-    """Return the joints of both grippers in the base, and how the opening was read."""
+def _read_grippers(
+    path: Path,
+) -> tuple[Float[np.ndarray, "f 2 3 3"], Float[np.ndarray, "f 2 3"], dict[str, str]]:
+    """Return joints and points between the fingers in the base, and how the opening was read."""
     end, effector = "state/end", "effector/position"
     shapes = {f"{end}/position": (None, 2, 3), f"{end}/orientation": (None, 2, 4),
               f"state/{effector}": (None, None)}  # fmt: skip
@@ -301,8 +302,9 @@ def _read_grippers(path: Path) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, 
             f"and {len(opening)} openings: it is damaged in the set itself."
         )
     rotations = from_quaternions(orientations)
+    tools = positions + TOOL_M * rotations[..., 2]
     if opening.shape[1] != 2:
-        return np.full((len(positions), 2, 3, 3), np.nan), {"hands": "not grippers"}
+        return np.full((len(positions), 2, 3, 3), np.nan), tools, {"hands": "not grippers"}
     notes = {"opening": "grows when it opens"}
     if _closes(arrays.get(f"action/{effector}"), opening):
         opening, notes = OPEN_MM - opening, {"opening": "grows when it closes, as the command"}
@@ -313,7 +315,7 @@ def _read_grippers(path: Path) -> tuple[Float[np.ndarray, "f 2 3 3"], dict[str, 
          for side, along in ((0, 0.0), (1, TOOL_M), (-1, TOOL_M))], axis=2,
     )  # fmt: skip
     joints = np.einsum("fnij,fnkj->fnki", rotations, local) + positions[:, :, None]
-    return joints, notes
+    return joints, tools, notes
 
 
 def _closes(command: np.ndarray | None, opening: Float[np.ndarray, "f 2"]) -> bool:

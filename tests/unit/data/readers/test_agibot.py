@@ -110,6 +110,17 @@ def test_an_opening_that_follows_the_closing_command_is_reversed(world, tmp_path
     assert "closes" in recording.provenance["opening"]
 
 
+def test_the_cameras_of_a_robot_with_hands_are_read_without_joints(world, tmp_path, imported):
+    write_episode(tmp_path / "set", world)
+    with h5py.File(next(tmp_path.rglob("*.h5")), "a") as file:
+        del file["state/effector/position"]
+        file["state/effector/position"] = np.zeros((world.frames, 12))
+    recording = imported(AgiBot(source=tmp_path / "set"))[0]["327_648642_000"]
+    assert recording.provenance["hands"] == "not grippers"
+    assert recording.joints_m is None
+    np.testing.assert_allclose(recording.world_from_camera, world.poses[:5], atol=1e-9)
+
+
 def test_an_episode_in_one_folder_without_parts_is_one_recording(world, tmp_path, imported):
     write_episode(tmp_path / "set", world, flat=True, parts=False)
     done, problems = imported(AgiBot(source=tmp_path / "set"))
