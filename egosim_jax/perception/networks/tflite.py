@@ -11,7 +11,7 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ MAX_COUNT = 4096
 """Maximum number of tensors, operations and buffers of a file."""
 MAX_ELEMENTS = 1 << 26
 """Maximum number of elements of one tensor."""
+MAX_SIZE = 256
+"""Largest stride, dilation and window."""
 _DTYPES = {0: np.float32, 1: np.float16, 2: np.int32}
 _PADDING = {0: "SAME", 1: "VALID"}
 _PICTURES = ("NHWC", "HWIO", "NHWC")
@@ -103,7 +105,7 @@ def read_program(path: Path) -> Program:
             constants,
             operations,
         )
-        _check_outputs(program)
+        _check_shapes(program)
     return program
 
 
@@ -157,15 +159,20 @@ def _operations(
             options["shape"] = shapes[output][1:]
         for name, wanted in _FIXED.get(kind, {}).items():
             _check(options.get(name) == wanted, f"{kind} with {name} {options.get(name)}")
+        for name in _SIZES:
+            _check(0 < options.get(name, 1) <= MAX_SIZE, f"{kind} with {name} {options.get(name)}")
         yield Operation(kind, inputs, output, options)
 
 
-def _check_outputs(program: Program) -> None:
-    """Compute shapes without values, and compare them with those that the file declares."""
+def _check_shapes(program: Program) -> None:
+    """Compute all shapes without values, and compare them with those that the file declares."""
+    everything = tuple(step.output for step in program.operations)
+    _check(set(program.outputs) <= set(everything), "an output is not computed")
+    program = replace(program, outputs=everything)
     weights = {i: jax.ShapeDtypeStruct(w.shape, w.dtype) for i, w in program.weights.items()}
     pictures = jax.ShapeDtypeStruct(program.shapes[program.input], np.float32)
     for i, found in zip(program.outputs, jax.eval_shape(program, weights, pictures), strict=True):
-        _check(found.shape == program.shapes[i], f"output {i} has shape {found.shape}")
+        _check(found.shape == program.shapes[i], f"tensor {i} has shape {found.shape}")
 
 
 def _activated(x: jax.Array, options: Options) -> jax.Array:
@@ -251,6 +258,15 @@ _FIXED: dict[str, Options] = {
     "RESIZE_BILINEAR": {"alignCorners": False, "halfPixelCenters": True},
 }
 """Options of which only one value is supported."""
+_SIZES = (
+    "strideH",
+    "strideW",
+    "dilationHFactor",
+    "dilationWFactor",
+    "filterHeight",
+    "filterWidth",
+)
+_DAMAGE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, struct.error)
 
 
 def _check(holds: bool, problem: str) -> None:
@@ -263,7 +279,7 @@ def _refusing(name: str) -> Iterator[None]:
     """Turn exceptions of parsing untrusted bytes into `InputError`."""
     try:
         yield
-    except (ValueError, TypeError, LookupError, AttributeError, struct.error) as error:
+    except _DAMAGE as error:
         raise InputError(
             f"{name} is damaged or not a supported network: {quote_text(str(error))}."
         ) from error
