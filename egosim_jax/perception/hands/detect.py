@@ -141,7 +141,7 @@ def find_candidates(
         )
         fresh = _new_ones(_once(fresh, same_hand), found, same_hand)
         found = found.join(fresh)
-    found = _refined(frames, networks, found, min_presence)
+    found = _refined(frames, networks, found, min_presence, same_hand)
     of_frame = dict(zip(searched.tolist(), palms, strict=True))
     for i, frame in enumerate(found.frame):
         found.palm[i] = _support(found.joints_px[i], of_frame[int(frame)])
@@ -207,11 +207,16 @@ def _find_joints(
 
 
 def _refined(
-    frames: np.ndarray, networks: HandNetworks, found: Candidates, min_presence: float
+    frames: np.ndarray,
+    networks: HandNetworks,
+    found: Candidates,
+    min_presence: float,
+    same_hand: float,
 ) -> Candidates:
     """Return candidates as the mean of what is found in their first region and in their own."""
     own = _find_joints(frames, networks, found.frame, regions_of_joints(found.joints_px), 0.0)
-    sure = np.flatnonzero(own.presence >= min_presence)
+    same = relative_distance(own.joints_px, found.joints_px) <= same_hand
+    sure = np.flatnonzero(same & (own.presence >= min_presence))
     values = {}
     for name in ("joints_px", "joints_hand_m", "presence", "right"):
         values[name] = getattr(found, name).copy()

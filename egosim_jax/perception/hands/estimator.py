@@ -20,6 +20,7 @@ from egosim_jax.perception.hands.track import (
     fill_gaps,
     find_gaps,
     smooth,
+    smoothing,
 )
 from egosim_jax.types import check_video
 
@@ -123,9 +124,11 @@ def _as_tracks(
     joints_hand_m[there] = found.joints_hand_m[path[there]]
     presence[there] = found.presence[path[there]]
     gaps = find_gaps(joints_px, most=max_gap, max_motion=max_motion)
+    joints_px = fill_gaps(joints_px, gaps)
+    weights = smoothing(joints_px, max_motion=max_motion / 2)
     return HandTracks(
-        joints_px=smooth(fill_gaps(joints_px, gaps)),
-        joints_hand_m=smooth(fill_gaps(joints_hand_m, gaps)),
+        joints_px=smooth(joints_px, weights),
+        joints_hand_m=smooth(fill_gaps(joints_hand_m, gaps), weights),
         presence=presence,
         filled=gaps,
     )

@@ -212,12 +212,26 @@ def runs(mask: Bool[np.ndarray, " f"]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def smooth(joints: Float[np.ndarray, "f 2 21 c"]) -> Float[np.ndarray, "f 2 21 c"]:
-    """Return tracks smoothed by weights 1 2 1 within each run of frames that have the hand."""
-    result = joints.copy()
-    for side in (LEFT, RIGHT):
-        for start, stop in runs(np.all(np.isfinite(joints[:, side]), axis=(1, 2))):
-            run = joints[start:stop, side]
-            padded = np.concatenate([run[:1], run, run[-1:]])
-            result[start:stop, side] = (padded[:-2] + 2 * run + padded[2:]) / 4
-    return result
+def smoothing(
+    joints_px: Float[np.ndarray, "f 2 21 2"], *, max_motion: float
+) -> Float[np.ndarray, "f 2 3"]:
+    """Return the weights, up to 1 2 1, of the frame before, of each frame and of the one after.
+
+    A frame whose hand is missing or farther away than `max_motion` hand sizes has no weight, so
+    that no hand is mixed with one whose joints were mirrored.
+    """
+    weights = np.zeros((*joints_px.shape[:2], 3))
+    weights[..., 1] = 2
+    moved = relative_distance(joints_px[:-1], joints_px[1:])
+    weights[1:, :, 0] = weights[:-1, :, 2] = moved <= max_motion
+    return weights / weights.sum(-1, keepdims=True)
+
+
+def smooth(
+    joints: Float[np.ndarray, "f 2 21 c"], weights: Float[np.ndarray, "f 2 3"]
+) -> Float[np.ndarray, "f 2 21 c"]:
+    """Return tracks smoothed over three frames; missing hands stay missing."""
+    known = np.nan_to_num(joints)
+    padded = np.concatenate([known[:1], known, known[-1:]])
+    parts = [weights[..., i, None, None] * padded[i : i + len(joints)] for i in range(3)]
+    return np.where(np.isnan(joints), np.nan, sum(parts))

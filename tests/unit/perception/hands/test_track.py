@@ -15,6 +15,7 @@ from egosim_jax.perception.hands.track import (
     fill_gaps,
     find_gaps,
     smooth,
+    smoothing,
 )
 from tests.hands import PaintedHands, hand_px, paint
 
@@ -120,12 +121,25 @@ def test_a_filled_gap_is_straight_motion():
     np.testing.assert_allclose(fill_gaps(broken, gaps), moving(), atol=1e-9)
 
 
-def test_smoothing_keeps_straight_motion_and_halves_noise_but_crosses_no_gap():
+def smoothed(joints_px):
+    return smooth(joints_px, smoothing(joints_px, max_motion=0.5))
+
+
+def test_smoothing_keeps_straight_motion_and_reduces_noise_but_crosses_no_gap():
     straight = moving(missing=[4])
-    np.testing.assert_allclose(smooth(straight)[1:3], straight[1:3], atol=1e-9)
-    np.testing.assert_array_equal(np.isnan(smooth(straight)), np.isnan(straight))
-    noisy = np.random.default_rng(0).normal(0, 1, (400, 2, 21, 2))
-    assert smooth(noisy).std() == pytest.approx(np.sqrt(6) / 4, rel=0.02)
+    np.testing.assert_allclose(smoothed(straight)[1:8], straight[1:8], atol=1.6)
+    np.testing.assert_allclose(smoothed(straight)[1:3], straight[1:3], atol=1e-9)
+    np.testing.assert_array_equal(np.isnan(smoothed(straight)), np.isnan(straight))
+    still = np.tile(hand_px(center=(0, 0)), (400, 2, 1, 1))
+    noise = np.random.default_rng(0).normal(0, 1, still.shape)
+    assert (smoothed(still + noise) - still)[1:-1].std() == pytest.approx(np.sqrt(6) / 4, rel=0.02)
+
+
+def test_a_mirrored_hand_is_not_mixed_with_its_neighbors():
+    joints = moving()
+    joints[4, RIGHT, :, 0] = 300 - joints[4, RIGHT, :, 0]
+    np.testing.assert_allclose(smoothed(joints)[4], joints[4])
+    np.testing.assert_allclose(smoothed(joints)[2], joints[2])
 
 
 def test_a_painted_video_has_its_hand_on_its_side_and_its_gap_is_marked():
