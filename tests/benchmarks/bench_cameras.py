@@ -39,27 +39,21 @@ class Clip:
 
 
 SFM: tuple[Rung, ...] = ("incremental", "focal", "global")
+STUCK: tuple[Rung, ...] = ("rotation", "refused")
+DWM, EGODEX = "dwm_triplets", "real_clips/egodex"
+SKELETON = "hand_keypoint_video.mp4"
 CLIPS = {
-    "00017": Clip("dwm_triplets/00017", "hands.mp4", SFM, 1, 300),
-    "00039": Clip("dwm_triplets/00039", "hands.mp4", SFM, 2, 300),
-    "00055": Clip("dwm_triplets/00055", "hands.mp4", (*SFM, "refused"), 2, 300),
-    "00055 device": Clip("dwm_triplets/00055", "hands.mp4", (*SFM, "refused"), 2, 300, True),
-    "declutter": Clip(
-        "real_clips/egodex/declutter_desk_8_0_120", "hand_keypoint_video.mp4", SFM, 1, 323
-    ),
-    "task12": Clip(
-        "real_clips/egocap/task12_rollout_clip_1_0.5_4.5", "hand_keypoint_video.mp4", SFM, 2, 382
-    ),
+    "00017": Clip(f"{DWM}/00017", "hands.mp4", SFM, 1, 300),
+    "00039": Clip(f"{DWM}/00039", "hands.mp4", SFM, 2, 300),
+    "00055": Clip(f"{DWM}/00055", "hands.mp4", (*SFM, "refused"), 2, 300, True),
+    "declutter": Clip(f"{EGODEX}/declutter_desk_8_0_120", SKELETON, SFM, 1, 323),
+    "task12": Clip("real_clips/egocap/task12_rollout_clip_1_0.5_4.5", SKELETON, SFM, 2, 382),
     "insert_remove": Clip(
-        "real_clips/egodex/insert_remove_bookshelf_18_0_120", "hand_keypoint_video.mp4",
-        ("rotation", "refused"), 1, 323,
+        f"{EGODEX}/insert_remove_bookshelf_18_0_120", SKELETON, STUCK, 1, 323, True
     ),
-    "pick_place": Clip(
-        "real_clips/egodex/basic_pick_place_178_0_73", "hand_keypoint_video.mp4",
-        ("rotation", "refused"), 2, 323,
-    ),
+    "pick_place": Clip(f"{EGODEX}/basic_pick_place_178_0_73", SKELETON, STUCK, 2, 323, True),
     "lift_tumbler": Clip("raw_clips/lift_tumbler.mp4", None, ("static",), 1),
-}  # fmt: skip
+}
 
 
 def main(

@@ -91,9 +91,11 @@ def _write(model: Any, job: dict[str, Any]) -> None:
     """Write cameras, points and observations as arrays; empty ones if there is no model."""
     import numpy as np
 
-    images = [] if model is None else [i for i in model.images.values() if i.has_pose]
-    images.sort(key=lambda image: image.name)
-    points = [] if model is None else list(model.points3D.items())
+    images, points, camera = [], [], np.zeros(4)
+    if model is not None:
+        images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
+        points = list(model.points3D.items())
+        camera = next(iter(model.cameras.values())).params
     index = {number: n for n, (number, _) in enumerate(points)}
     seen = [
         (int(Path(image.name).stem), index[p.point3D_id], *p.xy)
@@ -101,7 +103,6 @@ def _write(model: Any, job: dict[str, Any]) -> None:
         for p in image.points2D
         if p.has_point3D()
     ]
-    camera = next(iter(model.cameras.values())).params if images else np.zeros(4)
     np.savez(
         job["result"],
         frames=np.array([int(Path(i.name).stem) for i in images], np.int32),

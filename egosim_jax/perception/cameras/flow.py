@@ -56,7 +56,7 @@ class Background:
             return points, np.zeros(0, bool)
         options = {"winSize": _WINDOW, "maxLevel": _LEVELS}
         flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
-        start = None if guess is None else guess.astype(np.float32)
+        start = np.array(points if guess is None else guess, np.float32)
         there, found, _ = cv2.calcOpticalFlowPyrLK(
             self.gray[first], self.gray[second], points, start, flags=flags, **options
         )

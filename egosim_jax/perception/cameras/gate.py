@@ -95,11 +95,16 @@ class GateConfig:
             )
 
 
-def measure(found: Reconstruction, *, frames: int, height: int, width: int) -> dict[str, float]:
-    """Return the figures that the gate compares, of a reconstruction of a video of `frames`."""
+def measure(
+    found: Reconstruction, *, frames: int, pictures: int, height: int, width: int
+) -> dict[str, float]:
+    """Return the figures that the gate compares.
+
+    The reconstruction is of `pictures` among the `frames` of a video.
+    """
     registered = len(found.frames)
     figures = {
-        "registered": registered / frames,
+        "registered": registered / pictures,
         "points": float(len(found.points)),
         "focal_px": found.focal_px,
         "radial": found.radial,

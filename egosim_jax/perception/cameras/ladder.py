@@ -27,7 +27,12 @@ from egosim_jax.perception.cameras.colmap import ColmapConfig, ColmapError, Scen
 from egosim_jax.perception.cameras.flow import Background, Breaks, background, find_breaks
 from egosim_jax.perception.cameras.gate import GateConfig, measure, refusals
 from egosim_jax.perception.cameras.path import complete_path, estimate_from, pinhole
-from egosim_jax.perception.cameras.rotation import follow_corners, solve_rotations
+from egosim_jax.perception.cameras.rotation import (
+    Tracks,
+    find_focal,
+    follow_corners,
+    solve_rotations,
+)
 from egosim_jax.perception.cameras.static import still_share
 from egosim_jax.perception.estimates import CameraEstimate, Rung, Verdict
 from egosim_jax.progress import track
@@ -241,7 +246,9 @@ class _Climb:
         except ColmapError as error:
             return self._fail(rung, str(error))
         count, height, width = self.frames.shape[:3]
-        figures = measure(found, frames=len(self.scene.frames), height=height, width=width)
+        figures = measure(
+            found, frames=count, pictures=len(self.scene.frames), height=height, width=width
+        )
         self.figures |= {f"{rung}_{name}": value for name, value in figures.items()}
         if problems := refusals(figures, self.config.gate, calibrated=focal is not None):
             return self._fail(rung, ", ".join(problems))
@@ -257,7 +264,7 @@ class _Climb:
         gate = self.config.gate
         tracks = follow_corners(self.video, bridge=gate.max_gap)
         height, width = self.video.gray[0].shape
-        focal = self._focal("rotation")
+        focal = self._focal("rotation", tracks)
         intrinsics = pinhole(focal / self.video.reduction, height=height, width=width)
         found = solve_rotations(tracks, intrinsics)
         tracked = np.flatnonzero(~np.isnan(found.residual_px))
@@ -282,10 +289,17 @@ class _Climb:
         )
         return self._pinhole("rotation", poses, focal, reason)
 
-    def _focal(self, rung: str) -> float:
-        """Return the known focal length, or the one assumed, and record which."""
+    def _focal(self, rung: str, tracks: Tracks | None = None) -> float:
+        """Return the known focal length, that found by turning, or the assumed; record which."""
         if self.known_focal_px is not None:
             return self.known_focal_px
+        if tracks is not None:
+            height, width = self.video.gray[0].shape
+            views = self.config.gate.min_view_deg, self.config.gate.max_view_deg
+            found = find_focal(tracks, height=height, width=width, views_deg=views)
+            if found is not None:
+                self.figures[f"{rung}_focal_px"] = found * self.video.reduction
+                return found * self.video.reduction
         self.figures[f"{rung}_assumed_view_deg"] = self.config.assumed_view_deg
         half = np.radians(self.config.assumed_view_deg / 2)
         return float(max(self.frames.shape[1:3]) / 2 / np.tan(half))
@@ -295,7 +309,7 @@ class _Climb:
     ) -> CameraEstimate:
         """Return an accepted estimate without points."""
         height, width = self.frames.shape[1:3]
-        if self.known_focal_px is None:
+        if f"{rung}_assumed_view_deg" in self.figures:
             reason += f"; the view is assumed to be {self.config.assumed_view_deg:g} degrees wide"
         cameras = Cameras(
             world_from_camera=poses,

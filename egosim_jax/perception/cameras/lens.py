@@ -45,11 +45,12 @@ def undistort(
     rows, columns = np.mgrid[: cameras.height, : cameras.width].astype(np.float64)
     rays = _rays(np.stack([columns, rows], axis=-1), cameras.intrinsics_px)
     recorded = _recorded(rays, lens, cameras.intrinsics_px).astype(np.float32)
+    columns, rows = recorded[..., 0].copy(), recorded[..., 1].copy()
     picture = frames.dtype == np.uint8 and frames.ndim == 4
     method = cv2.INTER_LINEAR if picture else cv2.INTER_NEAREST
     source = frames.astype(np.uint8) if frames.dtype == bool else frames
     remapped = [
-        cv2.remap(f, recorded, None, method, borderMode=cv2.BORDER_REPLICATE) for f in source
+        cv2.remap(f, columns, rows, method, borderMode=cv2.BORDER_REPLICATE) for f in source
     ]
     return np.stack(remapped).reshape(frames.shape).astype(frames.dtype)
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from egosim_jax.perception.cameras.flow import MIN_CORNERS, Background
+from egosim_jax.perception.cameras.path import pinhole
 
 MIN_SHARE = 0.4
 """Share of a key frame's corners below which the next key frame begins."""
@@ -89,6 +90,29 @@ def solve_rotations(tracks: Tracks, intrinsics_px: Float[np.ndarray, "3 3"]) -> 
     cosine = (np.trace(known, axis1=1, axis2=2) - 1) / 2
     turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max())
     return Rotations(world_from_camera=poses, residual_px=residual, turn_deg=turn)
+
+
+def find_focal(
+    tracks: Tracks, *, height: int, width: int, views_deg: tuple[float, float]
+) -> float | None:
+    """Return the focal length in pixels at working size that explains turning best, or None.
+
+    None unless the residual falls by a third, and by half a pixel, from either end of the range of
+    views to its least: a turn of a few degrees says nothing about the focal length.
+    """
+    views = np.radians(np.linspace(*views_deg, 14))
+    focals = max(height, width) / 2 / np.tan(views / 2)
+    costs = []
+    for focal in focals:
+        intrinsics = pinhole(float(focal), height=height, width=width)
+        costs.append(float(np.nanmean(solve_rotations(tracks, intrinsics).residual_px)))
+    best = int(np.argmin(costs))
+    least, ends = costs[best], min(costs[0], costs[-1])
+    if best in (0, len(costs) - 1) or least > min(0.67 * ends, ends - 0.5):
+        return None
+    around = slice(best - 1, best + 2)
+    a, b, _ = np.polyfit(np.log(focals[around]), costs[around], 2)
+    return float(np.exp(-b / (2 * a)))
 
 
 def _solve(

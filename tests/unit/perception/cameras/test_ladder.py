@@ -66,10 +66,16 @@ def test_rotations_are_found_to_a_twentieth_of_a_degree() -> None:
     assert found.verdict.figures["rotation_residual_px"] < 0.3
 
 
-def test_a_large_turn_is_followed_over_key_frames() -> None:
-    cameras = path(25, turn_deg=np.array([0.0, 80.0, 0.0]))
-    found = estimate(ROTATION, noisy(render(cameras)))
+def test_a_large_turn_is_followed_over_key_frames_and_gives_the_focal_length() -> None:
+    cameras = path(16, turn_deg=np.array([0.0, 50.0, 0.0]))
+    found = estimate(CameraLadder(rung="rotation"), noisy(render(cameras)))
     assert angles_deg(found, cameras).max() < 0.5
+    assert found.verdict.figures["rotation_focal_px"] == pytest.approx(FOCAL, rel=0.02)
+
+
+def test_a_small_turn_does_not_give_the_focal_length() -> None:
+    found = estimate(CameraLadder(rung="rotation"), noisy(render(path(8, turn_deg=TURN / 4))))
+    assert found.verdict.figures["rotation_assumed_view_deg"] == 90
 
 
 def test_parallax_is_no_rotation() -> None:
