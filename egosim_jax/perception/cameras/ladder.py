@@ -220,7 +220,7 @@ class _Climb:
         gate = self.config.gate
         forced = self.config.rung == "static"
         share, shift = still_share(
-            self.video, max_shift_px=gate.max_shift_px, stop_below=0 if forced else gate.min_still
+            self.video, max_shift_px=gate.max_shift_px, stop_below=0.0 if forced else gate.min_still
         )
         self.figures |= {"static_still": share, "static_shift_px": min(shift, 1e12)}
         reason = f"the background is where frame 0 has it in {share:.0%} of the frames"
@@ -268,10 +268,12 @@ class _Climb:
         intrinsics = pinhole(focal / self.video.reduction, height=height, width=width)
         found = solve_rotations(tracks, intrinsics)
         tracked = np.flatnonzero(~np.isnan(found.residual_px))
-        residual = float(np.median(found.residual_px[tracked[1:]])) if len(tracked) > 1 else 0.0
+        residuals = found.residual_px[tracked[1:]] if len(tracked) > 1 else np.zeros(1)
+        residual, worst = np.percentile(residuals, [50, 90])
         self.figures |= {
             "rotation_tracked": len(tracked) / len(self.frames),
-            "rotation_residual_px": residual,
+            "rotation_residual_px": float(residual),
+            "rotation_worst_px": float(worst),
             "rotation_turn_deg": found.turn_deg,
         }
         if tracked[-1] != len(self.frames) - 1:

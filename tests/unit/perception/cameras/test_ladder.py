@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.cameras import CameraLadder
-from egosim_jax.perception.estimates import CameraEstimate, CameraEstimator
+from egosim_jax.perception.estimates import CameraEstimate, CameraEstimator, Rung
 from egosim_jax.types import Cameras, InputError
 from tests.unit.perception.cameras.room import FOCAL, path, render
 
@@ -129,6 +129,14 @@ def test_given_cameras_stay_as_they_are() -> None:
     assert found.cameras is cameras
     assert found.metric
     assert found.verdict.rung == "given"
+
+
+@pytest.mark.parametrize("rung", ["static", "rotation"])
+def test_a_single_frame_has_a_camera(rung: Rung) -> None:
+    found = estimate(CameraLadder(rung=rung), render(path(1)))
+    assert found.verdict.rung == rung
+    assert found.cameras is not None
+    assert found.cameras.world_from_camera.tolist() == [np.eye(4).tolist()]
 
 
 def test_bad_input_is_refused_before_work() -> None:
