@@ -6,7 +6,7 @@ import numpy as np
 
 from egosim_jax.perception.cameras.flow import MIN_CORNERS, Background
 
-MIN_SHARE = 0.3
+MIN_SHARE = 0.15
 """Least share of the corners of frame 0 that a frame must show again to be judged."""
 
 
