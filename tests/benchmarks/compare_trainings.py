@@ -42,6 +42,7 @@ from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import Programs, Stage, TrainState
 from egosim_jax.types import InputError
 from tests.benchmarks.critic import Adversarial
+from tests.benchmarks.routing import Routing
 
 SHIPPED = Path(__file__).parents[2] / "egosim_jax" / "weights" / "tabletop"
 PROBE = 6
@@ -98,11 +99,14 @@ DENOISERS: Mapping[str, Mapping[str, Any]] = {
     "change 4": {"change": 4.0},
     "batch 4": {"batch": 4},
     "batch 16": {"batch": 16},
+    "routing": {"routing": True},
     "wide": {"dit": {"dim": 384, "ffn_dim": 1152, "heads": 6}},
     "deep": {"dit": {"layers": 12}},
     "random": {"random": True},
 }
-"""Changes of the recipe `tabletop`; `wide`, `deep` and `random` start from random weights."""
+"""Changes of the recipe `tabletop`; `wide`, `deep` and `random` start from random weights.
+
+`routing` leaves half of the tokens out of most blocks (`routing.py`)."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +176,8 @@ def train_denoiser(settings: Settings, changes: Mapping[str, Any]) -> Trained:
         **changes.get("optimizer", {}),
     )
     training = replace(training, optimizer=optimizer, batch_size=changes.get("batch", 8))
-    task = Denoising(
+    kind = Routing if changes.get("routing") else Denoising
+    task = kind(
         model=model,
         dropout=TABLETOP.dropout,
         objective=Objective(times=changes.get("times", "uniform")),
