@@ -176,6 +176,8 @@ class Make:
     """Columns in pixels, a multiple of 16."""
     fps: int = 8
     """Frames per second."""
+    black_cloths: int | None = None
+    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
     workers: int = os.cpu_count() or 1
     """Number of processes."""
     config: str | None = None
@@ -192,6 +194,7 @@ class Make:
             clips=self.clips,
             spec=spec,
             kind=self.kind,
+            black_cloths=self.black_cloths,
         )
         progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))
         for _ in track(progress, "making", total=self.scenes):

@@ -38,6 +38,8 @@ class Tabletop(ModelExperiment):
     """Repetitions of each clip with different noise."""
     batch_size: int = 8
     """Clips generated together."""
+    black_cloths: int | None = None
+    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
 
 
 @dataclass(frozen=True, kw_only=True)

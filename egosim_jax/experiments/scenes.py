@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -53,10 +54,12 @@ class HeldOutClip:
     """Ground-truth frames without hands and without manipulated object, uint8 `f h w 3`."""
 
     @classmethod
-    def make(cls, seed: int, spec: VideoSpec, kind: Kind) -> HeldOutClip:
+    def make(
+        cls, seed: int, spec: VideoSpec, kind: Kind, *, black_cloths: int | None = None
+    ) -> HeldOutClip:
         """Make the first clip of a seed."""
-        clip = next(make_sequence(seed, spec=spec, kind=kind))
-        bare = next(make_sequence(seed, spec=spec, kind=kind, bare=True))
+        scene = partial(make_sequence, seed, spec=spec, kind=kind, black_cloths=black_cloths)
+        clip, bare = next(scene()), next(scene(bare=True))
         return cls(clip, to_triplet(clip), bare.frames)
 
     def evaluate(self, video: np.ndarray) -> dict[str, float]:

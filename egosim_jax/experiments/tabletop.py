@@ -63,7 +63,7 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Table:
     spec, size = generator.config.video, settings.batch_size
     seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
     scenes = [
-        HeldOutClip.make(seed, spec, kind)
+        HeldOutClip.make(seed, spec, kind, black_cloths=settings.black_cloths)
         for seed in track(seeds, f"making {kind} scenes", total=settings.scenes)
     ]
     table: Table = {}

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import rotation_z
+from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import (
     COLORS,
     LOOSE,
@@ -166,6 +167,11 @@ def with_cloths(scene: Scene, rng: np.random.Generator, most: int) -> Scene:
     In a prior they look like unobserved places, from which only the mask distinguishes them: other
     black is either a whole body or not observed, as the picture itself shows.
     """
+    if most < 0:
+        raise InputError(
+            f"{most} cloths cannot be put on a table: the number must be at least 0. "
+            "(--black-cloths)"
+        )
     paint = Paint(color=CLOTH_COLOR, second=CLOTH_COLOR, pattern="plain", scale_m=1.0)
     cloths = []
     for number in range(rng.integers(most + 1)):

@@ -143,6 +143,11 @@ def test_black_cloths_change_the_table_alone(clips):
     np.testing.assert_array_equal(again.frames, clips[0].frames)
 
 
+def test_fewer_than_no_cloths_are_refused():
+    with pytest.raises(InputError, match="--black-cloths"):
+        next(make_sequence(3, spec=SPEC, black_cloths=-1))
+
+
 def test_a_prior_does_not_distinguish_a_black_cloth_from_an_unobserved_place():
     spec = VideoSpec(frames=5, height=96, width=160)
     triplet = to_triplet(next(make_sequence(3, spec=spec, black_cloths=3)))
