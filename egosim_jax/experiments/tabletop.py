@@ -21,7 +21,7 @@ from egosim_jax.experiments.scenes import (
 )
 from egosim_jax.generator import Generator
 from egosim_jax.io.run import write_json
-from egosim_jax.metrics.report import print_table, summarize
+from egosim_jax.metrics.report import paired_difference, print_table, summarize
 from egosim_jax.progress import track
 from egosim_jax.types import Kind, check_counts
 
@@ -37,6 +37,10 @@ SPREAD = {
     "spread": "standard deviation over scenes (n - 1), each a mean over seeds",
     "spread_over_seeds": "standard deviation over seeds (n - 1), each a mean over scenes",
 }
+DIFFERENCES = {
+    "differences": "of the means over seeds of each scene, without a condition minus with all; "
+    "mean over scenes and 95 % interval by Student's t"
+}
 
 
 def run(settings: Tabletop) -> None:
@@ -50,16 +54,25 @@ def run(settings: Tabletop) -> None:
     )
     generator = open_experiment(settings)
     kinds: tuple[Kind, ...] = ("human", "robot")
-    tables = {kind: _compare(settings, kind, generator) for kind in kinds}
-    report = {"definitions": {**DEFINITIONS, **SPREAD}, "tables": tables}
+    found = {kind: _compare(settings, kind, generator) for kind in kinds}
+    report = {
+        "definitions": {**DEFINITIONS, **SPREAD, **DIFFERENCES},
+        "tables": {kind: table for kind, (table, _) in found.items()},
+        "differences": {kind: differences for kind, (_, differences) in found.items()},
+    }
     write_json(settings.out / "report.json", report)
-    for kind, table in tables.items():
+    for kind, (table, differences) in found.items():
         title = f"{kind}: mean ± spread over scenes (± over seeds)"
         print_table("", table, MEASURES, title=title)
+        title = f"{kind}: what dropping a condition changes, with its 95 % interval"
+        print_table("", differences, MEASURES, title=title)
 
 
-def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Table:
-    """Score every method on the scenes of one kind of hands, and draw their contact sheet."""
+def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> tuple[Table, Table]:
+    """Score every method on the scenes of one kind of hands, and draw their contact sheet.
+
+    Returns the table of the methods, and that of the differences from the first.
+    """
     spec, size = generator.config.video, settings.batch_size
     seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
     scenes = [
@@ -67,6 +80,7 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Table:
         for seed in track(seeds, f"making {kind} scenes", total=settings.scenes)
     ]
     table: Table = {}
+    by_scene: dict[str, list[dict[str, float]]] = {}
     shown: list[SheetClip] = []
     for name, dropped in METHODS:
         runs = []
@@ -78,7 +92,7 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Table:
                     scene.on_sheet({"generated": video})
                     for scene, video in zip(scenes, videos, strict=True)
                 ]
-        table[name] = summarize_runs(runs)
+        table[name], by_scene[name] = summarize_runs(runs), over_seeds(runs)
     others = {
         **baselines(scenes),
         "ground truth through the autoencoder": list(
@@ -90,7 +104,30 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Table:
         table[name] = summarize_runs([evaluate(scenes, videos)])
     sheet = settings.out / f"contact_sheet_{kind}.png"
     draw_sheet(shown[:SHEET_SCENES], sheet, moments=SHEET_MOMENTS)
-    return table
+    return table, differences_from("full", by_scene)
+
+
+def differences_from(
+    reference: str, by_scene: Mapping[str, Sequence[Mapping[str, float]]]
+) -> Table:
+    """Return how each method differs from a reference on the same scenes, by measure."""
+    start = by_scene[reference]
+    return {
+        name: {
+            measure: paired_difference(
+                [scores[measure] for scores in scenes], [scores[measure] for scores in start]
+            )
+            for measure in MEASURES
+            if measure in start[0]
+        }
+        for name, scenes in by_scene.items()
+        if name != reference
+    }
+
+
+def over_seeds(runs: Sequence[Sequence[Mapping[str, float]]]) -> list[dict[str, float]]:
+    """Return the means over seeds of each scene's scores."""
+    return [_means(scores) for scores in zip(*runs, strict=True)]
 
 
 def summarize_runs(
@@ -100,7 +137,7 @@ def summarize_runs(
 
     NaN, the score of a scene in which there is nothing to measure, is ignored.
     """
-    scenes = [_means(scores) for scores in zip(*runs, strict=True)]
+    scenes = over_seeds(runs)
     seeds = summarize([_means(scores) for scores in runs], MEASURES)
     return {
         name: {**summary, "spread_over_seeds": seeds[name]["spread"]}

@@ -52,12 +52,31 @@ def summarize(
     return summary
 
 
+def paired_difference(
+    values: Sequence[float], reference: Sequence[float], level: float = 0.95
+) -> dict[str, float]:
+    """Return the mean of `values - reference` over pairs and its confidence interval.
+
+    By Student's t; pairs with NaN are ignored, and fewer than two have an infinite interval.
+    """
+    from scipy.stats import t
+
+    pairs = np.subtract(values, reference)
+    mean, spread = mean_and_spread(pairs)
+    count = int((~np.isnan(pairs)).sum())
+    half = np.inf
+    if count > 1:
+        half = float(t.ppf((1 + level) / 2, count - 1)) * spread / count**0.5
+    return {"mean": mean, "low": mean - half, "high": mean + half}
+
+
 def print_table(
     corner: str, rows: Mapping[str, Summary], measures: Measures, *, title: str | None = None
 ) -> None:
     """Print a row for each summary, as mean ± spread; `corner` heads the column of row names.
 
-    The cell of a missing measure is empty; a `spread_over_seeds` is appended in parentheses.
+    The cell of a missing measure is empty; a `spread_over_seeds` is appended in parentheses, an
+    interval from `low` to `high` in brackets.
     """
     from rich.console import Console
     from rich.table import Table
@@ -71,5 +90,7 @@ def print_table(
 
 def _cell(value: Mapping[str, float], form: str) -> str:
     text = " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)
+    if "low" in value:
+        text = f"{text} [{form.format(value['low'])}, {form.format(value['high'])}]"
     seeds = value.get("spread_over_seeds")
     return text if seeds is None else f"{text} (± {form.format(seeds)})"

@@ -289,11 +289,10 @@ class Judge:
         )
         videos = list(make(generator, self.clips, batch_size=4))
         found = scenes.evaluate(self.clips, videos)
-        alex, vgg = lpips.Lpips.load("alex"), lpips.Lpips.load("vgg")
+        vgg = lpips.Lpips.load("vgg")
         for clip, video, row in zip(self.clips, videos, found, strict=True):
-            ours, theirs = video[1:], clip.clip.frames[1:]
-            row["lpips_alex"] = float(lpips.frame_distances(alex, ours, theirs).mean())
-            row["lpips_vgg"] = float(lpips.frame_distances(vgg, ours[::4], theirs[::4]).mean())
+            ours, theirs = video[1::4], clip.clip.frames[1::4]
+            row["lpips_vgg"] = float(lpips.frame_distances(vgg, ours, theirs).mean())
         return {name: float(np.nanmean([row[name] for row in found])) for name in found[0]}
 
 

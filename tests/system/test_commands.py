@@ -224,9 +224,15 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
     counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2"]
     assert main(["experiment", "tabletop", *fixed, *counts]) == 0
     assert json.loads((out / "config.json").read_text("utf-8"))["model"]["steps"] == 2
-    tables = json.loads((out / "report.json").read_text("utf-8"))["tables"]
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    tables = report["tables"]
     assert tables.keys() == {"human", "robot"}
-    human = tables["human"]
+    human, differences = tables["human"], report["differences"]["human"]
+    assert differences.keys() == {"without prior", "without mask", "without hands"}
+    dropped = differences["without prior"]["psnr"]
+    want = human["without prior"]["psnr"]["mean"] - human["full"]["psnr"]["mean"]
+    assert dropped["mean"] == pytest.approx(want)
+    assert dropped["low"] < dropped["mean"] < dropped["high"]
     assert human.keys() >= {"full", "without prior", "without mask", "without hands"}
     assert human["ground truth"]["psnr"]["mean"] == 100
     assert human["ground truth"]["hand_iou"]["mean"] > 0.7

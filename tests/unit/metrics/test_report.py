@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from egosim_jax.metrics.report import mean_and_spread, print_table, summarize
+from egosim_jax.metrics.report import (
+    mean_and_spread,
+    paired_difference,
+    print_table,
+    summarize,
+)
 
 
 def test_a_summary_is_mean_and_sample_deviation():
@@ -22,6 +27,25 @@ def test_a_single_clip_has_no_spread():
 def test_nan_is_ignored():
     assert mean_and_spread([1.0, np.nan, 3.0]) == (2.0, pytest.approx(2**0.5))
     assert np.isnan(mean_and_spread([np.nan])[0])
+
+
+def test_a_paired_difference_has_the_interval_of_students_t():
+    difference = paired_difference([3.0, 5.0, np.nan, 7.0], [2.0, 3.0, 1.0, 4.0])
+    assert difference["mean"] == pytest.approx(2.0)
+    # Three differences that deviate by 1: t = 4.303 for two degrees of freedom.
+    half = 4.302653 / 3**0.5
+    assert difference["low"] == pytest.approx(2.0 - half)
+    assert difference["high"] == pytest.approx(2.0 + half)
+
+
+def test_a_single_pair_excludes_nothing():
+    assert paired_difference([3.0], [2.0]) == {"mean": 1.0, "low": -np.inf, "high": np.inf}
+
+
+def test_an_interval_is_in_brackets(capsys):
+    row = {"psnr": {"mean": -1.0, "low": -1.5, "high": -0.5}}
+    print_table("", {"without prior": row}, {"psnr": ("PSNR dB", "{:.2f}")})
+    assert "-1.00 [-1.50, -0.50]" in capsys.readouterr().out
 
 
 def test_a_table_has_mean_and_spreads_and_empty_cells(capsys):
