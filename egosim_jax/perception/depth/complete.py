@@ -72,7 +72,7 @@ class Diffusion:
         diagonal = confidence.ravel() + total
         matrix = diags_array(
             [diagonal, -right[:-1], -right[:-1], -below[:-width], -below[:-width]],
-            offsets=[0, 1, -1, width, -width],
+            offsets=np.array([0, 1, -1, width, -width]),  # pyright: ignore[reportArgumentType]
         ).tocsr()
         known = np.where(confidence > 0, confidence * measured, 0).ravel()
         solved, _ = cg(

@@ -10,8 +10,10 @@ from egosim_jax.geometry import invert, pixel_rays
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.types import Cameras
 
+METRIC_DISTANCE_M = 0.6
+"""Distance of the plane from cameras in meters."""
 MAX_DEPTH = 10.0
-"""Depth in units of the plane's distance beyond which a turned camera's view of it is unknown."""
+"""Depth, in distances of the plane, beyond which a turned camera's view of it is unknown."""
 
 
 def has_parallax(estimate: CameraEstimate) -> bool:
@@ -23,13 +25,15 @@ def has_parallax(estimate: CameraEstimate) -> bool:
 
 
 def plane_depth_estimate(
-    estimate: CameraEstimate, cameras: Cameras, wanted: Sequence[int], *, distance: float = 1.0
+    estimate: CameraEstimate, cameras: Cameras, wanted: Sequence[int], *, why: str
 ) -> DepthEstimate:
-    """Return the depth of a plane across the first camera's view, at a distance in its unit.
+    """Return the depth of a plane across the first camera's view, with the reason in words.
 
-    No pixel is confident. The scale from hands then puts the plane where hands touch it, and a
+    No pixel is confident. The plane is at distance 1 of a camera whose unit is not known: the scale
+    from hands then puts it where hands touch it. Metric cameras see it at `METRIC_DISTANCE_M`. A
     prior that is rendered from it is the first frame, turned as the camera turns.
     """
+    distance = METRIC_DISTANCE_M if estimate.metric else 1.0
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     depths = []
     for frame in wanted:
@@ -42,7 +46,6 @@ def plane_depth_estimate(
         frames=np.array(wanted, np.int32),
         depth_m=np.stack(depths),
         confident=np.zeros((len(depths), cameras.height, cameras.width), bool),
-        metric=False,
-        reason=f"assumed: the camera does not change its place ({estimate.verdict.rung}), so that "
-        "depth cannot be measured; a plane at the distance of the hands stands for the scene",
+        metric=estimate.metric,
+        reason=f"assumed, not measured: {why}; a plane across the first view replaces the scene",
     )

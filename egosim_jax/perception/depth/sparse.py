@@ -61,11 +61,11 @@ class SparseFilter:
         self, pixels: Float[np.ndarray, "n 2"], inverse: Float[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
         """Return which inverse depths are like those of their neighbors in the picture."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         if len(pixels) <= self.neighbors:
             return np.ones(len(pixels), bool)
-        _, near = cKDTree(pixels).query(pixels, k=self.neighbors + 1)
+        near = np.asarray(KDTree(pixels).query(pixels, k=self.neighbors + 1)[1])
         around = inverse[near[:, 1:]]
         median = np.median(around, axis=1)
         spread = np.median(np.abs(around - median[:, None]), axis=1)

@@ -55,8 +55,8 @@ class PlaneSweep:
     """Smallest correlation of a confident pixel."""
     min_texture: float = 0.01
     """Smallest standard deviation of gray levels from 0 to 1 in a confident pixel's window."""
-    second_peak: float = 0.05
-    """Smallest lead of the best plane over any that is not next to it, in units of correlation."""
+    second_peak: float = 0.02
+    """Smallest lead of the best plane over those more than three planes away, in correlation."""
 
     def __post_init__(self) -> None:
         """Check the counts."""
@@ -131,7 +131,8 @@ class PlaneSweep:
         place = np.where(best == inner, inner + np.clip(offset, -0.5, 0.5), best)
         score = scores.max(axis=0)
         planes = np.arange(count)[:, None, None]
-        second = np.where(np.abs(planes - best) > 3, scores, np.float32(-1)).max(axis=0)
+        other = np.abs(planes - best) > 3
+        second = np.where(other, scores, np.float32(-1)).max(axis=0)
         confident = (score > self.min_score) & (deviation > self.min_texture) & ~hidden
         confident &= (score - second > self.second_peak) & (best > 0) & (best < count - 1)
         step = inverses[1] - inverses[0]

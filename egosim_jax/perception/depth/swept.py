@@ -13,6 +13,7 @@ from egosim_jax.perception.depth.complete import Diffusion
 from egosim_jax.perception.depth.planes import has_parallax, plane_depth_estimate
 from egosim_jax.perception.depth.sparse import SparseFilter
 from egosim_jax.perception.depth.sweep import PlaneSweep, choose_views
+from egosim_jax.perception.depth.triangulate import Triangulation
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.types import Cameras, InputError, check_counts
 
@@ -24,11 +25,17 @@ class SweptDepth:
     downscale: int = 2
     """Factor by which frames are reduced before the sweep."""
     percentiles: tuple[float, float] = (1.0, 99.0)
-    """Percentiles of the sparse points' depths between which planes are swept."""
+    """Percentiles of the sparse points' inverse depths between which planes are swept."""
     margin: float = 0.1
     """Widening of that range, relative to the inverse depths at its ends."""
+    min_ratio: float = 2.0
+    """Least ratio of the farthest plane's depth to the nearest one's."""
     sparse_weight: float = 4.0
     """Weight of a sparse point in the completion, versus a confident pixel of the sweep."""
+    min_points: int = 20
+    """Fewest trusted points of a frame whose depth is measured."""
+    triangulation: Triangulation = field(default_factory=Triangulation)
+    """Triangulation of points where the cameras have none."""
     points: SparseFilter = field(default_factory=SparseFilter)
     """Selection of sparse points."""
     sweep: PlaneSweep = field(default_factory=PlaneSweep)
@@ -49,9 +56,10 @@ class SweptDepth:
     ) -> DepthEstimate:
         """Return depth of the wanted frames in the unit of the cameras, known everywhere.
 
-        What `moving` hides is completed from around it. Cameras that stay in place have no
-        parallax: then depth is that of a plane, and the estimate's `reason` says so. Raises
-        `InputError` if cameras were refused, or have no triangulated points.
+        What `moving` hides is completed from around it. Cameras without triangulated points, such
+        as a dataset's, get them by tracked corners. If cameras stay in place, or fewer than
+        `min_points` points show parallax in a frame, depth is that of a plane, and the estimate's
+        `reason` says so. Raises `InputError` if cameras were refused.
         """
         cameras = estimate.cameras
         if cameras is None:
@@ -60,16 +68,16 @@ class SweptDepth:
                 f"{estimate.verdict.reason}. Give cameras, or a depth network. (--depth)"
             )
         if not has_parallax(estimate):
-            return plane_depth_estimate(estimate, cameras, wanted)
-        if estimate.points is None:
-            raise InputError(
-                "Depth cannot be swept without triangulated points, which give its range. Give "
-                "them with the cameras, or a depth network. (--depth)"
-            )
+            why = f"the camera does not change its place ({estimate.verdict.rung})"
+            return plane_depth_estimate(estimate, cameras, wanted, why=why)
         small, hidden, reduced = reduce_video(frames, moving, cameras, self.downscale)
         depths, measured = [], []
         for frame in wanted:
-            pixels, depth = self.points(estimate.points, cameras, frame, moving[frame])
+            points = estimate.points or self.triangulation(frames, moving, cameras, frame)
+            pixels, depth = self.points(points, cameras, frame, moving[frame])
+            if len(depth) < self.min_points:
+                why = f"{len(depth)} points of frame {frame} show parallax"
+                return plane_depth_estimate(estimate, cameras, wanted, why=why)
             pixels = (pixels + 0.5) / self.downscale - 0.5
             inverse, known = self._frame(small, hidden, reduced, frame, pixels, depth)
             depths.append(1 / _enlarge(inverse, cameras))
@@ -92,13 +100,9 @@ class SweptDepth:
         depth: Float[np.ndarray, " n"],
     ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
         """Return the completed inverse depth of a reduced frame, and where it was measured."""
-        if len(depth) < 2:
-            raise InputError(
-                f"Frame {frame} observes {len(depth)} triangulated points that can be trusted: at "
-                "least 2 are needed for the range of its depth. Give a depth network. (--depth)"
-            )
-        far, near = np.percentile(1 / depth, [100 - p for p in self.percentiles[::-1]])
-        far, near = float(far) * (1 - self.margin), float(near) * (1 + self.margin)
+        far, near = (float(np.percentile(1 / depth, p)) for p in self.percentiles)
+        widen = max(1 + self.margin, float(np.sqrt(self.min_ratio * far / near)))
+        far, near = far / widen, near * widen
         views = choose_views(cameras, frame, float(np.median(depth)), self.sweep.views)
         swept = self.sweep(frames, hidden, cameras, frame, views, (far, near))
         weight = swept.confident.astype(float)

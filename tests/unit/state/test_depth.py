@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from egosim_jax.geometry import look_at
+from egosim_jax.geometry import look_at, pixel_rays
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import Cameras, InputError
@@ -31,6 +31,25 @@ def test_the_state_seen_from_its_camera_is_the_image():
     np.testing.assert_allclose(view.depth_m[0][known], depth_m[known], rtol=1e-5)
     np.testing.assert_array_equal(view.object_ids[0][known], ids[known])
     assert not view.frames[0][~known].any()
+
+
+def test_split_pixels_lie_on_the_same_plane_and_leave_no_gaps_nearby():
+    rays = pixel_rays(INTRINSICS, height=24, width=40)
+    normal = np.array([0.1, 0.6, 0.8])
+    depth_m = 1 / (rays @ normal)
+    depth_m[:, 20:] *= 2
+    depth_m[3, 3] = np.inf
+    image = np.full((24, 40, 3), 90, np.uint8)
+    state = state_from_depth(image, depth_m, INTRINSICS, np.eye(4), points_per_pixel=2)
+    assert len(state.points_m) == 4 * (24 * 40 - 1)
+    height = state.points_m @ normal
+    inner = np.minimum(np.abs(height - 1), np.abs(height - 2))
+    assert np.median(inner) < 1e-6
+    assert inner.max() < 0.03
+    near = np.eye(4)
+    near[2, 3] = 0.4
+    cameras = Cameras(world_from_camera=near[None], intrinsics_px=INTRINSICS, height=24, width=40)
+    assert np.isfinite(render(state, cameras, point_px=1).depth_m[0, 8:16, 10:16]).all()
 
 
 @pytest.mark.parametrize(

@@ -84,6 +84,17 @@ def test_without_parallax_depth_is_a_plane_and_says_so(clip, moving, rung):
     assert "assumed" in found.reason
 
 
+def test_metric_cameras_that_hardly_move_see_a_plane_in_meters(clip, moving):
+    estimate = replace(estimate_of(clip, points=False), metric=True)
+    poses = estimate.cameras.world_from_camera.copy()
+    poses[:, :3, 3] = poses[0, :3, 3] + 1e-4 * np.arange(len(poses))[:, None]
+    estimate = replace(estimate, cameras=replace(estimate.cameras, world_from_camera=poses))
+    found = SweptDepth()(clip.frames[:1].repeat(9, axis=0), moving, estimate, [0])
+    assert found.metric
+    assert "parallax" in found.reason
+    np.testing.assert_allclose(np.median(found.depth_m), 0.6, rtol=0.01)
+
+
 def test_refused_cameras_are_refused(clip, moving):
     refused = replace(estimate_of(clip), cameras=None)
     with pytest.raises(InputError, match="refused"):
