@@ -50,7 +50,12 @@ def finger_masks(frame: np.ndarray) -> np.ndarray:
 
 def sphere_centers(masks: np.ndarray) -> list[np.ndarray]:
     """Return centers of each finger's spheres, `n 2`: places wider than the tubes around them."""
-    depths = [cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in masks]
+    rows, columns = (np.flatnonzero(masks.any((0, axis))) for axis in (2, 1))
+    if not len(rows):
+        return [np.zeros((0, 2))] * len(masks)
+    top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+    masks = masks[:, top : rows[-1] + 2, left : columns[-1] + 2].astype(np.uint8)
+    depths = [cv2.distanceTransform(mask, cv2.DIST_L2, 5) for mask in masks]
     radius = np.median([depth.max() for depth in depths if depth.max() > 2] or [np.inf])
     reach = 2 * round(1.5 * min(radius, 20)) + 1
     centers = []
@@ -62,7 +67,7 @@ def sphere_centers(masks: np.ndarray) -> list[np.ndarray]:
         width = cv2.boxFilter(depth * ridge, -1, around, normalize=False) / np.maximum(count, 1)
         peaks = smooth >= cv2.dilate(smooth, np.ones((reach, reach)))
         peaks &= (depth >= 0.6 * radius) & (depth >= 1.15 * width)
-        centers.append(np.argwhere(peaks)[:, ::-1].astype(float))
+        centers.append(np.argwhere(peaks)[:, ::-1] + np.array([left, top], float))
     return centers
 
 
