@@ -2,7 +2,7 @@
 
 An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
 
-    hands     landmarks                                   perception.hands
+    hands     litert, jax                                 perception.hands, networks.hands
     masks     geometry, sam3=FOLDER, grounded-sam3=FOLDER, grounded-sam2=FOLDER,
               grounded-edgetam=FOLDER                     perception.silhouettes, networks
     cameras   ladder                                      perception.cameras
@@ -91,6 +91,8 @@ class AnnotateConfig:
     """Shots, windows and quality."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""
+    hands: Literal["litert", "jax"] = "litert"
+    """Program of the hand networks: LiteRT on the CPU, or JAX, in batches on an accelerator."""
     offline: bool = False
     """Refuse to fetch anything."""
     side: Side = "auto"
@@ -180,12 +182,22 @@ class AnnotateConfig:
         kind = _import(_DEPTH[name])
         depth = kind() if folder is None else kind(folder, device=self.device)
         return Estimators(
-            hands=LandmarkHands(weights=self.hand_weights, offline=self.offline),
+            hands=LandmarkHands(
+                weights=self.hand_weights, offline=self.offline, networks=self._hand_networks()
+            ),
             cameras=CameraLadder(**ladder),
             depth=cast(DepthEstimator, depth),
             segmenter=segmenter,
             captioner=captioner,
         )
+
+    def _hand_networks(self) -> Any:
+        """Return the networks that replace LiteRT, or None."""
+        if self.hands == "litert":
+            return None
+        from egosim_jax.perception.networks.hands import JaxHandNetworks
+
+        return JaxHandNetworks(self.hand_weights, self.offline)
 
 
 def _find(known: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:

@@ -61,6 +61,8 @@ class Annotate:
     """Smallest PSNR of the prior in decibels, compared with that of the first frame repeated."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""
+    hands: Literal["litert", "jax"] = "litert"
+    """Program of the hand networks: LiteRT on the CPU, or JAX, in batches on an accelerator."""
     offline: bool = False
     """Fetch nothing: refuse if something is missing."""
     side: Literal["auto", "left", "right"] = "auto"
@@ -181,6 +183,7 @@ class Annotate:
             sampling=Sampling(size=size, fps=fps, num_frames=count),
             cutting=Cutting(clips=self.clips, quality=quality),
             hand_weights=self.hand_weights,
+            hands=self.hands,
             offline=self.offline,
             side=self.side,
             masks=self.masks,

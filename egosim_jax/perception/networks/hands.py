@@ -1,6 +1,6 @@
 """MediaPipe's hand networks as batched JAX programs, for accelerators.
 
-    LandmarkHands(networks=JaxHandNetworks(*weights.files()))
+    LandmarkHands(networks=JaxHandNetworks())
 
 On a CPU, LiteRT is many times as fast, because XLA's depthwise convolutions are slow there. Results
 agree to less than a thousandth of a pixel.
@@ -8,26 +8,37 @@ agree to less than a thousandth of a pixel.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import jax
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from egosim_jax.perception.hands.weights import files
 from egosim_jax.perception.networks.tflite import Program, read_program
 
 
+@dataclass(frozen=True)
 class JaxHandNetworks:
     """Palm detector and landmark network (`hands.detect.HandNetworks`), in batches."""
 
-    def __init__(self, palms: Path, landmarks: Path):
-        self._palms, self._landmarks = BatchedNetwork(palms), BatchedNetwork(landmarks)
+    weights: Path | None = None
+    """Folder of the two tflite files; None for those in the user's cache, fetched if need be."""
+    offline: bool = False
+    """True to refuse instead of fetching weights."""
+
+    @cached_property
+    def _networks(self) -> tuple[BatchedNetwork, BatchedNetwork]:
+        palms, landmarks = files(self.weights, offline=self.offline)
+        return BatchedNetwork(palms), BatchedNetwork(landmarks)
 
     def palms(
         self, pictures: UInt8[np.ndarray, "b 192 192 3"]
     ) -> tuple[Float32[np.ndarray, "b 2016 18"], Float32[np.ndarray, "b 2016"]]:
         """Return boxes with keypoints relative to the anchors, and logits."""
-        boxes, logits = self._palms(pictures)
+        boxes, logits = self._networks[0](pictures)
         return boxes, logits[..., 0]
 
     def landmarks(
@@ -39,7 +50,7 @@ class JaxHandNetworks:
         Float32[np.ndarray, "b 21 3"],
     ]:
         """Return keypoints in crop pixels, presence, probability of a right hand, and meters."""
-        joints, presence, right, meters = self._landmarks(pictures)
+        joints, presence, right, meters = self._networks[1](pictures)
         return joints.reshape(-1, 21, 3), presence[:, 0], right[:, 0], meters.reshape(-1, 21, 3)
 
 

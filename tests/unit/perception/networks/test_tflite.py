@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from egosim_jax.perception.networks.hands import BatchedNetwork
+from egosim_jax.annotate.config import AnnotateConfig
+from egosim_jax.perception.networks.hands import BatchedNetwork, JaxHandNetworks
 from egosim_jax.perception.networks.tflite import read_program
 from egosim_jax.types import InputError
 
@@ -95,3 +96,11 @@ def test_damaged_bytes_are_refused_or_read_but_never_crash(network, tmp_path):
         except InputError:
             refused += 1
     assert refused > 30
+
+
+def test_an_annotation_finds_hands_by_jax_on_request(tmp_path):
+    config = AnnotateConfig(hand_weights=tmp_path, hands="jax")
+    hands = config.build().hands
+    assert hands.networks == JaxHandNetworks(tmp_path)
+    with pytest.raises(InputError, match=r"palm_detection_full\.tflite cannot be read"):
+        hands(np.zeros((1, 48, 64, 3), np.uint8))
