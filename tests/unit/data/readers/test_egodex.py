@@ -1,11 +1,16 @@
 """EgoDex: cameras, joint order and captions of a tiny episode, and hostile HDF5 files."""
 
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import h5py
 import numpy as np
 import pytest
 
 from egosim_jax.data.readers.egodex import JOINT_NAMES, SIDES, EgoDex
 from egosim_jax.geometry import invert, project, transform
+from tests.captures import World
 
 METACARPALS = [f"{f}FingerMetacarpal" for f in ("Index", "Middle", "Ring", "Little")]
 BODY = ["hip", *(f"spine{n}" for n in range(1, 8)), *(f"neck{n}" for n in range(1, 5))]
@@ -47,6 +52,21 @@ def write_episode(world, path, *, confidence=1.0, attributes=None):
     return path
 
 
+@cache
+def sample():
+    """The bytes of a default episode's files, by suffix: most tests change a copy."""
+    with TemporaryDirectory() as folder:
+        path = write_episode(World(), Path(folder) / "0.hdf5")
+        return {suffix: path.with_suffix(suffix).read_bytes() for suffix in (".hdf5", ".mp4")}
+
+
+def copy_episode(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for suffix, data in sample().items():
+        path.with_suffix(suffix).write_bytes(data)
+    return path
+
+
 def test_cameras_hands_and_texts_are_read(world, tmp_path, imported):
     write_episode(world, tmp_path / "set/part1/fold/0.hdf5")
     done, problems = imported(EgoDex(source=tmp_path / "set"))
@@ -83,10 +103,10 @@ def test_a_hand_of_low_confidence_is_missing(world, tmp_path, imported):
     assert np.isfinite(recording.joints_m[:, 1]).all()
 
 
-def test_a_bad_episode_is_named_and_the_others_are_imported(world, tmp_path, imported):
+def test_a_bad_episode_is_named_and_the_others_are_imported(tmp_path, imported):
     source = tmp_path / "set"
     for number in range(6):
-        write_episode(world, source / f"{number}.hdf5")
+        copy_episode(source / f"{number}.hdf5")
     data = (source / "1.hdf5").read_bytes()
     (source / "1.hdf5").write_bytes(data[: len(data) // 3])
     (source / "2.mp4").unlink()
@@ -127,16 +147,16 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_a_hostile_file_is_refused(world, tmp_path, imported, kind):
-    write_episode(world, tmp_path / "0.hdf5")
+def test_a_hostile_file_is_refused(tmp_path, imported, kind):
+    copy_episode(tmp_path / "0.hdf5")
     replace(tmp_path / "0.hdf5", "transforms/camera", HOSTILE[kind])
     done, problems = imported(EgoDex(source=tmp_path))
     assert not done
     assert "transforms/camera" in problems["0"]
 
 
-def test_a_filter_that_needs_a_plugin_is_refused(world, tmp_path, imported):
-    write_episode(world, tmp_path / "0.hdf5")
+def test_a_filter_that_needs_a_plugin_is_refused(tmp_path, imported):
+    copy_episode(tmp_path / "0.hdf5")
 
     def make(file):
         plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
