@@ -18,7 +18,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -157,7 +157,7 @@ def train_vae(settings: Settings, changes: Mapping[str, Any]) -> Trained:
     recipe = replace(TABLETOP_VAE, vae=replace(TABLETOP_VAE.vae, optimizer=optimizer), **changes)
     task, training = recipe.stages()["vae"]
     if critic:
-        task = Adversarial(**{f.name: getattr(task, f.name) for f in fields(task)})
+        task = Adversarial(**vars(task))
     return spend(settings, Stage(task, training), settings.frames, random=False)
 
 

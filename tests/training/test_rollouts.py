@@ -1,6 +1,7 @@
 """Priors from states of a model's own rollouts."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ def clips():
     return list(make_sequence(3, spec=SPEC, clips=3))
 
 
-def states_of(clips, monkeypatch, generate, perception):
+def states_of(clips, monkeypatch, generate, perception) -> list[Any]:
     monkeypatch.setattr(rollouts, "load_generator", lambda config, weights: (generate, SPEC.fps))
     make = OwnRollouts(config="tiny", weights=Path(), digests={}, perceptions=(perception,))
     return list(make(clips))

@@ -97,10 +97,11 @@ class Refining(Autoencoding):
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return PSNR and LPIPS of the reconstruction from the mean latents."""
-        metrics = super().validate(networks.vae, batch)
+        vae: Any = networks.vae
+        metrics = super().validate(vae, batch)
         if self.perceptual_weight:
             video = to_model(batch["video"])
-            decoded = networks.vae.decode_whole(networks.vae.moments(video)[0])
+            decoded = vae.decode_whole(vae.moments(video)[0])
             metrics["lpips"] = _lpips(decoded.clip(-1, 1), video)
         return metrics
 
