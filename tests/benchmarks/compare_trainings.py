@@ -276,10 +276,8 @@ class Judge:
         if "dit" in parts:
             model = replace(model, dit=parts["dit"].config)
         others = [name for name in ("dit", "vae", "text", "image") if name not in parts]
-        networks = Networks.load(model, self.settings.weights, only=others)
-        for name, network in parts.items():
-            setattr(networks, name, network)
-        return self.score(model, networks)
+        given = Networks.load(model, self.settings.weights, only=others)
+        return self.score(model, Networks(**given.parts(), **parts))
 
     def score(self, model: ModelConfig, networks: Networks) -> dict[str, float]:
         """Return means over the scenes."""
