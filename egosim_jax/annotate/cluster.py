@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from egosim_jax.annotate import clip
 from egosim_jax.annotate.clip import Job
@@ -84,7 +84,7 @@ def annotate_on_ray(
         data = ray.data.from_items(rows, override_num_blocks=min(len(rows), 1000))
         for stage, gpu, most in zip((FirstStages, LastStages), gpus, actors, strict=True):
             data = data.map(
-                stage,
+                cast(Any, stage),
                 fn_constructor_args=(str(out), config),
                 compute=ray.data.ActorPoolStrategy(min_size=1, max_size=max(1, most)),
                 num_gpus=gpu or None,
@@ -107,7 +107,9 @@ def _connect(address: str) -> None:
     if not alone:
         ray.init(address=None if address == "auto" else address, log_to_driver=False)
         return
-    ray.init(address="local", include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init(
+        address="local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+    )
     if (listens := ray.util.get_node_ip_address()) != LOOPBACK:
         ray.shutdown()
         raise InputError(

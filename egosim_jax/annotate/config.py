@@ -77,8 +77,8 @@ class Estimators:
                 files(part.weights, offline=part.offline)
             elif isinstance(part, CameraLadder) and part.rung not in ("static", "rotation"):
                 require_pycolmap()
-            elif hasattr(part, "check_installed"):
-                part.check_installed()
+            elif (check := getattr(part, "check_installed", None)) is not None:
+                check()
 
 
 @dataclass(frozen=True, kw_only=True)

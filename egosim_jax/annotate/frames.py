@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from math import ceil
 from typing import no_type_check
 
 import numpy as np
@@ -112,7 +113,7 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     Raises `InputError` for one that is too short or too long, or of another shape than the size.
     """
     name = quote_path(recording.video)
-    fps = recording.fps / int(np.ceil(recording.fps / MAX_FPS))
+    fps = recording.fps / ceil(recording.fps / MAX_FPS)
     if sampling.fps is not None:
         fps = Fraction(sampling.fps).limit_denominator(1001)
     count = int((recording.frames - 1) * fps / recording.fps + Fraction(1, 2)) + 1

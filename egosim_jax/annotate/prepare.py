@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import no_type_check
+from typing import Any, cast, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -140,7 +140,7 @@ def scan(recording: Recording, fitted: Plan) -> Scan:
             change, speed = 0.0, np.zeros(1)
             if before is not None:
                 change = float(np.abs(small.astype(int) - before[0]).mean())
-                moved = flow.calc(before[1], small_gray, None)
+                moved = flow.calc(before[1], small_gray, cast(Any, None))
                 speed = np.linalg.norm(moved, axis=-1) * fps / THUMB_PX
             low_high = np.percentile(speed, (50, 95))
             sharpness = cv2.Laplacian(gray, cv2.CV_32F).var()

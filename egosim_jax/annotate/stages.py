@@ -260,7 +260,7 @@ def _given_points(record: Record) -> SparsePoints | None:
         points_m=points.points_m.astype(float),
         error_px=np.zeros(len(points.points_m)) if errors is None else plan.scale * errors,
         frames=clip_frame[points.frames[kept]].astype(np.int32),
-        indices=points.indices[kept],
+        indices=np.asarray(points.indices)[kept],
         pixels_px=fitted,
     )
 
