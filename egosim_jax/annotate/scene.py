@@ -41,22 +41,29 @@ POINT_PX = 2
 def find_scale(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
     """Bring cameras, depth and joints to meters; note the scale, its source and uncertainty."""
     from egosim_jax.perception.hands import lift
-    from egosim_jax.perception.scale import estimate_scale, scale_cameras, scale_depth
+    from egosim_jax.perception.scale import Scale, estimate_scale, scale_cameras, scale_depth
 
     estimate, depth = record.require("estimate"), record.require("depth")
     joints = None if record.hands is None else lift(record.hands, record.cameras.intrinsics_px)
-    scene, metric_depth = depth, None
-    if depth.metric and not estimate.metric:
-        scene, metric_depth = _sparse_depth(record), depth
-    scale = estimate_scale(
-        estimate,
-        scene,
-        joints,
-        record.moving,
-        meters_per_unit=config.scale,
-        camera_height_m=config.camera_height_m,
-        metric_depth=metric_depth,
-    )
+    still = depth.metric and not estimate.metric and estimate.points is None
+    if still and config.scale is None:
+        scale = Scale(
+            meters_per_unit=1.0,
+            uncertainty=0.0,
+            source="metric depth",
+            reason="depth is in meters, and the camera stays in its place",
+        )
+    else:
+        moved = depth.metric and not estimate.metric and estimate.points is not None
+        scale = estimate_scale(
+            estimate,
+            _sparse_depth(record) if moved else depth,
+            joints,
+            record.moving,
+            meters_per_unit=config.scale,
+            camera_height_m=config.camera_height_m,
+            metric_depth=depth if moved else None,
+        )
     record = record.add(
         "scale", asdict(scale),
         estimate=scale_cameras(estimate, scale), depth=scale_depth(depth, scale),
@@ -65,15 +72,9 @@ def find_scale(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
 
 
 def _sparse_depth(record: Record) -> DepthEstimate:
-    """Return the triangulated points as depth of the first frame, in the unit of the cameras.
-
-    Of a camera without points, which does not move, the depth itself is returned: its unit does not
-    matter.
-    """
-    estimate, depth = record.require("estimate"), record.require("depth")
+    """Return the triangulated points as depth of the first frame, in the unit of the cameras."""
+    estimate = record.require("estimate")
     points, cameras = estimate.points, estimate.cameras
-    if points is None:
-        return depth
     own = points.frames == 0
     local = transform(invert(cameras.world_from_camera[0]), points.points_m[points.indices[own]])
     row, column, inside = pixels_of(cameras, local)
