@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from egosim_jax.train.bundle import write_bundle
 from egosim_jax.train.bundled import FILES, LATENTS, Latents, main
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.loop import train
+from egosim_jax.train.recipes import TABLETOP
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
@@ -173,6 +175,26 @@ def test_every_file_has_its_hash_and_no_code_is_missing(written):
     files = {str(p.relative_to(written)) for p in written.rglob("*") if p.is_file()} - {FILES}
     assert hashes.keys() == files
     assert {"egosim_jax/train/bundled.py", "recipe.json", "weights/dit.safetensors"} <= files
+
+
+@pytest.mark.slow
+def test_a_recipe_writes_its_clips_and_weights_into_a_bundle(weights, tmp_path):
+    out = tmp_path / "b"
+    recipe = replace(
+        TABLETOP,
+        config="debug",
+        denoiser=STAGE.training,
+        scenes=2,
+        held_out=1,
+        weights=weights,
+        bundle=out,
+    )
+    assert recipe.train() == ExitCode.DONE
+    assert [len(Latents(out, split)) for split in ("train", "test")] == [4, 1]
+    written = bundled.BundleRecipe.read(out, "cpu")
+    assert (written.task, written.training) == recipe.stages()["denoiser"]
+    assert written.weights == out / "weights"
+    assert (tmp_path / "b_data" / "latents").is_dir()
 
 
 def test_an_existing_bundle_is_refused_before_any_work(written, capsys):
