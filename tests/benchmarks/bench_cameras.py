@@ -4,8 +4,9 @@
 
 FOLDER has dwm_triplets, real_clips and raw_clips. The hands of the published hand videos, widened
 and prolonged to the lower border, are masked. Each clip has the rungs that are right for it; any
-other one is printed as WRONG. A reconstruction whose focal length is off by a tenth of the device's
-counts as degenerate. The thresholds of the gate were set on the first half of the clips.
+other one is printed as WRONG, and so is a focal length that is off by a tenth of the device's. At
+the end, the gate's figures of accepted and of refused reconstructions for each half of the clips:
+a threshold that is between them in the first half is tried on the second.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import tyro
 
 from egosim_jax.io.video import read_video
 from egosim_jax.perception.cameras import CameraLadder, ColmapConfig
-from egosim_jax.perception.estimates import CameraEstimate, Rung
+from egosim_jax.perception.estimates import CameraEstimate, Rung, Verdict
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def main(
         clips: Names of those to run.
         threads: Of COLMAP; 1 makes it reproducible.
     """
-    wrong = 0
+    wrong, tried = 0, []
     for name in clips:
         clip = CLIPS[name]
         frames, moving = load(folder, clip)
@@ -84,9 +85,26 @@ def main(
             f"{seconds:.0f} s\n  {found.verdict.reason}"
         )
         print("  " + json.dumps({n: float(f"{v:.4g}") for n, v in found.verdict.figures.items()}))
+        tried.append((clip.half, found.verdict))
         if out is not None:
             save(out / f"{name}.npz", found)
     print(f"{len(clips) - wrong} of {len(clips)} verdicts right")
+    print("\n".join(margins(tried)))
+
+
+def margins(tried: list[tuple[int, Verdict]]) -> list[str]:
+    """Return a line for each figure of the gate: its values where accepted and where refused."""
+    lines = []
+    for half in (1, 2):
+        for figure in ("registered", "depth_spread", "radial", "angle_deg", "step", "view_deg"):
+            values: dict[bool, list[float]] = {True: [], False: []}
+            for _, verdict in (one for one in tried if one[0] == half):
+                for rung in SFM:
+                    if (value := verdict.figures.get(f"{rung}_{figure}")) is not None:
+                        values[rung == verdict.rung].append(value)
+            good, bad = (" ".join(f"{v:.3g}" for v in sorted(values[k])) for k in (True, False))
+            lines.append(f"half {half} {figure}: accepted {good or '-'}; refused {bad or '-'}")
+    return lines
 
 
 def load(folder: Path, clip: Clip) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ def main(path: Path) -> None:
     job = json.loads(path.read_text())
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     pycolmap.set_random_seed(job["seed"])
     {"features": _features, "incremental": _map, "global": _map}[job["step"]](pycolmap, job)
 
