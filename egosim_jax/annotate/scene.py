@@ -102,6 +102,8 @@ def clean_first_frame(record: Record, parts: Estimators, config: AnnotateConfig)
 
 def build_state(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
     """Add `state`, the scene that the prior shows: of the first frame, or of key frames too."""
+    from egosim_jax.perception.depth import points_per_pixel
+
     cameras, ids, depth = record.cameras, record.object_ids, record.require("depth")
     objects = None if ids is None else np.maximum(ids[0], 0)
     state = state_from_depth(
@@ -111,6 +113,7 @@ def build_state(record: Record, parts: Estimators, config: AnnotateConfig) -> Re
         cameras.world_from_camera[0],
         object_ids=objects,
         names=record.names,
+        points_per_pixel=points_per_pixel(depth.depth_m[0], cameras),
     )
     for frame, depth_m in zip(depth.frames[1:], depth.depth_m[1:], strict=True):
         state = extend_state(state, record, int(frame), depth_m)

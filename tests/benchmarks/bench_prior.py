@@ -26,7 +26,7 @@ from egosim_jax import rendering
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.metrics.image import decibels
 from egosim_jax.perception.cameras import CameraLadder, undistort, undistort_pixels
-from egosim_jax.perception.depth import SweptDepth
+from egosim_jax.perception.depth import SweptDepth, points_per_pixel
 from egosim_jax.perception.hands import LandmarkHands, lift
 from egosim_jax.perception.plate import clean_plate
 from egosim_jax.perception.scale import estimate_scale, scale_cameras, scale_depth
@@ -87,7 +87,7 @@ def measure(name: str, frames: np.ndarray, hands: np.ndarray, sheets: Path | Non
         depth_m,
         cameras.intrinsics_px,
         cameras.world_from_camera[0],
-        points_per_pixel=2,
+        points_per_pixel=points_per_pixel(depth_m, cameras),
     )
     view = rendering.get("jax").render(state, cameras, point_px=2)
     times.append(time.monotonic())
