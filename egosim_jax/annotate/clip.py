@@ -213,7 +213,7 @@ def _write(
     """Write the triplet and what was estimated with it."""
     then = time.monotonic()
     triplet, figures = to_triplet(record, config)
-    check_prior(figures, config)
+    check_prior(record.require("estimate").verdict.rung, figures, config)
     folder, cameras = out / job.video_id, record.cameras
     notes["row"] = write_clip(out, triplet, fps=record.fps)
     with atomic_write(folder / "action.npz") as temporary:

@@ -49,7 +49,7 @@ class Quality:
     """Smallest motion of what moves fastest (95 %), in widths of the picture per second."""
     max_motion: float = 1.5
     """Largest motion of the picture as a whole (median), in widths of the picture per second."""
-    min_prior_gain_db: float = -1.0
+    min_prior_gain_db: float = -2.0
     """Smallest PSNR of the prior, compared with that of the first frame repeated, in decibels."""
 
     def check(self, figures: Mapping[str, float]) -> None:

@@ -25,7 +25,7 @@ from egosim_jax.annotate.stages import (
 )
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.metrics.image import decibels
-from egosim_jax.perception.estimates import DepthEstimate
+from egosim_jax.perception.estimates import DepthEstimate, Rung
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import SceneState, Triplet
@@ -239,8 +239,14 @@ def _psnr(
     return float(decibels(np.array(errors)).mean()) if errors else 0.0
 
 
-def check_prior(figures: Mapping[str, float], config: AnnotateConfig) -> None:
-    """Raise `RefusedError` for a prior that shows the background worse than the first frame."""
+def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig) -> None:
+    """Raise `RefusedError` for a prior that shows the background worse than the first frame.
+
+    A camera that stays in its place is not judged so: its prior is the first frame, turned, and
+    what its hands hid there.
+    """
+    if rung in ("static", "rotation"):
+        return
     gain = figures["psnr_background"] - figures["psnr_first_frame"]
     least = config.cutting.quality.min_prior_gain_db
     if gain < least:

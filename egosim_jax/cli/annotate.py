@@ -57,7 +57,7 @@ class Annotate:
     """Smallest motion of what moves fastest, in widths of the picture per second."""
     max_motion: float = 1.5
     """Largest motion of the camera, in widths of the picture per second."""
-    min_prior_gain: float = -1.0
+    min_prior_gain: float = -2.0
     """Smallest PSNR of the prior in decibels, compared with that of the first frame repeated."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""

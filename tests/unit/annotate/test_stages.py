@@ -3,10 +3,13 @@
 from fractions import Fraction
 
 import numpy as np
+import pytest
 
+from egosim_jax.annotate.prepare import RefusedError
+from egosim_jax.annotate.scene import check_prior
 from egosim_jax.annotate.stages import hold_hands, visible
 from egosim_jax.perception.estimates import RIGHT
-from tests.unit.annotate.stubs import StubHands
+from tests.unit.annotate.stubs import StubHands, config
 
 
 def test_a_hand_keeps_its_silhouette_for_half_a_second():
@@ -21,3 +24,11 @@ def test_a_hand_keeps_its_silhouette_for_half_a_second():
 def test_a_video_without_hands_holds_none():
     hands = StubHands(0.0, None)(np.zeros((9, 48, 80, 3), np.uint8))
     assert not visible(hold_hands(hands, Fraction(16))).any()
+
+
+def test_a_prior_that_is_worse_than_the_first_frame_is_refused():
+    figures = {"psnr_background": 17.0, "psnr_first_frame": 20.0}
+    with pytest.raises(RefusedError, match=r"-3\.0 dB .*\(--min-prior-gain\)"):
+        check_prior("incremental", figures, config())
+    check_prior("static", figures, config())
+    check_prior("incremental", {**figures, "psnr_background": 19.0}, config())
