@@ -39,6 +39,8 @@ KEY_FRAMES = 6
 """Frames that a fused scene is made of."""
 HAND_PHRASES = ("hand", "arm")
 """Names of hands and arms for a network that segments."""
+FLASH_S = 0.3
+"""Shortest time for which a second hand is seen, in seconds."""
 HOLD_S = 0.5
 """Time for which the silhouette of a hand that is not found stays, in seconds."""
 Run = Callable[[Record, Estimators, AnnotateConfig], Record]
@@ -64,7 +66,8 @@ def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
     elif given is not None:
         return record.add("hands", {"source": "recording", "kind": record.recording.kind})
     else:
-        hands, source = _on_side(parts.hands(record.frames), config.side), "estimated"
+        tracks = drop_flashes(parts.hands(record.frames), record.fps)
+        hands, source = _on_side(tracks, config.side), "estimated"
     seen = visible(hands)
     shown = int(np.any(seen, axis=1).sum())
     share = shown / len(seen)
@@ -117,6 +120,23 @@ def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) 
         moving = hand_silhouettes(record.frames, hold_hands(record.hands, record.fps))
     ids = np.where(moving, -1, 0).astype(np.int32)
     return record.add("silhouettes", {"masks": "geometry"}, object_ids=ids, names={})
+
+
+def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
+    """Return tracks without second hands that are found for a moment only.
+
+    A hand that is seen for less than 0.3 s while the other one is seen, and not for half a second
+    before and after, is the other one again.
+    """
+    found, joints_px = visible(hands), hands.joints_px.copy()
+    joints_hand_m, presence = hands.joints_hand_m.copy(), hands.presence.copy()
+    for side in (LEFT, RIGHT):
+        frames = np.flatnonzero(found[:, side])
+        for run in np.split(frames, np.flatnonzero(np.diff(frames) > HOLD_S * fps) + 1):
+            if 0 < len(run) < FLASH_S * fps and found[run, 1 - side].all():
+                joints_px[run, side], joints_hand_m[run, side] = np.nan, np.nan
+                presence[run, side] = 0
+    return HandTracks(joints_px=joints_px, joints_hand_m=joints_hand_m, presence=presence)
 
 
 def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:

@@ -7,8 +7,8 @@ import pytest
 
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.scene import check_prior
-from egosim_jax.annotate.stages import hold_hands, visible
-from egosim_jax.perception.estimates import RIGHT
+from egosim_jax.annotate.stages import drop_flashes, hold_hands, visible
+from egosim_jax.perception.estimates import LEFT, RIGHT
 from tests.unit.annotate.stubs import StubHands, config
 
 
@@ -32,3 +32,15 @@ def test_a_prior_that_is_worse_than_the_first_frame_is_refused():
         check_prior("incremental", figures, config())
     check_prior("static", figures, config())
     check_prior("incremental", {**figures, "psnr_background": 19.0}, config())
+
+
+def test_a_second_hand_for_a_moment_is_the_first_one_again():
+    hands = StubHands(1.0, None)(np.zeros((60, 48, 80, 3), np.uint8))
+    for frames in (slice(10, 14), slice(30, 45)):
+        hands.joints_px[frames, LEFT] = hands.joints_px[frames, RIGHT] + 20
+        hands.joints_hand_m[frames, LEFT] = hands.joints_hand_m[frames, RIGHT]
+    kept = drop_flashes(hands, Fraction(16))
+    assert np.flatnonzero(visible(kept)[:, LEFT]).tolist() == list(range(30, 45))
+    assert visible(kept)[:, RIGHT].all()
+    alone = StubHands(0.05, None)(np.zeros((60, 48, 80, 3), np.uint8))
+    assert visible(drop_flashes(alone, Fraction(16))).sum() == 3
