@@ -45,8 +45,8 @@ class Network:
     folder: Path
     """Folder of the checkpoint, with config.json and safetensors."""
     _: KW_ONLY
-    device: str = "cpu"
-    """Device of the worker: cpu, cuda or cuda:N."""
+    device: str = "auto"
+    """Device of the worker: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     dtype: DType = "float32"
     """Floating-point type of the network."""
     timeout_s: float = 1800.0
@@ -168,18 +168,20 @@ def load_network(network: Any, folder: Path, *, device: str, dtype: str) -> Any:
             f"{quote_path(folder)} lacks {len(wrong)} weights of {network.__name__}, such as "
             f"{quote(wrong[0])}, or has them in another shape. Download the checkpoint again."
         )
-    return model.eval().to(check_device(device))
+    return model.eval().to(device)
 
 
 def check_device(device: str) -> str:
     """Return the name of a device of torch; raise `InputError` if this machine does not have it."""
     import torch
 
+    if device == "auto":
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
     kind, _, number = device.partition(":")
     count = {"cpu": 1, "cuda": torch.cuda.device_count()}.get(kind, 0)
     if not (number or "0").isdecimal() or int(number or 0) >= count:
         raise InputError(
             f"There is no device {quote(device)}: torch {torch.__version__} finds the CPU and "
-            f"{torch.cuda.device_count()} GPUs. Use cpu or cuda:N. (--device)"
+            f"{torch.cuda.device_count()} GPUs. Use auto, cpu or cuda:N. (--device)"
         )
     return device

@@ -188,7 +188,7 @@ class NetworksConfig:
     hand_phrases: str = "hand. arm."
     """Phrases for hands and arms."""
     device: str = "cpu"
-    """Device of the networks: cpu, cuda or cuda:N."""
+    """Device of the networks: cpu, cuda, cuda:N or auto; the generator may need all of a GPU."""
     dtype: DType = "float32"
     """Floating-point type of the networks."""
     timeout_s: float = 1800.0

@@ -16,7 +16,7 @@ from jaxtyping import Bool, UInt8
 
 from egosim_jax.io.untrusted import quote, quote_path
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
-from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.types import InputError, check_counts
 
@@ -73,6 +73,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     import torch
     from transformers import DepthAnythingForDepthEstimation, DPTImageProcessorPil
 
+    device = check_device(device)
     network = load_network(
         DepthAnythingForDepthEstimation, Path(folder), device=device, dtype=dtype
     )

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
-from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.perception.networks.pixels import PixelSettings, normalize, to_images
 from egosim_jax.types import InputError
@@ -104,6 +104,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     from torch.nn.functional import interpolate
     from transformers import DepthProForDepthEstimation
 
+    device = check_device(device)
     network = load_network(DepthProForDepthEstimation, Path(folder), device=device, dtype=dtype)
     settings = PixelSettings.read(Path(folder), DEFAULT)
     size = settings.height, settings.width

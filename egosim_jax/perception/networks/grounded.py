@@ -56,8 +56,8 @@ class Grounded:
     segmenter: Path
     """Folder of the tracker, which segments what it follows."""
     _: KW_ONLY
-    device: str = "cpu"
-    """Device of the workers: cpu, cuda or cuda:N."""
+    device: str = "auto"
+    """Device of the workers: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     dtype: DType = "float32"
     """Floating-point type of the networks."""
     timeout_s: float = 1800.0

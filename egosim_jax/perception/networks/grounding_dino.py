@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.types import InputError
 
@@ -112,6 +112,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
         GroundingDinoProcessor,
     )
 
+    device = check_device(device)
     network = load_network(
         GroundingDinoForObjectDetection, Path(folder), device=device, dtype=dtype
     )

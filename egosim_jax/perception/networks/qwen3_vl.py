@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.perception.networks.worker import NetworkError
 from egosim_jax.state.filter import is_hand
@@ -133,6 +133,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
         Qwen3VLForConditionalGeneration,
     )
 
+    device = check_device(device)
     network: Any = load_network(
         Qwen3VLForConditionalGeneration, Path(folder), device=device, dtype=dtype
     )

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int32, UInt8
 
 from egosim_jax.perception.estimates import HandTracks
-from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.perception.networks.grounding_dino import clean_phrases
 from egosim_jax.perception.networks.pixels import PixelSettings
@@ -65,6 +65,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     from transformers.models.sam3_video import modeling_sam3_video
 
     modeling_sam3_video.cv_utils_kernel = MaskTools()
+    device = check_device(device)
     network: Any = load_network(Sam3VideoModel, Path(folder), device=device, dtype=dtype)
     tokenizer: Any = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
     pixels = PixelSettings.read(Path(folder), SAM3_PIXELS)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from egosim_jax.perception.networks.checkpoint import CONFIG, Network, load_network
+from egosim_jax.perception.networks.checkpoint import CONFIG, Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.perception.networks.pixels import (
     PixelSettings,
@@ -107,6 +107,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     network_type = getattr(transformers, f"{name}Model")
     module = importlib.import_module(network_type.__module__)
     session_type = getattr(module, f"{name}InferenceSession")
+    device = check_device(device)
     network = load_network(network_type, Path(folder), device=device, dtype=dtype)
     pixels = PixelSettings.read(Path(folder), default)
 
@@ -123,7 +124,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
         session.processed_frames = PreparedFrames(frames, pixels, network.dtype)
         scale = np.array([pixels.width / width, pixels.height / height] * 2, np.float32)
         for number, box in enumerate(arrays["boxes_px"] * scale, start=1):
-            points = torch.from_numpy(box).to(device, network.dtype).reshape(1, 1, 2, 2)
+            points = torch.from_numpy(box).to(device).reshape(1, 1, 2, 2)
             labels = torch.tensor(BOX_LABELS, dtype=torch.int32, device=device).reshape(1, 1, 2)
             inputs = {"point_coords": points, "point_labels": labels}
             session.add_point_inputs(session.obj_id_to_idx(number), options["frame"], inputs)
