@@ -4,7 +4,7 @@ Both networks see one batch per round, over all frames: first the palms of all t
 keypoints in the regions of all palms, then those in the regions that keypoints of a frame predict
 for the frames next to it, in both directions of time, until no new hand is found. A hand is thus
 found in frames in which its palm is not, before and after those in which it is. At last every hand
-is seen once more in the region of its own keypoints, which is narrower than that of a palm.
+is seen once more in the region that its keypoints give, which is narrower than a palm's.
 """
 
 from __future__ import annotations

@@ -45,6 +45,8 @@ class TrackConfig:
     """Largest motion in hand sizes; beyond it a hand disappears and another one appears."""
     min_frames: int = 3
     """Minimum number of frames of a track; shorter ones are false detections."""
+    min_palms: float = 0.2
+    """Minimum share of a track's frames in which its palm was detected."""
     most: int = 6
     """Maximum number of candidates of a frame, the most confident ones."""
 
@@ -68,7 +70,7 @@ def choose_tracks(
     for pointers in reversed(back):
         chosen.append(int(pointers[chosen[-1]]))
     path = np.array([s[i] for s, i in zip(states, reversed(chosen), strict=True)])
-    return _without_short(candidates, _of_one_side(candidates, path, config), config)
+    return _without_false(candidates, _of_one_side(candidates, path, config), config)
 
 
 def _best(candidates: Candidates, frame: int, most: int) -> np.ndarray:
@@ -164,8 +166,8 @@ def _in_one_place(candidates: Candidates, one: int, other: int, config: TrackCon
     return bool(apart < config.max_motion * pair.size_px.max())
 
 
-def _without_short(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
-    """Return the path without tracks that are too short to be believed."""
+def _without_false(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
+    """Return the path without tracks that are too short, or too rarely seen as a palm."""
     path = path.copy()
     for side in (LEFT, RIGHT):
         for start, stop in runs(path[:, side] >= 0):
@@ -173,7 +175,8 @@ def _without_short(candidates: Candidates, path: np.ndarray, config: TrackConfig
             moved = relative_distance(joints[1:], joints[:-1])
             cuts = start + 1 + np.flatnonzero(moved > config.max_motion)
             for first, last in zip([start, *cuts], [*cuts, stop], strict=True):
-                if last - first < min(config.min_frames, len(path)):
+                palms = (candidates.palm[path[first:last, side]] > 0).mean()
+                if last - first < min(config.min_frames, len(path)) or palms < config.min_palms:
                     path[first:last, side] = -1
     return path
 

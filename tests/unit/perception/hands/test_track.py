@@ -95,6 +95,13 @@ def test_what_looks_like_a_hand_but_has_no_palm_loses_against_one_that_has():
     assert chosen(found, 6, side=2.0)[:, RIGHT].tolist() == list(range(6, 12))
 
 
+def test_a_track_whose_palm_is_hardly_ever_detected_is_no_hand():
+    palms = [0.9] + [0] * 9
+    found = candidates(*[(f, (100, 100), 0.9, 0.9, palm) for f, palm in enumerate(palms)])
+    assert (chosen(found, 10) == -1).all()
+    assert (chosen(found, 10, min_palms=0.1)[:, RIGHT] >= 0).all()
+
+
 def test_no_candidates_are_no_tracks():
     nothing = candidates((0, (0, 0), 0, 0, 0)).take(np.zeros(0, int))
     assert (chosen(nothing, 3) == -1).all()
