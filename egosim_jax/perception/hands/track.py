@@ -198,7 +198,7 @@ def find_gaps(
     joints_px: Float[np.ndarray, "f 2 21 2"], *, most: int, max_motion: float
 ) -> Bool[np.ndarray, "f 2"]:
     """Return the frames of gaps between two hands that are near by in time and in the picture."""
-    missing = np.isnan(joints_px).any((2, 3))
+    missing = np.any(np.isnan(joints_px), axis=(2, 3))
     gaps = np.zeros_like(missing)
     for side in (LEFT, RIGHT):
         for start, stop in runs(missing[:, side]):

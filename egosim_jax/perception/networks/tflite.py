@@ -92,7 +92,7 @@ def read_program(path: Path) -> Program:
     with _refusing(name):
         model = schema.Model.GetRootAsModel(data, 0)
         _check(model.SubgraphsLength() == 1, "it has several graphs")
-        graph = model.Subgraphs(0)
+        graph: Any = model.Subgraphs(0)
         counts = graph.TensorsLength(), graph.OperatorsLength(), model.BuffersLength()
         _check(max(*counts, model.OperatorCodesLength()) <= MAX_COUNT, "it has too many parts")
         _check(graph.InputsLength() == 1, "it has several inputs")
