@@ -232,7 +232,7 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
     dropped = differences["without prior"]["psnr"]
     want = human["without prior"]["psnr"]["mean"] - human["full"]["psnr"]["mean"]
     assert dropped["mean"] == pytest.approx(want)
-    assert dropped["low"] < dropped["mean"] < dropped["high"]
+    assert dropped["low"] <= dropped["mean"] <= dropped["high"]  # an untrained head ignores all
     assert human.keys() >= {"full", "without prior", "without mask", "without hands"}
     assert human["ground truth"]["psnr"]["mean"] == 100
     assert human["ground truth"]["hand_iou"]["mean"] > 0.7
