@@ -34,8 +34,6 @@ class CogVideoXDiTConfig:
     """Patterns of the linear layers that a LoRA adapts."""
     also_train: ClassVar[tuple[str, ...]] = ("patch.*",)
     """Patterns of the weights that are trained in full along with a LoRA."""
-    image_dim: ClassVar[None] = None
-    """Width of the image encoder's tokens: the model has no image branch."""
 
     in_channels: int = 33
     """Channels of the noisy latents and the condition together."""
@@ -131,6 +129,10 @@ class CogVideoXDiTConfig:
     def head_dim(self) -> int:
         """Size of an attention head."""
         return self.dim // self.heads
+
+    @property
+    def image_dim(self) -> None:
+        """Width of the image encoder's tokens: the model has no image branch."""
 
     @property
     def condition_channels(self) -> int:

@@ -34,8 +34,8 @@ class DepthAnything3(Network):
     needs: ClassVar[str] = "Depth Anything 3 (depth-anything/DA3*)"
     packages: ClassVar[tuple[str, ...]] = ("torch", "torchvision", "depth_anything_3")
     install: ClassVar[str] = (
-        "pip install 'egosim-jax[networks]' torchvision einops omegaconf addict && pip install "
-        "--no-deps depth-anything-3 (docs/networks.md)"
+        "pip install 'egosim-jax[networks]', then the packages that docs/networks.md lists, then "
+        "pip install --no-deps depth-anything-3"
     )
 
     _: KW_ONLY
