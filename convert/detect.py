@@ -62,7 +62,7 @@ class Folder:
     path: Path
     """File or folder that was searched."""
     found: tuple[DetectedNetwork, ...]
-    """Networks in it."""
+    """Networks that the checkpoint folder holds."""
     unknown: tuple[Source, ...]
     """Checkpoints without a known network."""
     tokenizer: Path | None

@@ -164,7 +164,7 @@ class _Part:
     layer: int | None
 
     def array(self) -> np.ndarray:
-        """Return the values."""
+        """Return the values of the converted tensor."""
         weight = self.tensor.array()
         return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
 

@@ -32,7 +32,7 @@ class Source:
     files: tuple[Path, ...]
     """Files that have the tensors."""
     tensors: Mapping[str, Tensor]
-    """Tensors by name."""
+    """Tensors of the checkpoint by name."""
 
     @property
     def bytes(self) -> int:

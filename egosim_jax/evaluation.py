@@ -47,7 +47,7 @@ class Evaluation(NamedTuple):
     """The result of an evaluation."""
 
     report: dict[str, Any]
-    """Contents of report.json."""
+    """Scores and protocol of an evaluation, the contents of report.json."""
     skipped: list[str]
     """Clips that were not compared, with the reasons."""
 

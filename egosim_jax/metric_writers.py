@@ -78,7 +78,7 @@ class JsonLines:
         write_text(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Append a line."""
+        """Append a line of metrics to the file."""
         append_line(self.path, {"step": step, **values})
 
     def close(self) -> None:
@@ -119,11 +119,11 @@ class WandB:
         )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Log the metrics."""
+        """Log the metrics of a step."""
         self._run.log(dict(values), step=step)
 
     def close(self) -> None:
-        """Finish the upload."""
+        """Finish the upload to Weights & Biases."""
         self._run.finish()
 
 

@@ -62,13 +62,13 @@ class VideoSpec:
     """Length, size and rate of the videos that a model reads and writes."""
 
     frames: int = 61
-    """Pixel frames."""
+    """Pixel frames of a video."""
     height: int = 480
-    """Rows in pixels."""
+    """Rows of a frame in pixels."""
     width: int = 832
-    """Columns in pixels."""
+    """Columns of a frame in pixels."""
     fps: int = 16
-    """Frames per second."""
+    """Frame rate of the video in frames per second."""
 
     def __post_init__(self) -> None:
         """Check that all are positive; what a model can encode is up to its `VideoGrid`."""

@@ -34,7 +34,7 @@ class OptimizerConfig:
 
     `muon` orthogonalizes the updates of matrices and convolutions and uses Adam for the rest."""
     learning_rate: float = 1e-5
-    """Peak learning rate."""
+    """Peak learning rate of the training."""
     warmup_steps: int = 0
     """Updates of linear warm-up from zero."""
     schedule: Literal["constant", "cosine"] = "constant"

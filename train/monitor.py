@@ -143,7 +143,7 @@ class Watchdog:
         self._last = None
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread of the monitor."""
         self._ended.set()
 
     def _watch(self) -> None:
@@ -216,7 +216,7 @@ class Samples:
     vae: Path
     """Weights folder with the autoencoder of the latents."""
     count: int = 2
-    """Number of clips."""
+    """Number of clips in the training set."""
 
     def write(self, networks: nnx.Module, out: Path, step: int) -> None:
         """Write OUT/step_N.mp4 and .png: each generated clip next to its ground truth.

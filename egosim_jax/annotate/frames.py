@@ -43,7 +43,7 @@ class Sampling:
     size: tuple[int, int] | None = None
     """Height and width in pixels, multiples of 16."""
     fps: float | None = None
-    """Frames per second."""
+    """Frame rate of the clips in frames per second."""
     num_frames: int | None = None
     """Frames of a clip, 4k + 1."""
 

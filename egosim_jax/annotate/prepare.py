@@ -162,7 +162,7 @@ class Window:
     video_id: str
     """Unique id of the clip."""
     start: int
-    """First frame."""
+    """First frame of the clip in the video."""
     stop: int
     """Frame after the last."""
     figures: Mapping[str, float]

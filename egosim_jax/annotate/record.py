@@ -59,11 +59,11 @@ class Record:
     plan: Plan
     """Rate and crop of the clip."""
     frames: UInt8[np.ndarray, "f h w 3"]
-    """The clip."""
+    """Clip that is annotated."""
     device_focal_px: float | None = None
     """Focal length of the device in pixels of the clip, from other clips."""
     hands: HandTracks | None = None
-    """Hands in pixels."""
+    """Hands of the clip, in pixels."""
     object_ids: Int32[np.ndarray, "f h w"] | None = None
     """Object instance of each pixel: 0 none, negative hands and arms."""
     names: Mapping[int, str] | None = None
@@ -77,7 +77,7 @@ class Record:
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None
     """First frame without hands."""
     state: SceneState | None = None
-    """Scene, without hands."""
+    """Scene of the clip in 3D, without hands."""
     prompt: str | None = None
     """Caption of the clip."""
     notes: Mapping[str, Any] = field(default_factory=dict)

@@ -55,7 +55,7 @@ class Scanned:
     source: str
     """Id of the video."""
     jobs: tuple[Job, ...] = ()
-    """Clips to annotate."""
+    """Clips of the video to annotate."""
     refused: tuple[tuple[Job, str, str], ...] = ()
     """Clips that are refused before any stage, with rule and reason."""
     problem: str | None = None

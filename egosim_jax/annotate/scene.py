@@ -270,6 +270,6 @@ STAGES = (
     Stage("scene", build_state),
     Stage("caption", add_caption, ("prompt",)),
 )
-"""Stages in order."""
+"""Stages of an annotation, in order."""
 FIRST_STAGES = 2
 """Stages that need no camera: the first pool of actors runs them."""

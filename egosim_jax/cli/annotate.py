@@ -36,7 +36,7 @@ class Annotate:
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO ...")]
     """Videos, recordings, or folders of them."""
     out: Path
-    """Folder to write."""
+    """Folder of the clips, metadata.csv and the report."""
     config: str | None = None
     """Model whose size, rate and length the clips have; those of the video if not given."""
     size: tuple[int, int] | None = None
@@ -98,7 +98,7 @@ class Annotate:
     split: str = "train"
     """Value of the column split."""
     workers: int = 1
-    """Number of processes."""
+    """Number of worker processes."""
     ray: str | None = None
     """Run on a Ray cluster: auto for a local one, or its address."""
     ray_gpus: tuple[float, float] = (0.0, 0.0)
@@ -109,7 +109,7 @@ class Annotate:
     """Seed of what is random."""
 
     def run(self) -> int:
-        """Scan, annotate, report."""
+        """Scan the videos, annotate their clips and write the report."""
         from egosim_jax.annotate import run
         from egosim_jax.annotate.sources import find_sources
         from egosim_jax.io.atomic import lock_folder

@@ -175,11 +175,11 @@ class Make:
     width: int = 160
     """Columns in pixels, a multiple of 16."""
     fps: int = 8
-    """Frames per second."""
+    """Frame rate of the clips in frames per second."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
     workers: int = os.cpu_count() or 1
-    """Number of processes."""
+    """Number of worker processes."""
     config: str | None = None
     """Name of a model whose latent grid the clips must fit, by default Wan's."""
 
@@ -249,7 +249,7 @@ class Look:
     """Width of a frame in pixels."""
 
     def run(self) -> int:
-        """Choose, decode, draw."""
+        """Draw the contact sheet of the chosen clips."""
         import numpy as np
 
         from egosim_jax.data.inspect import choose_clips

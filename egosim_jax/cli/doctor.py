@@ -43,7 +43,7 @@ class Doctor:
     """Folders of weights to report, by default those in ./weights and those that were fetched."""
 
     def run(self) -> int:
-        """Print the report."""
+        """Print versions, devices, memory and what is missing."""
         import jax
         from rich.console import Console
 

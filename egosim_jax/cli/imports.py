@@ -130,5 +130,5 @@ class Import:
     )
 
     def run(self) -> int:
-        """Run the import."""
+        """Import the recordings of a dataset."""
         return self.command.run()

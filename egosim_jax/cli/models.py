@@ -21,7 +21,7 @@ class List:
     """List the models, and where their weights are or come from."""
 
     def run(self) -> int:
-        """Print a table."""
+        """Print the table of models and their weights."""
         from rich.console import Console
         from rich.table import Table
 

@@ -39,14 +39,15 @@ class Preflight:
     steps: int | None = None
     """Denoising steps, if not the model's."""
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
-    """Layout of the devices; by default each generates separate clips. Less time for one clip:
-    --mesh.data 1 --mesh.context -1. Weights too large for one device: --mesh.data 1
-    --mesh.fsdp -1."""
+    """Layout of the devices; by default each generates separate clips.
+
+    Less time for one clip: --mesh.data 1 --mesh.context -1. Weights too large for one device:
+    --mesh.data 1 --mesh.fsdp -1."""
     json: bool = False
     """Print the reports as JSON."""
 
     def run(self) -> int:
-        """Compile and print."""
+        """Compile the program and print what it needs."""
         from egosim_jax import configs
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.preflight import report as reports

@@ -39,7 +39,7 @@ class Condition:
     hands: Float[Array, "b f h w z"] | None = None
     """Latents of the drawn hands."""
     text: Float[Array, "b n d"]
-    """Prompt embeddings."""
+    """Embeddings of the prompt's tokens."""
     null_text: Float[Array, "b n d"] | None = None
     """Prompt embeddings that stand for no prompt; None: zeros."""
     image: Float[Array, "b m e"] | None = None

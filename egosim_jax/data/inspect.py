@@ -18,7 +18,7 @@ class SplitStatistics:
     """Number, lengths and prompts of the records of a split."""
 
     records: int = 0
-    """Number of records."""
+    """Number of records of the shards."""
     lengths: Counter[int] = field(default_factory=Counter)
     """Number of records by their number of frames."""
     words: int = 0

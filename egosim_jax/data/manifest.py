@@ -46,9 +46,9 @@ class ShardInfo:
     file: str
     """File name in the folder."""
     records: int
-    """Number of records."""
+    """Number of records in the shard."""
     size: int
-    """Size in bytes."""
+    """Size of the shard in bytes."""
     sha256: str
     """SHA-256 of the file in hexadecimal."""
 

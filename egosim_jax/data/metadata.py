@@ -42,7 +42,7 @@ MAX_COLUMNS = 256
 """Maximum number of columns."""
 _SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
 SAFE_IDS = "letters, digits, '.', '_' and '-', and '/' between folders without dots"
-"""Rule of `is_safe_id`."""
+"""Rule of a safe clip id, for messages."""
 
 
 def is_safe_id(video_id: str) -> bool:
@@ -68,7 +68,7 @@ class ClipFiles:
     hands: Path
     """Video of the hand skeletons."""
     first_frame: Path
-    """Image for CLIP."""
+    """Path of the image for CLIP."""
     target: Path | None
     """Recorded video, if the metadata names one."""
     extra: Mapping[str, str]

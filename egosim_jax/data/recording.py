@@ -80,13 +80,13 @@ class Recording:
     recording_id: str
     """Unique id, which names the outputs."""
     video: Path
-    """Video file."""
+    """Video file of the recording."""
     start: int = 0
     """First frame of the recording in the video."""
     frames: int
-    """Number of frames."""
+    """Number of frames of the recording."""
     fps: Fraction
-    """Frames per second."""
+    """Frame rate of the video in frames per second."""
     height: int
     """Rows of a frame in pixels, as displayed."""
     width: int

@@ -37,7 +37,7 @@ class Tabletop(ModelExperiment):
     seeds: int = 2
     """Repetitions of each clip with different noise."""
     batch_size: int = 8
-    """Clips generated together."""
+    """Number of clips that are generated together."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
 
@@ -77,15 +77,15 @@ class Hyperparameters:
     """Hyper-parameters of one training; the learning rate has a warm-up and a cosine decay."""
 
     steps: int
-    """Number of updates."""
+    """Number of training updates in the experiment."""
     learning_rate: float
-    """Peak learning rate."""
+    """Peak learning rate of the training."""
     warmup: int
     """Updates of linear warm-up."""
     optimizer: Literal["adamw", "muon"] = "muon"
     """Name of the optimizer."""
     batch_size: int = 4
-    """Clips per update."""
+    """Clips per training update in the experiment."""
     seed: int = 0
     """Seed of the initial weights, the order of the clips and the noise."""
 
@@ -146,7 +146,7 @@ class RealTiny:
     seed: int = 0
     """Seed of the generated clips."""
     batch_size: int = 5
-    """Clips generated together."""
+    """Number of clips that are generated together."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,7 @@ METHODS: dict[str, str | None] = {
 
 
 def run(settings: Continuous) -> None:
-    """Simulate, compare, draw."""
+    """Simulate the scenes with each update of the state and compare them."""
     check_counts({"--sequences": settings.sequences, "--clips": settings.clips})
     generator = open_experiment(settings)
     seeds = range(settings.first_scene, settings.first_scene + settings.sequences)

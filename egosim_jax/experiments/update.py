@@ -45,7 +45,7 @@ DEFINITIONS = {
 
 
 def run(settings: Update) -> None:
-    """Carry, update, compare."""
+    """Update states after a carried object and compare them with the true ones."""
     check_counts({"--scenes": settings.scenes})
     generator = open_experiment(settings)
     spec = generator.config.video

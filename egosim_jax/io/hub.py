@@ -63,7 +63,7 @@ class RemoteFile:
     path: str
     """Path in the repository."""
     bytes: int
-    """Size in bytes."""
+    """Size of the file in bytes."""
     sha256: str | None
     """Hash that its content must have; None if nobody published one."""
 

@@ -42,7 +42,7 @@ class Hdf5Contents:
     """Arrays and texts that were read of an HDF5 file."""
 
     arrays: Mapping[str, Float64[np.ndarray, ...]]
-    """Arrays by path."""
+    """Arrays of the file by their path in it."""
     texts: Mapping[str, tuple[str, ...]]
     """Texts of attributes of the file by name; none of an attribute that is absent."""
 

@@ -92,7 +92,7 @@ class Video:
     """Decoded video and its frame rate."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Frames in RGB."""
+    """Frames of the video in RGB."""
     fps: Fraction
 
 

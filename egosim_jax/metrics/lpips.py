@@ -47,11 +47,11 @@ class Convolution:
     """Convolution followed by a ReLU."""
 
     features: int
-    """Output channels."""
+    """Output channels of a convolution."""
     kernel: int = 3
     """Height and width of the kernel in pixels."""
     stride: int = 1
-    """Stride in pixels."""
+    """Stride of a convolution in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

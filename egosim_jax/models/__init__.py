@@ -86,7 +86,7 @@ class NetworkConfig(Protocol):
 
     @property
     def dtype(self) -> str:
-        """Compute dtype."""
+        """Dtype that the network computes in."""
         ...
 
     def build(self, *, rngs: nnx.Rngs) -> Any:
@@ -124,7 +124,7 @@ class DenoiserConfig(NetworkConfig, Protocol):
 
     @property
     def heads(self) -> int:
-        """Attention heads."""
+        """Number of attention heads of the denoiser."""
         ...
 
     @property
@@ -202,7 +202,7 @@ class Flops(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Sum of both."""
+        """FLOPs of weights and attention together."""
         return self.weights + self.attention
 
 

@@ -30,7 +30,7 @@ from egosim_jax.models import flash
 ROWS = 64
 """Queries of a warpgroup: the height of Hopper's matrix instructions."""
 COMPUTING = 2
-"""Warpgroups that compute."""
+"""Warpgroups of the kernel that compute, besides the one that loads."""
 BLOCK = 128
 """Keys at a time: with more, accumulators do not fit the registers."""
 STAGES = 2

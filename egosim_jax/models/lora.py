@@ -40,7 +40,7 @@ class Delta:
     """Low-rank change of a linear layer, or of that layer in every block of a stack."""
 
     down: Float[np.ndarray, "*l i r"]
-    """Matrix A."""
+    """Matrix A of the low-rank product."""
     up: Float[np.ndarray, "*l r o"]
     """Matrix B, multiplied by alpha / r."""
 

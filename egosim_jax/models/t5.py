@@ -29,7 +29,7 @@ class T5Sizes:
     head_dim: int = 64
     """Width of a head."""
     layers: int = 24
-    """Number of blocks."""
+    """Number of transformer blocks."""
     buckets: int = 32
     """Relative-position buckets, of both directions together."""
     max_distance: int = 128

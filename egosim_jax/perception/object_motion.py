@@ -59,7 +59,7 @@ class TrackObjects:
     blur_px: float = 0.7
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     color: ColorCost = field(default_factory=ColorCost)
-    """Comparison of colors."""
+    """Comparison of the clip's colors with those predicted."""
     refinement: Refinement = field(default_factory=Refinement)
     """Refinement of the object's last pose."""
 

@@ -71,7 +71,7 @@ class CollectiveTraffic:
     """Traffic of one kind of collective, on one device."""
 
     count: int
-    """Number of executions."""
+    """Number of executions of the instruction."""
     bytes: float
     """Bytes that the device sends."""
 

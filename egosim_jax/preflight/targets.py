@@ -44,7 +44,7 @@ class Device:
     platform: Platform
     """jax's name of the platform."""
     flops: float
-    """Dense bfloat16 FLOP/s."""
+    """Peak of a device in dense bfloat16 FLOP/s."""
     memory: float
     """Bytes of device memory."""
     bandwidth: float

@@ -58,13 +58,13 @@ class Model:
     lenses: Mapping[int, Lens]
     """Lens of each camera by id."""
     images: tuple[Image, ...]
-    """Registered pictures."""
+    """Pictures that the COLMAP model registered."""
     point_ids: Int[np.ndarray, " p"]
     points_m: Float[np.ndarray, "p 3"]
     """Positions in the model's unit."""
     colors: UInt8[np.ndarray, "p 3"]
     error_px: Float[np.ndarray, " p"]
-    """Mean reprojection errors."""
+    """Mean reprojection error of each point, in pixels."""
 
 
 def read_model(folder: Path) -> Model:

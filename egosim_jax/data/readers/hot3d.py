@@ -63,7 +63,7 @@ class Hot3D:
     """Stream to read; Quest 3 has only 1201-1 and 1201-2, in gray."""
 
     def find(self) -> Iterator[Entry]:
-        """List the clips."""
+        """Yield the clips of a HOT3D folder."""
         root = self.source if self.source.is_dir() else self.source.parent
         for path in find_files(self.source, "*.tar", what="clip of HOT3D"):
             yield Entry(
@@ -144,7 +144,7 @@ class _Clip:
         return value
 
     def picture(self, name: str) -> np.ndarray:
-        """Return a picture."""
+        """Return a picture of the Aria camera, decoded."""
         return decode_image(self.read(name), name=f"{self.name}: {name}")
 
     def camera(self, key: str, stream: str) -> tuple[dict[str, Any], np.ndarray]:

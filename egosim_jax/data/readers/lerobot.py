@@ -58,7 +58,7 @@ class LeRobot:
     """Key of the camera, such as observation.images.head; by default the only or egocentric one."""
 
     def find(self) -> Iterator[Entry]:
-        """List the episodes."""
+        """Yield the episodes of a LeRobot dataset."""
         info = read_json(self.source / "meta" / "info.json")
         if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
             raise InputError(f"{self.source}/meta/info.json is not that of a LeRobot dataset.")

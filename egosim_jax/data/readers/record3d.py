@@ -70,7 +70,7 @@ class Record3D:
     """A .r3d file, a folder of such files, or the folder of one capture."""
 
     def find(self) -> Iterator[Entry]:
-        """List the captures."""
+        """Yield the captures of a Record3D folder."""
         captures = [self.source]
         if self.source.is_dir() and not _metadata_name(self.source):
             captures = sorted(self.source.rglob("*.r3d"), key=natural_order)

@@ -26,7 +26,7 @@ class Trumans:
     """Folder of the set."""
 
     def find(self) -> Iterator[Entry]:
-        """Raise `InputError`."""
+        """Refuse TRUMANS, whose bodies are parameters of SMPL-X, without egocentric video."""
         raise InputError(
             f"{self.source} cannot be imported: TRUMANS has no egocentric video, and its bodies "
             "are parameters of SMPL-X, whose license does not allow to ship the model. Render a "

@@ -37,7 +37,7 @@ class HandModel:
     pivots_m: Float[np.ndarray, "20 3"]
     """Point on the axis of each hinge, at rest, in the frame of the wrist."""
     landmarks_m: Float[np.ndarray, "21 3"]
-    """Landmarks at rest."""
+    """Landmarks of the hand at rest, in meters."""
     weights: Float[np.ndarray, "21 k"]
     """Weights of the bones that each landmark follows."""
     bones: Int[np.ndarray, "21 k"]

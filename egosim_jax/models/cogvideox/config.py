@@ -44,7 +44,7 @@ class CogVideoXDiTConfig:
     heads: int = 48
     """Attention heads, each of dim / heads."""
     layers: int = 42
-    """Number of blocks."""
+    """Number of transformer blocks."""
     text_dim: int = 4096
     """Width of the text encoder's tokens."""
     time_dim: int = 512
@@ -60,7 +60,7 @@ class CogVideoXDiTConfig:
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products and the residual stream."""
     attention: Kernel = "auto"
-    """Attention kernel."""
+    """Attention kernel of the transformer."""
     remat: Level = "none"
     """Activations that the backward pass recomputes."""
 

@@ -49,7 +49,7 @@ class CogVideoXContext:
     patches: Float[Array, "b v d"]
     """Contribution of the condition to the patch embedding, with the bias."""
     text: Float[Array, "b m d"]
-    """Tokens of the text."""
+    """Tokens of the text in the denoiser's width."""
     rotation: Float[Array, "n k 2"]
     """Rotary embedding table of all tokens; those of the text do not turn."""
 

@@ -48,7 +48,7 @@ class CogVideoXVAEConfig:
     dims: tuple[int, ...] = (128, 256, 256, 512)
     """Channels of each level; each level after the first halves rows and columns."""
     z_dim: int = 16
-    """Latent channels."""
+    """Channels of the latents."""
     res_blocks: int = 3
     """Residual blocks per level of the encoder; the decoder has one more."""
     temporal_levels: int = 2

@@ -47,7 +47,7 @@ class WanDiTConfig:
     heads: int = 40
     """Attention heads, each of dim / heads."""
     layers: int = 40
-    """Number of blocks."""
+    """Number of transformer blocks."""
     text_dim: int = 4096
     """Width of the text encoder's tokens."""
     image_dim: int | None = 1280
@@ -63,7 +63,7 @@ class WanDiTConfig:
 
     With bfloat16 sums and all else stay in `dtype`."""
     attention: Kernel = "auto"
-    """Attention kernel."""
+    """Attention kernel of the transformer."""
     remat: Level = "none"
     """Activations that the backward pass recomputes."""
 

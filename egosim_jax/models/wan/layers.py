@@ -77,7 +77,7 @@ def modulation_table(rows: int, dim: int, rngs: nnx.Rngs) -> nnx.Param:
 
 
 class MLP(nnx.Module):
-    """Linear, activation, linear."""
+    """Multilayer perceptron of a linear layer, an activation and a linear layer."""
 
     def __init__(
         self,

@@ -55,7 +55,7 @@ class WanVAEConfig:
     dim: int = 96
     """Channels at full resolution."""
     z_dim: int = 16
-    """Latent channels."""
+    """Channels of the latents."""
     dim_mult: tuple[int, ...] = (1, 2, 4, 4)
     """Channels of each level, in units of `dim`; each level after the first halves the size."""
     res_blocks: int = 2

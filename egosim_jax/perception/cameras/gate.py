@@ -27,7 +27,7 @@ class Reconstruction:
     """Cameras and points of structure from motion, with pixel centers at integer coordinates."""
 
     frames: Int32[np.ndarray, " r"]
-    """Registered frames, ascending."""
+    """Frames that the reconstruction registered, ascending."""
     camera_from_world: Float[np.ndarray, "r 3 4"]
     """Pose of each registered frame, in an unknown unit."""
     focal_px: float

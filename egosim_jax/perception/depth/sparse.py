@@ -28,7 +28,7 @@ class SparseFilter:
     """Difference from the neighbors' median in their median absolute deviations."""
 
     def __post_init__(self) -> None:
-        """Check the counts."""
+        """Check that all counts are positive."""
         check_counts({"min_track": self.min_track, "neighbors": self.neighbors})
 
     def __call__(

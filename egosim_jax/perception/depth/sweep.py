@@ -59,7 +59,7 @@ class PlaneSweep:
     """Smallest lead of the best plane over those more than three planes away, in correlation."""
 
     def __post_init__(self) -> None:
-        """Check the counts."""
+        """Check that all counts are positive."""
         check_counts({"planes": self.planes, "views": self.views, "window": self.window})
 
     def __call__(

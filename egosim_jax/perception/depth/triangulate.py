@@ -36,7 +36,7 @@ class Triangulation:
     """Largest angle; what does not move with the scene is triangulated amid the cameras."""
 
     def __post_init__(self) -> None:
-        """Check the counts."""
+        """Check that all counts are positive."""
         check_counts({"corners": self.corners, "spacing_px": self.spacing_px})
 
     def __call__(

@@ -174,7 +174,7 @@ class NetworksConfig:
     """Perception by networks: depth, segmentation and tracking, from local checkpoints."""
 
     depth: Literal["depth-anything", "depth-pro", "depth-anything-3"] = "depth-anything"
-    """Depth network."""
+    """Depth network of the pipeline."""
     depth_folder: Path
     """Folder of its checkpoint."""
     masks: Literal["grounded-sam2", "grounded-sam3", "grounded-edgetam", "sam3"] = "grounded-sam2"

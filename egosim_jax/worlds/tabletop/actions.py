@@ -59,7 +59,7 @@ class Hand:
     """One hand of the wearer at one moment."""
 
     side: Side
-    """Left or right."""
+    """Side of the hand, left or right."""
     grip: Grip
     """Configuration of the hand."""
 

@@ -79,9 +79,9 @@ class Part:
     """A rigid part: a textured triangle mesh in its local frame."""
 
     name: str
-    """Name, for debugging."""
+    """Name of the body, for debugging."""
     vertices_m: Float[np.ndarray, "v 3"]
-    """Vertices in meters."""
+    """Vertices of the mesh in meters."""
     triangles: Int[np.ndarray, "t 3"]
     """Vertex indices of each triangle."""
     paint: Paint

@@ -35,7 +35,7 @@ class Placed:
     """A part with its pose at one moment."""
 
     part: Part
-    """Mesh and texture."""
+    """Mesh and texture of a body to render."""
     world_from_part: Float[np.ndarray, "4 4"]
     """Pose in the world."""
     number: int
