@@ -77,7 +77,14 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
             "mask_prior": True,
         },
     },
-    "Tabletop": {"crop": [48, 64], "dropout": _DROPOUT, "stride": 1, "weights_dtype": "float16"},
+    "PromptTokenizer": {"clean": True},
+    "Tabletop": {
+        "crop": [48, 64],
+        "dropout": _DROPOUT,
+        "stride": 1,
+        "weights_dtype": "float16",
+        "rollout_clips": 4,
+    },
 }
 """Fields that a class of config.json did not have under its old name, with their values then."""
 DROPPED = {"Objective": ("schedule",)}
