@@ -79,7 +79,8 @@ def _described(folder: Path) -> dict[str, Any]:
             case {"sha256": str(), "parts": [*parts]} if all(
                 isinstance(part, dict)
                 and isinstance(part.get("sha256"), str)
-                and _NAME.fullmatch(str(part.get("file")))
+                and isinstance(part.get("file"), str)
+                and _NAME.fullmatch(part["file"])
                 for part in parts
             ) and _NAME.fullmatch(name):
                 pass
