@@ -53,6 +53,19 @@ class Rule:
         return TRANSFORMS.get(self.transform) or _layout(self.transform)
 
 
+def linear_rules(theirs: str, ours: str) -> list[Rule]:
+    """Return the rules of a linear layer with a bias."""
+    return [
+        Rule(f"{theirs}.weight", f"{ours}.kernel", "linear"),
+        Rule(f"{theirs}.bias", f"{ours}.bias"),
+    ]
+
+
+def norm_rules(theirs: str, ours: str) -> list[Rule]:
+    """Return the rules of a norm with scale and bias."""
+    return [Rule(f"{theirs}.weight", f"{ours}.scale"), Rule(f"{theirs}.bias", f"{ours}.bias")]
+
+
 @dataclass(frozen=True)
 class Transform:
     """Change of axis layout between a foreign tensor and a weight, with its inverse."""

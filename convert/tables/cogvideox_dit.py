@@ -9,7 +9,7 @@ import numpy as np
 from einops import rearrange
 
 from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT
-from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
 from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
 from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
@@ -32,22 +32,22 @@ def diffusers(config: CogVideoXDiTConfig) -> list[Rule]:
     rules = [
         Rule("patch_embed.proj.weight", "patch.kernel", "o c i j -> c i j o"),
         Rule("patch_embed.proj.bias", "patch.bias"),
-        *_linear("patch_embed.text_proj", "text"),
-        *_linear("time_embedding.linear_1", "time.up"),
-        *_linear("time_embedding.linear_2", "time.down"),
+        *linear_rules("patch_embed.text_proj", "text"),
+        *linear_rules("time_embedding.linear_1", "time.up"),
+        *linear_rules("time_embedding.linear_2", "time.down"),
         *_modulation(f"{theirs}.norm1", "blocks.modulation_a"),
         *_modulation(f"{theirs}.norm2", "blocks.modulation_m"),
-        *_linear(f"{theirs}.ff.net.0.proj", "blocks.mlp.up"),
-        *_linear(f"{theirs}.ff.net.2", "blocks.mlp.down"),
-        *_linear(f"{theirs}.attn1.to_out.0", "blocks.attn.o"),
-        *_norm("norm_final", "norm"),
+        *linear_rules(f"{theirs}.ff.net.0.proj", "blocks.mlp.up"),
+        *linear_rules(f"{theirs}.ff.net.2", "blocks.mlp.down"),
+        *linear_rules(f"{theirs}.attn1.to_out.0", "blocks.attn.o"),
+        *norm_rules("norm_final", "norm"),
         *_modulation("norm_out", "modulation"),
-        *_linear("proj_out", "out"),
+        *linear_rules("proj_out", "out"),
     ]
     for name in "qkv":
-        rules += _linear(f"{theirs}.attn1.to_{name}", f"blocks.attn.{name}")
+        rules += linear_rules(f"{theirs}.attn1.to_{name}", f"blocks.attn.{name}")
     for name in ("norm_q", "norm_k"):
-        rules += _norm(f"{theirs}.attn1.{name}", f"blocks.attn.{name}")
+        rules += norm_rules(f"{theirs}.attn1.{name}", f"blocks.attn.{name}")
     return rules
 
 
@@ -138,21 +138,10 @@ def pipeline(config: ModelConfig) -> dict[str, dict[str, Any]]:
     }
 
 
-def _linear(theirs: str, ours: str) -> list[Rule]:
-    return [
-        Rule(f"{theirs}.weight", f"{ours}.kernel", "linear"),
-        Rule(f"{theirs}.bias", f"{ours}.bias"),
-    ]
-
-
-def _norm(theirs: str, ours: str) -> list[Rule]:
-    return [Rule(f"{theirs}.weight", f"{ours}.scale"), Rule(f"{theirs}.bias", f"{ours}.bias")]
-
-
 def _modulation(theirs: str, ours: str) -> list[Rule]:
     return [
-        *_linear(f"{theirs}.linear", f"{ours}.linear"),
-        *_norm(f"{theirs}.norm", f"{ours}.norm"),
+        *linear_rules(f"{theirs}.linear", f"{ours}.linear"),
+        *norm_rules(f"{theirs}.norm", f"{ours}.norm"),
     ]
 
 

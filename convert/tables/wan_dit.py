@@ -13,7 +13,7 @@ import numpy as np
 from einops import rearrange
 
 from egosim_jax.conditioning.layout import WAN_INPAINT
-from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
 from egosim_jax.convert.tables import (
     SHORT_LAYERS,
     Comparison,
@@ -42,33 +42,33 @@ def wan(config: WanDiTConfig) -> list[Rule]:
     rules = [
         Rule("patch_embedding.weight", "patch.kernel", PATCH_KERNEL),
         Rule("patch_embedding.bias", "patch.bias"),
-        *_linear("text_embedding.0", "text.up"),
-        *_linear("text_embedding.2", "text.down"),
-        *_linear("time_embedding.0", "time.mlp.up"),
-        *_linear("time_embedding.2", "time.mlp.down"),
-        *_linear("time_projection.1", "time.modulation"),
+        *linear_rules("text_embedding.0", "text.up"),
+        *linear_rules("text_embedding.2", "text.down"),
+        *linear_rules("time_embedding.0", "time.mlp.up"),
+        *linear_rules("time_embedding.2", "time.mlp.down"),
+        *linear_rules("time_projection.1", "time.modulation"),
         Rule("blocks.*.modulation", "blocks.modulation", MODULATION),
-        *_norm("blocks.*.norm3", "blocks.cross_norm"),
-        *_linear("blocks.*.ffn.0", "blocks.mlp.up"),
-        *_linear("blocks.*.ffn.2", "blocks.mlp.down"),
+        *norm_rules("blocks.*.norm3", "blocks.cross_norm"),
+        *linear_rules("blocks.*.ffn.0", "blocks.mlp.up"),
+        *linear_rules("blocks.*.ffn.2", "blocks.mlp.down"),
         Rule("head.modulation", "head.modulation", MODULATION),
-        *_linear("head.head", "head.linear"),
+        *linear_rules("head.head", "head.linear"),
     ]
     for attention in ("self_attn", "cross_attn"):
         theirs, ours = f"blocks.*.{attention}", f"blocks.{attention}"
         for name in "qkvo":
-            rules += _linear(f"{theirs}.{name}", f"{ours}.{name}")
+            rules += linear_rules(f"{theirs}.{name}", f"{ours}.{name}")
         for name in ("norm_q", "norm_k"):
             rules.append(Rule(f"{theirs}.{name}.weight", f"{ours}.{name}.scale"))
     if config.image_dim is not None:
         theirs, ours = "blocks.*.cross_attn", "blocks.cross_attn.image"
         rules += [
-            *_norm("img_emb.proj.0", "image.norm_in"),
-            *_linear("img_emb.proj.1", "image.mlp.up"),
-            *_linear("img_emb.proj.3", "image.mlp.down"),
-            *_norm("img_emb.proj.4", "image.norm_out"),
-            *_linear(f"{theirs}.k_img", f"{ours}.k"),
-            *_linear(f"{theirs}.v_img", f"{ours}.v"),
+            *norm_rules("img_emb.proj.0", "image.norm_in"),
+            *linear_rules("img_emb.proj.1", "image.mlp.up"),
+            *linear_rules("img_emb.proj.3", "image.mlp.down"),
+            *norm_rules("img_emb.proj.4", "image.norm_out"),
+            *linear_rules(f"{theirs}.k_img", f"{ours}.k"),
+            *linear_rules(f"{theirs}.v_img", f"{ours}.v"),
             Rule(f"{theirs}.norm_k_img.weight", f"{ours}.norm_k.scale"),
         ]
     return rules
@@ -80,36 +80,36 @@ def diffusers(config: WanDiTConfig) -> list[Rule]:
     rules = [
         Rule("patch_embedding.weight", "patch.kernel", PATCH_KERNEL),
         Rule("patch_embedding.bias", "patch.bias"),
-        *_linear(f"{embedder}.text_embedder.linear_1", "text.up"),
-        *_linear(f"{embedder}.text_embedder.linear_2", "text.down"),
-        *_linear(f"{embedder}.time_embedder.linear_1", "time.mlp.up"),
-        *_linear(f"{embedder}.time_embedder.linear_2", "time.mlp.down"),
-        *_linear(f"{embedder}.time_proj", "time.modulation"),
+        *linear_rules(f"{embedder}.text_embedder.linear_1", "text.up"),
+        *linear_rules(f"{embedder}.text_embedder.linear_2", "text.down"),
+        *linear_rules(f"{embedder}.time_embedder.linear_1", "time.mlp.up"),
+        *linear_rules(f"{embedder}.time_embedder.linear_2", "time.mlp.down"),
+        *linear_rules(f"{embedder}.time_proj", "time.modulation"),
         Rule("blocks.*.scale_shift_table", "blocks.modulation", MODULATION),
-        *_norm("blocks.*.norm2", "blocks.cross_norm"),
-        *_linear("blocks.*.ffn.net.0.proj", "blocks.mlp.up"),
-        *_linear("blocks.*.ffn.net.2", "blocks.mlp.down"),
+        *norm_rules("blocks.*.norm2", "blocks.cross_norm"),
+        *linear_rules("blocks.*.ffn.net.0.proj", "blocks.mlp.up"),
+        *linear_rules("blocks.*.ffn.net.2", "blocks.mlp.down"),
         Rule("scale_shift_table", "head.modulation", MODULATION),
-        *_linear("proj_out", "head.linear"),
+        *linear_rules("proj_out", "head.linear"),
     ]
     for theirs, ours in (
         ("blocks.*.attn1", "blocks.self_attn"),
         ("blocks.*.attn2", "blocks.cross_attn"),
     ):
         for name in "qkv":
-            rules += _linear(f"{theirs}.to_{name}", f"{ours}.{name}")
-        rules += _linear(f"{theirs}.to_out.0", f"{ours}.o")
+            rules += linear_rules(f"{theirs}.to_{name}", f"{ours}.{name}")
+        rules += linear_rules(f"{theirs}.to_out.0", f"{ours}.o")
         for name in ("norm_q", "norm_k"):
             rules.append(Rule(f"{theirs}.{name}.weight", f"{ours}.{name}.scale"))
     if config.image_dim is not None:
         theirs, ours = "blocks.*.attn2", "blocks.cross_attn.image"
         rules += [
-            *_norm(f"{embedder}.image_embedder.norm1", "image.norm_in"),
-            *_linear(f"{embedder}.image_embedder.ff.net.0.proj", "image.mlp.up"),
-            *_linear(f"{embedder}.image_embedder.ff.net.2", "image.mlp.down"),
-            *_norm(f"{embedder}.image_embedder.norm2", "image.norm_out"),
-            *_linear(f"{theirs}.add_k_proj", f"{ours}.k"),
-            *_linear(f"{theirs}.add_v_proj", f"{ours}.v"),
+            *norm_rules(f"{embedder}.image_embedder.norm1", "image.norm_in"),
+            *linear_rules(f"{embedder}.image_embedder.ff.net.0.proj", "image.mlp.up"),
+            *linear_rules(f"{embedder}.image_embedder.ff.net.2", "image.mlp.down"),
+            *norm_rules(f"{embedder}.image_embedder.norm2", "image.norm_out"),
+            *linear_rules(f"{theirs}.add_k_proj", f"{ours}.k"),
+            *linear_rules(f"{theirs}.add_v_proj", f"{ours}.v"),
             Rule(f"{theirs}.norm_added_k.weight", f"{ours}.norm_k.scale"),
         ]
     return rules
@@ -193,17 +193,6 @@ def pipeline(config: ModelConfig) -> dict[str, dict[str, Any]]:
             "shift": config.process.shift,
         },
     }
-
-
-def _linear(theirs: str, ours: str) -> list[Rule]:
-    return [
-        Rule(f"{theirs}.weight", f"{ours}.kernel", "linear"),
-        Rule(f"{theirs}.bias", f"{ours}.bias"),
-    ]
-
-
-def _norm(theirs: str, ours: str) -> list[Rule]:
-    return [Rule(f"{theirs}.weight", f"{ours}.scale"), Rule(f"{theirs}.bias", f"{ours}.bias")]
 
 
 TABLE = Table(

@@ -11,6 +11,8 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
+from egosim_jax.types import InputError
+
 
 class PatchEmbedding(nnx.Module):
     """Linear embedding of each patch, with a kernel `[channel, row, column, out]`."""
@@ -48,3 +50,21 @@ class PatchEmbedding(nnx.Module):
         )
         kernel = rearrange(kernel, "c i j d -> (c i j) d")
         return patches.astype(self.dtype) @ kernel.astype(self.dtype)
+
+
+def check_condition(
+    shape: tuple[int, ...], *, in_channels: int, noisy_channels: int, patch: int
+) -> None:
+    """Raise `InputError` unless a condition `b f h w c` fits the channels and the patches."""
+    _, _, h, w, channels = shape
+    if channels != in_channels - noisy_channels:
+        raise InputError(
+            f"A condition of {channels} channels does not fit this model: it reads "
+            f"{in_channels - noisy_channels} in addition to the {noisy_channels} noisy ones "
+            f"(in_channels {in_channels})."
+        )
+    if h % patch or w % patch:
+        raise InputError(
+            f"Latents of {h} x {w} cells do not split into patches of {patch} x {patch}: both "
+            "sizes must be even (pixels in multiples of 16)."
+        )

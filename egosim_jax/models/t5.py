@@ -7,9 +7,11 @@ from functools import partial
 
 import jax
 import numpy as np
+from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
+from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import Linear
 from egosim_jax.types import InputError
 
@@ -69,6 +71,28 @@ def relative_buckets(
     far = np.minimum(exact + (octaves * (half - exact)).astype(np.int32), half - 1)
     bucket = np.where(np.abs(offset) < exact, np.abs(offset), far)
     return (bucket + half * (offset > 0)).astype(np.int32)
+
+
+class Attention(nnx.Module):
+    """Self-attention with given position biases; the initial scores have variance 1."""
+
+    def __init__(self, config: T5Sizes, *, rngs: nnx.Rngs):
+        dim, inner = config.dim, config.heads * config.head_dim
+        self.heads = config.heads
+        linear = partial(Linear, bias=False, dtype=config.dtype, rngs=rngs)
+        unscaled = nnx.initializers.variance_scaling(1 / config.head_dim, "fan_in", "normal")
+        self.q = linear(dim, inner, axes=("embed", "heads"), kernel_init=unscaled)
+        self.k = linear(dim, inner, axes=("embed", "heads"))
+        self.v = linear(dim, inner, axes=("embed", "heads"))
+        self.o = linear(inner, dim, axes=("heads", "embed"))
+
+    def attend(
+        self, x: Float[Array, "b n d"], bias: Float[Array, "#b h n n"]
+    ) -> Float[Array, "b n d"]:
+        """Attend to all tokens, with `bias` added to the scores."""
+        split = partial(rearrange, pattern="b n (h k) -> b n h k", h=self.heads)
+        y = attention(split(self.q(x)), split(self.k(x)), split(self.v(x)), bias=bias, scale=1.0)
+        return self.o(rearrange(y, "b n h k -> b n (h k)"))
 
 
 class FeedForward(nnx.Module):

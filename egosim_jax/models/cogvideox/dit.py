@@ -30,7 +30,7 @@ from egosim_jax.models import remat, rope
 from egosim_jax.models.attention import attention
 from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
 from egosim_jax.models.layers import LayerNorm, Linear, scan_blocks, stack, zeros
-from egosim_jax.models.patch import PatchEmbedding
+from egosim_jax.models.patch import PatchEmbedding, check_condition
 from egosim_jax.models.remat import name_projection
 from egosim_jax.models.sinusoid import time_sinusoid
 from egosim_jax.sharding import constrain
@@ -272,18 +272,11 @@ class CogVideoXDiT(nnx.Module):
         return self.denoise(noisy, t, self.prepare(condition, text))
 
     def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
-        _, _, h, w, channels = condition
-        config = self.config
-        if channels != config.condition_channels:
-            raise InputError(
-                f"A condition of {channels} channels does not fit this model: it reads "
-                f"{config.condition_channels} in addition to the {config.out_channels} noisy ones "
-                f"(in_channels {config.in_channels})."
-            )
-        if h % PATCH or w % PATCH:
-            raise InputError(
-                f"Latents of {h} x {w} cells do not split into patches of {PATCH} x {PATCH}: both "
-                "sizes must be even (pixels in multiples of 16)."
-            )
+        check_condition(
+            condition,
+            in_channels=self.config.in_channels,
+            noisy_channels=self.config.out_channels,
+            patch=PATCH,
+        )
         if has_image:
             raise InputError("Image tokens were given to CogVideoX, which has no image branch.")

@@ -6,7 +6,6 @@ It is umT5 (`wan/umt5.py`) with one table of relative position biases for all bl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -14,9 +13,8 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from egosim_jax.models.attention import attention
-from egosim_jax.models.layers import Embed, Linear, RMSNorm, scan_blocks, stack
-from egosim_jax.models.t5 import FeedForward, T5Sizes, relative_buckets
+from egosim_jax.models.layers import Embed, RMSNorm, scan_blocks, stack
+from egosim_jax.models.t5 import Attention, FeedForward, T5Sizes, relative_buckets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,34 +32,12 @@ class T5Config(T5Sizes):
         return T5(self, rngs=rngs)
 
 
-class SelfAttention(nnx.Module):
-    """Attention with position biases that are given; the initial scores have variance 1."""
-
-    def __init__(self, config: T5Config, *, rngs: nnx.Rngs):
-        dim, inner = config.dim, config.heads * config.head_dim
-        self.heads = config.heads
-        linear = partial(Linear, bias=False, dtype=config.dtype, rngs=rngs)
-        unscaled = nnx.initializers.variance_scaling(1 / config.head_dim, "fan_in", "normal")
-        self.q = linear(dim, inner, axes=("embed", "heads"), kernel_init=unscaled)
-        self.k = linear(dim, inner, axes=("embed", "heads"))
-        self.v = linear(dim, inner, axes=("embed", "heads"))
-        self.o = linear(inner, dim, axes=("heads", "embed"))
-
-    def __call__(
-        self, x: Float[Array, "b n d"], bias: Float[Array, "1 h n n"]
-    ) -> Float[Array, "b n d"]:
-        """Attend to all tokens."""
-        split = partial(rearrange, pattern="b n (h k) -> b n h k", h=self.heads)
-        y = attention(split(self.q(x)), split(self.k(x)), split(self.v(x)), bias=bias, scale=1.0)
-        return self.o(rearrange(y, "b n h k -> b n (h k)"))
-
-
 class Block(nnx.Module):
     """Attention, then feed-forward, each added to its input."""
 
     def __init__(self, config: T5Config, *, rngs: nnx.Rngs):
         self.norm1 = RMSNorm(config.dim, eps=config.eps)
-        self.attn = SelfAttention(config, rngs=rngs)
+        self.attn = Attention(config, rngs=rngs)
         self.norm2 = RMSNorm(config.dim, eps=config.eps)
         self.ffn = FeedForward(config, rngs=rngs)
 
@@ -69,7 +45,7 @@ class Block(nnx.Module):
         self, x: Float[Array, "b n d"], bias: Float[Array, "1 h n n"]
     ) -> Float[Array, "b n d"]:
         """Advance the residual stream by one block."""
-        x = x + self.attn(self.norm1(x), bias)
+        x = x + self.attn.attend(self.norm1(x), bias)
         return x + self.ffn(self.norm2(x))
 
 

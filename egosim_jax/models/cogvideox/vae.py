@@ -145,7 +145,7 @@ class SpatialNorm(nnx.Module):
 def fit(z: Float[Array, "b f h w c"], shape: tuple[int, ...]) -> Float[Array, "b f2 h2 w2 c"]:
     """Repeat latent cells to the frames, rows and columns of a shape.
 
-    Of an odd number of frames, more than one, the first stands for itself.
+    With an odd number of frames above one, the first latent frame is not repeated in time.
     """
     _, frames, height, width, _ = shape
     z = repeat(z, "b f h w c -> b f (h i) (w j) c", i=height // z.shape[2], j=width // z.shape[3])

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from egosim_jax.models import remat, rope
 from egosim_jax.models.layers import scan_blocks, stack
-from egosim_jax.models.patch import PatchEmbedding
+from egosim_jax.models.patch import PatchEmbedding, check_condition
 from egosim_jax.models.wan.config import PATCH, WanDiTConfig
 from egosim_jax.models.wan.layers import (
     MLP,
@@ -144,19 +144,13 @@ class WanDiT(nnx.Module):
         return self.denoise(noisy, t, self.prepare(condition, text, image))
 
     def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
-        _, _, h, w, channels = condition
         config = self.config
-        if channels != config.condition_channels:
-            raise InputError(
-                f"A condition of {channels} channels does not fit this model: it reads "
-                f"{config.condition_channels} in addition to the {config.out_channels} noisy ones "
-                f"(in_channels {config.in_channels})."
-            )
-        if h % PATCH or w % PATCH:
-            raise InputError(
-                f"Latents of {h} x {w} cells do not split into patches of {PATCH} x {PATCH}: both "
-                "sizes must be even (pixels in multiples of 16)."
-            )
+        check_condition(
+            condition,
+            in_channels=config.in_channels,
+            noisy_channels=config.out_channels,
+            patch=PATCH,
+        )
         if has_image != (config.image_dim is not None):
             given, fix = ("were", "Omit them") if has_image else ("were not", "Pass them")
             raise InputError(

@@ -18,7 +18,6 @@ Padding is never attended to, and its embeddings are 0, as in Wan 2.1.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -27,9 +26,8 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
-from egosim_jax.models.attention import attention
-from egosim_jax.models.layers import Embed, Linear, RMSNorm, scan_blocks, stack
-from egosim_jax.models.t5 import FeedForward, T5Sizes, relative_buckets
+from egosim_jax.models.layers import Embed, RMSNorm, scan_blocks, stack
+from egosim_jax.models.t5 import Attention, FeedForward, T5Sizes, relative_buckets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,18 +45,11 @@ class UMT5Config(T5Sizes):
         return UMT5(self, rngs=rngs)
 
 
-class SelfAttention(nnx.Module):
+class SelfAttention(Attention):
     """Attention with a table of relative position biases; the initial scores have variance 1."""
 
     def __init__(self, config: UMT5Config, *, rngs: nnx.Rngs):
-        dim, inner = config.dim, config.heads * config.head_dim
-        self.heads = config.heads
-        linear = partial(Linear, bias=False, dtype=config.dtype, rngs=rngs)
-        unscaled = nnx.initializers.variance_scaling(1 / config.head_dim, "fan_in", "normal")
-        self.q = linear(dim, inner, axes=("embed", "heads"), kernel_init=unscaled)
-        self.k = linear(dim, inner, axes=("embed", "heads"))
-        self.v = linear(dim, inner, axes=("embed", "heads"))
-        self.o = linear(inner, dim, axes=("heads", "embed"))
+        super().__init__(config, rngs=rngs)
         table = nnx.initializers.normal(config.dim**-0.5)
         self.position_bias = nnx.Param(
             table(rngs.params(), (config.buckets, config.heads)), axes=(None, "heads")
@@ -71,12 +62,10 @@ class SelfAttention(nnx.Module):
         mask: Bool[Array, "b n"],
     ) -> Float[Array, "b n d"]:
         """Attend to the tokens of `mask`."""
-        split = partial(rearrange, pattern="b n (h k) -> b n h k", h=self.heads)
         bias = self.position_bias[...].astype(jnp.float32)[buckets]
         bias = rearrange(bias, "n m h -> 1 h n m")
         bias = jnp.where(mask[:, None, None, :], bias, jnp.finfo(jnp.float32).min)
-        y = attention(split(self.q(x)), split(self.k(x)), split(self.v(x)), bias=bias, scale=1.0)
-        return self.o(rearrange(y, "b n h k -> b n (h k)"))
+        return self.attend(x, bias)
 
 
 class Block(nnx.Module):

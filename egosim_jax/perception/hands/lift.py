@@ -3,7 +3,7 @@
 With keypoints w of the hand up to a translation T, and rays (x, y, 1) through its pixels, each
 keypoint gives two equations that are linear in T: x (T_z + w_z) = T_x + w_x, and the same for y.
 The least squares solution gives every keypoint its depth T_z + w_z. The keypoint is then put on its
-ray at that depth, so that a drawn skeleton lies on the hand that was seen.
+ray at that depth, so that a drawn skeleton coincides with the observed hand.
 """
 
 from __future__ import annotations
