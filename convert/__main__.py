@@ -24,11 +24,11 @@ Commands = (
 )
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: Sequence[str] | None = None, *, program: str = "egosim-convert") -> int:
     """Run `egosim-convert` and return its exit code."""
     return command.main(
         Commands,
-        program="egosim-convert",
+        program=program,
         description="Convert weights and LoRAs from and to PyTorch checkpoints.",
         args=args,
     )

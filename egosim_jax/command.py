@@ -57,10 +57,12 @@ def main(
     description: str,
     args: Sequence[str] | None,
     context: Callable[[], AbstractContextManager[None]] = nullcontext,
+    others: Sequence[str] = (),
 ) -> int:
     """Parse a command line into one of the dataclasses `commands`, run it, return its exit code.
 
-    The command runs inside the context manager that `context` makes after parsing. Results go to
+    The command runs inside the context manager that `context` makes after parsing. `others` are
+    subcommands that are not parsed here, to be suggested for mistyped ones. Results go to
     stdout, progress and errors to stderr. A wrong option or invalid input prints one message; a
     traceback means a defect of the program.
     """
@@ -74,7 +76,7 @@ def main(
         if given == ["--version"]:
             print(f"{program} {metadata.version('egosim-jax')}")
             return ExitCode.DONE
-        if (mistake := _mistyped(commands, given, program)) is not None:
+        if (mistake := _mistyped(commands, given, program, others)) is not None:
             raise InputError(mistake)
         command: Command = tyro.cli(
             commands,
@@ -92,17 +94,20 @@ def main(
     return run_with_exit_codes(run)
 
 
-def _mistyped(commands: Any, args: Sequence[str], program: str) -> str | None:
+def _mistyped(
+    commands: Any, args: Sequence[str], program: str, others: Sequence[str] = ()
+) -> str | None:
     """Return an error message for an unknown subcommand, or None; it names the nearest."""
     known = {part.__metadata__[0].name: part.__origin__ for part in get_args(commands)}
-    if not known or not args or args[0].startswith("-"):
+    if not known or not args or args[0].startswith("-") or args[0] in others:
         return None
     if args[0] in known:
         below = get_type_hints(known[args[0]], include_extras=True).get("command")
         return _mistyped(below, args[1:], f"{program} {args[0]}") if below else None
-    near = difflib.get_close_matches(args[0], known, n=1, cutoff=0.6)
+    names = [*known, *others]
+    near = difflib.get_close_matches(args[0], names, n=1, cutoff=0.6)
     meant = f" Did you mean {near[0]}?" if near else ""
-    return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(known)}."
+    return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(names)}."
 
 
 def run_with_exit_codes(run: Callable[[], int]) -> int:

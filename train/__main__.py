@@ -24,7 +24,7 @@ Recipes = Union[  # noqa: UP007 - a tuple of members
 ]
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") -> int:
     """Run `egosim-train`; with `args`, in a process that may have used its devices already."""
     from egosim_jax.train.distributed import distributed_context
 
@@ -32,7 +32,7 @@ def main(args: Sequence[str] | None = None) -> int:
     without_training = any(arg.partition("=")[0] == "--preflight" for arg in given)
     return command.main(
         Recipes,
-        program="egosim-train",
+        program=program,
         description="Train a model. The same command resumes an interrupted run. With --preflight "
         "it only reports whether the training would fit a machine, which need not be present.",
         args=args,

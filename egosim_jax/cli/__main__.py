@@ -1,4 +1,4 @@
-"""`egosim`: generate clips, simulate a world, evaluate, prepare data."""
+"""`egosim`: generate clips, simulate a world, evaluate, prepare data, train, convert weights."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ interrupts.expect()
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Annotated
 
 import tyro
@@ -38,13 +39,44 @@ Commands = (
 )
 
 
+PROGRAMS = {"train": "egosim_jax.train.__main__", "convert": "egosim_jax.convert.__main__"}
+"""Subcommands that are programs of their own, imported only when they are called."""
+
+START = """\
+egosim: an egocentric world simulator in JAX
+
+  egosim simulate                 three clips of a tabletop world, with the model in the package
+  egosim generate                 one clip; --metadata FILE generates your own
+  egosim data annotate VIDEO      a scene, cameras and hands from your own video
+  egosim episode make             an episode to edit: scene, cameras, hands, prompts
+  egosim models list              released weights to fetch and convert
+  egosim train debug              a training of minutes; egosim train --help lists the recipes
+  egosim doctor                   devices, versions, extras, and what fits
+
+egosim --help describes all commands, egosim COMMAND --help the options of one."""
+"""What `egosim` alone prints."""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command `egosim`; return its exit code."""
+    given = list(sys.argv[1:] if args is None else args)
+    if not given:
+        print(START)
+        return command.ExitCode.DONE
+    if given[0] in PROGRAMS:
+        program = f"egosim {given[0]}"
+        run = import_module(PROGRAMS[given[0]]).main
+        if args is not None:
+            return run(given[1:], program=program)
+        sys.argv = [program, *given[1:]]
+        return run(program=program)
     return command.main(
         Commands,
         program="egosim",
-        description="An egocentric world simulator in JAX.",
+        description="An egocentric world simulator in JAX. `egosim train` trains a model and "
+        "`egosim convert` converts weights; each has its own --help.",
         args=args,
+        others=tuple(PROGRAMS),
     )
 
 

@@ -13,6 +13,7 @@ from packaging.requirements import Requirement
 
 import egosim_jax
 from egosim_jax import command
+from egosim_jax.cli.__main__ import Commands
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as convert
 from egosim_jax.train.__main__ import main as train
@@ -46,6 +47,8 @@ def test_python_dash_m_egosim_jax_is_egosim(monkeypatch, capsys):
         (egosim, ["experiment", "tabeltop"], "Did you mean tabletop?"),
         (train, ["debugg", "--out", "x"], "Did you mean debug?"),
         (convert, ["to_torch"], "Did you mean to-torch?"),
+        (egosim, ["trian"], "Did you mean train?"),
+        (egosim, ["convert", "to_torch"], "egosim convert has no command 'to_torch'. Did you"),
         (egosim, ["zzz"], "All: generate, "),
     ],
 )
@@ -54,6 +57,21 @@ def test_a_mistyped_command_gets_a_suggestion_in_one_line(program, args, meant, 
     said = capsys.readouterr().err
     assert meant in said
     assert said.count("\n") == 1
+
+
+def test_egosim_alone_shows_what_to_do_next(capsys):
+    assert egosim([]) == command.ExitCode.DONE
+    shown = capsys.readouterr().out
+    lines = [line.split("  ")[1].split() for line in shown.splitlines()[2:-2]]
+    assert len(lines) == 7
+    for program, *words in lines:
+        assert program == "egosim"
+        assert command._mistyped(Commands, words, program, ["train"]) is None
+
+
+def test_egosim_train_is_egosim_train(capsys):
+    assert egosim(["train", "--version"]) == command.ExitCode.DONE
+    assert capsys.readouterr().out == f"egosim train {egosim_jax.__version__}\n"
 
 
 def test_a_mistyped_config_gets_a_suggestion(capsys, tmp_path):
