@@ -23,11 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.image import clip_pixels
+from egosim_jax.conditioning.posterior import EncodingNoise, add_pixel_noise, draw, posterior
 from egosim_jax.conditioning.video import to_model, to_uint8
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
@@ -65,10 +66,19 @@ class Inputs:
     """Token ids of the model's `unconditional_prompt`."""
     null_mask: Bool[Any, "b n"] | None
     pixels: Float[Any, "b s s 3"] | None
+    image: Float[Any, "b m e"] | None = None
+    """Image tokens of zeros, of a model that has them in place of an encoder's."""
+    seeds: UInt32[Any, " b"] | None = None
+    """Seeds of the model's `encoding_noise`; None without."""
 
     @classmethod
-    def of(cls, triplets: Sequence[Triplet], config: ModelConfig) -> Inputs:
-        """Tokenize the prompts, pack the masks and prepare the image for CLIP."""
+    def of(
+        cls, triplets: Sequence[Triplet], config: ModelConfig, seeds: Sequence[int] | None = None
+    ) -> Inputs:
+        """Tokenize the prompts, pack the masks and prepare the image for CLIP.
+
+        `seeds` are only needed, and kept, where the encoding is random.
+        """
         tokens, layout = config.tokenizer.tokenize([t.prompt for t in triplets]), config.layout
         masks = [layout.pack_mask(t.mask, config.grid) for t in triplets if "mask" in layout]
         null = config.unconditional_prompt
@@ -87,6 +97,8 @@ class Inputs:
                 image_size=config.image.image_size,
                 image_range=config.image_range,
             ),
+            image=config.zero_image(len(triplets)),
+            seeds=None if seeds is None or config.encoding_noise is None else _uint32(seeds),
         )
 
     @classmethod
@@ -97,7 +109,7 @@ class Inputs:
         frames = shape(np.uint8, video.frames, video.height, video.width, 3)
         size = config.image and config.image.image_size
         mask = shape(np.uint8, *config.latent_shape, layout.count("mask"))
-        null = config.unconditional_prompt is not None
+        null, zeros = config.unconditional_prompt is not None, config.zero_image(1)
         return cls(
             prior=frames if "prior" in layout else None,
             hands=frames if "hands" in layout else None,
@@ -107,25 +119,43 @@ class Inputs:
             null_ids=shape(np.int32, tokens) if null else None,
             null_mask=shape(np.bool_, tokens) if null else None,
             pixels=size and shape(np.float32, size, size, 3),
+            image=None if zeros is None else shape(zeros.dtype, *zeros.shape[1:]),
+            seeds=None if config.encoding_noise is None else shape(np.uint32),
         )
 
 
-def encode_condition(networks: Networks, inputs: Inputs) -> Condition:
-    """Encode the conditions: videos to latents, prompt and image to tokens."""
+def encode_condition(
+    networks: Networks, inputs: Inputs, noise: EncodingNoise | None = None
+) -> Condition:
+    """Encode the conditions: videos to latents, prompt and image to tokens.
 
-    def encode(video: Array | None) -> Array | None:
-        return None if video is None else networks.vae.encode(to_model(video))
+    `noise` draws from the inputs' seeds.
+    """
+    noise = noise or EncodingNoise()
+    if inputs.seeds is None and noise != EncodingNoise():
+        raise InputError("A random encoding needs seeds: give each triplet one. (seeds)")
+    keys = () if inputs.seeds is None else (_keys(inputs.seeds, 2), _keys(inputs.seeds, 3))
+
+    def encode(video: Array | None, *, std: float = 0.0, drawn: bool = False) -> Array | None:
+        if video is None:
+            return None
+        pixels: Any = to_model(video)
+        if std:
+            pixels = add_pixel_noise(pixels, std, keys[0])
+        if drawn:
+            return draw(*posterior(networks.vae, pixels), keys[1])
+        return networks.vae.encode(pixels)
 
     embed = replicate_params(networks.text)
     return Condition(
         mask=None if inputs.mask is None else inputs.mask.astype(jnp.float32),
-        prior=encode(inputs.prior),
-        hands=encode(inputs.hands),
+        prior=encode(inputs.prior, std=noise.prior_pixels),
+        hands=encode(inputs.hands, drawn=noise.hands),
         text=embed(inputs.ids, inputs.ids_mask),
         null_text=None
         if inputs.null_ids is None or inputs.null_mask is None
         else embed(inputs.null_ids, inputs.null_mask),
-        image=None
+        image=inputs.image
         if networks.image is None or inputs.pixels is None
         else replicate_params(networks.image)(inputs.pixels),
     )
@@ -177,7 +207,10 @@ class Generator:
         self.renderer = renderer
         self.networks = networks = shard_params(networks, mesh)
         self._encode = CompiledFn(
-            encode_condition, networks, mesh=mesh, cache_key=("encode", config)
+            lambda networks, inputs: encode_condition(networks, inputs, config.encoding_noise),
+            networks,
+            mesh=mesh,
+            cache_key=("encode", config),
         )
         self._latents = CompiledFn(
             lambda vae, video: vae.encode(to_model(video)), networks.vae, mesh=mesh
@@ -276,7 +309,7 @@ class Generator:
         without: ConditionName | None = None,
     ) -> Float[Array, "b f h w z"]:
         """Return the latents that `generate` decodes; raises what it raises."""
-        condition = self._encode(Inputs.of(triplets, self.config))
+        condition = self._encode(Inputs.of(triplets, self.config, seeds))
         if without is not None:
             condition = condition.drop(without)
         latents = self._denoise(condition, self.noise(seeds), *self._stepping(_uint32(seeds)))
@@ -350,7 +383,12 @@ def _uint32(seeds: Sequence[int]) -> np.ndarray:
 
 def _step_keys(seeds: Array) -> Key[Array, " b"]:
     """Return the key of each seed's noise at the solver's steps, other than its starting noise."""
-    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), 1))(seeds)
+    return _keys(seeds, 1)
+
+
+def _keys(seeds: Array, use: int) -> Key[Array, " b"]:
+    """Return a key of each seed for one of its uses."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), use))(seeds)
 
 
 def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:

@@ -7,10 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
+from jaxtyping import Float
 
 from egosim_jax.conditioning.layout import ChannelLayout
+from egosim_jax.conditioning.posterior import EncodingNoise
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
@@ -33,7 +36,7 @@ from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.types import InputError, VideoGrid, VideoSpec
+from egosim_jax.types import InputError, VideoGrid, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
 """Role of a network in a model, which is also the stem of its file of weights."""
@@ -58,6 +61,10 @@ class ModelConfig:
     """Config of the text encoder."""
     image: ImageEncoderConfig | None = field(default_factory=CLIPVisionConfig)
     """Config of the image encoder; None for models without the image branch."""
+    zero_image_tokens: int | None = None
+    """Number of zeros that the denoiser gets for image tokens, without an encoder (DWM on Wan).
+
+    They are tokens of the image encoder's width, in training as at generation."""
     layout: ChannelLayout = field(default_factory=ChannelLayout)
     """Input channels of the denoiser."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
@@ -66,6 +73,10 @@ class ModelConfig:
     """`frozen`: text and image encoder are given; `joint`: trained together with the denoiser."""
     image_range: Literal["signed", "unit"] = "signed"
     """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
+    posterior: Literal["sampled"] | None = None
+    """Latents of a training: drawn at each update (`sampled`, DWM), or the means (None)."""
+    encoding_noise: EncodingNoise | None = None
+    """Randomness in the encoding of conditions at generation; None: none."""
     process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
     """Path from data to noise, and the quantity that the denoiser predicts."""
     solver: Euler | DDIM | UniPC | DPMSolver = field(default_factory=Euler)
@@ -86,7 +97,7 @@ class ModelConfig:
         pairs = [
             ("dit.text_dim", dit.text_dim, "text.dim", self.text.dim),
             ("dit.out_channels", dit.out_channels, "vae.latent_channels", latents),
-            ("dit.image_dim", dit.image_dim, "image.dim", self.image and self.image.dim),
+            *self._image_sizes(),
             ("dit.in_channels", dit.in_channels, "layout.channels", layout.channels),
         ]
         for part in ("noisy", "prior", "hands"):
@@ -119,6 +130,31 @@ class ModelConfig:
                 f"{self.name}: {frames} latent frames do not divide into tokens of {patch}. Change "
                 "the number of frames. (video.frames, dit.patch)"
             )
+
+    def _image_sizes(self) -> list[tuple[str, int | None, str, int | None]]:
+        """Return the widths of the image tokens, which must agree."""
+        given = self.image and self.image.dim
+        if self.zero_image_tokens is None:
+            return [("dit.image_dim", self.dit.image_dim, "image.dim", given)]
+        check_counts({"zero_image_tokens": self.zero_image_tokens})
+        if self.image is not None or self.dit.image_dim is None:
+            raise InputError(
+                f"{self.name}: image tokens of zeros are for a denoiser with an image branch in a "
+                f"model without an image encoder, not {self.zero_image_tokens} of them with "
+                f"image.dim {given} and dit.image_dim {self.dit.image_dim}. (zero_image_tokens)"
+            )
+        return []
+
+    @property
+    def image_tokens(self) -> int:
+        """Number of image tokens that the denoiser gets."""
+        return self.zero_image_tokens or (0 if self.image is None else self.image.tokens)
+
+    def zero_image(self, batch: int) -> Float[np.ndarray, "b m e"] | None:
+        """Return the image tokens of a model whose tokens are zeros; None for others."""
+        if self.zero_image_tokens is None:
+            return None
+        return np.zeros((batch, self.zero_image_tokens, self.dit.image_dim or 0), np.float32)
 
     @property
     def grid(self) -> VideoGrid:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
+import jax.numpy as jnp
 import optax
 from flax import nnx
 from optax.contrib import MuonDimensionNumbers, muon
@@ -37,8 +38,12 @@ class OptimizerConfig:
     """Peak learning rate of the training."""
     warmup_steps: int = 0
     """Updates of linear warm-up from zero."""
-    schedule: Literal["constant", "cosine"] = "constant"
-    """Learning rate after the warm-up: constant, or a cosine down to a twentieth of the peak."""
+    schedule: Literal["constant", "cosine", "cosine_restarts"] = "constant"
+    """Learning rate after the warm-up: constant, or a cosine.
+
+    `cosine` falls to a twentieth of the peak, `cosine_restarts` to 0 in each of its `cycles`."""
+    cycles: int | None = None
+    """Number of cycles of `cosine_restarts`; None: 1."""
     weight_decay: float = 0.0
     """Decoupled weight decay, of matrices and kernels only."""
     b1: float = 0.9
@@ -59,6 +64,12 @@ class OptimizerConfig:
         for name in ("learning_rate", "clip_grad_norm"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
+        check_counts({"cycles": self.cycles})
+        if self.cycles is not None and self.schedule != "cosine_restarts":
+            raise InputError(
+                f"Only the schedule cosine_restarts has cycles, not {self.schedule}: omit them, or "
+                f"choose it. {self.cycles} were given. (cycles)"
+            )
         factor, decay = self.skip_grad_norm_factor, self.ema_decay
         if factor is not None and factor <= 1:
             raise InputError(f"skip_grad_norm_factor must be above 1, not {factor}.")
@@ -197,6 +208,18 @@ def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
     if config.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(
             0.0 if warmup else peak, peak, warmup, max(steps, warmup + 1), end_value=peak / 20
+        )
+    if config.schedule == "cosine_restarts":
+        rest, cycles = max(steps - warmup, 1), config.cycles or 1
+
+        def restarted(count: Any) -> Any:
+            """Return the rate at a number of updates after the warm-up."""
+            share = jnp.minimum(count / rest, 1.0)
+            angle = jnp.where(share < 1, cycles * share % 1.0, 1.0)
+            return peak * 0.5 * (1 + jnp.cos(jnp.pi * angle))
+
+        return optax.schedules.join_schedules(
+            [optax.linear_schedule(0.0 if warmup else peak, peak, warmup), restarted], [warmup]
         )
     return optax.schedules.join_schedules(
         [optax.linear_schedule(0.0 if warmup else peak, peak, warmup), lambda _: peak], [warmup]

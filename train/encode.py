@@ -14,6 +14,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -26,6 +27,8 @@ from flax import nnx
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
+from egosim_jax.conditioning.posterior import STD
+from egosim_jax.conditioning.posterior import posterior as moments_of
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
@@ -57,7 +60,9 @@ class Encoding:
 
     def __init__(self, config: ModelConfig, encoders: Networks, mesh: Mesh | None = None):
         self.config = config
-        self._encode = CompiledFn(_encode, shard_params(encoders, mesh), mesh=mesh)
+        self._encode = CompiledFn(
+            partial(_encode, posterior=config.posterior), shard_params(encoders, mesh), mesh=mesh
+        )
 
     def __call__(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
         """Return the arrays of each triplet's record.
@@ -72,14 +77,24 @@ class Encoding:
         return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
 
 
-def _encode(encoders: Networks, inputs: Inputs, target: jax.Array) -> dict[str, jax.Array]:
-    """Encode one video after the other: the VAE is compiled once and needs little memory."""
+def _encode(
+    encoders: Networks, inputs: Inputs, target: jax.Array, *, posterior: str | None = None
+) -> dict[str, jax.Array]:
+    """Encode one video after the other: the VAE is compiled once and needs little memory.
+
+    With the posterior `sampled` there are deviations too, so that a training can draw.
+    """
     videos = {"target": target, "prior": inputs.prior, "hands": inputs.hands}
     videos = {name: jnp.asarray(video) for name, video in videos.items() if video is not None}
-    latents = jax.lax.map(
-        lambda video: encoders.vae.encode(to_model(video)), jnp.stack([*videos.values()])
-    )
-    arrays = dict(zip(videos, latents, strict=True))
+    stacked = jnp.stack([*videos.values()])
+    if posterior is None:
+        latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), stacked)
+        arrays = dict(zip(videos, latents, strict=True))
+    else:
+        codec: Any = encoders.vae
+        means, stds = jax.lax.map(lambda video: moments_of(codec, to_model(video)), stacked)
+        arrays = dict(zip(videos, means, strict=True))
+        arrays |= dict(zip((f"{name}{STD}" for name in videos), stds, strict=True))
     if encoders.text is not None:
         arrays["text"] = encoders.text(inputs.ids, inputs.ids_mask)
         if inputs.null_ids is not None and inputs.null_mask is not None:
@@ -101,7 +116,12 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
     target = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
     graph, params = nnx.split(Networks.abstract(config, only=config.cached_networks))
     encoded = jax.eval_shape(
-        lambda params, *given: _encode(nnx.merge(graph, params), *given), params, inputs, target
+        lambda params, *given: _encode(
+            nnx.merge(graph, params), *given, posterior=config.posterior
+        ),
+        params,
+        inputs,
+        target,
     )
     given = {"mask": inputs.mask}
     if config.encoders == "joint":
@@ -317,6 +337,8 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
     mask = manifest.provenance.get("mask", OLD_MASK)
     if "mask" in config.layout and mask != mask_of(config):
         problems.append(f"mask: the shards have {mask}, this training has {mask_of(config)}")
+    if config.posterior is not None and f"target{STD}" not in manifest.arrays:
+        problems.append("deviations of the latents: the shards have none, this training draws")
     if weights is not None:
         ours = {"vae": "none", **hashes(weights, only=encoders)}
         problems += [

@@ -43,6 +43,8 @@ class FineTuning(Recipe):
     """Distribution and weighting of the noise levels."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
+    navigation: float | None = None
+    """Rate of samples without hands whose target is the prior (DWM's regularizer); None: none."""
     remat: str | None = None
     """Rematerialization in the backward pass, if not the model's (`remat_levels`)."""
     attention: Kernel | None = None
@@ -63,6 +65,7 @@ class FineTuning(Recipe):
             objective=Objective(times=self.times),
             dropout=self.dropout,
             rank=self.rank,
+            navigation=self.navigation,
         )
         return {"training": Stage(task, self.training)}
 

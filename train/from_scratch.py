@@ -178,7 +178,6 @@ class FromScratch(Recipe):
 
     def _train_autoencoder(self, frames: Mapping[str, Path], out: Path) -> WanVAE:
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.models.wan.vae import standardize_latents
         from egosim_jax.train.loop import train
         from egosim_jax.train.tasks.autoencoding import latent_statistics
 
@@ -189,7 +188,7 @@ class FromScratch(Recipe):
             out=out / "vae",
         )
         videos = (record.arrays["target"] for record in ShardReader(frames["train"]))
-        standardize_latents(vae, *latent_statistics(vae, videos))
+        vae.standardize(*latent_statistics(vae, videos))
         return vae
 
     def _encode(self, split: str, frames: Path, out: Path) -> Path:

@@ -120,6 +120,69 @@ writes the names that ComfyUI and diffusers read.
 """
 
 
+DWM_COGVIDEOX_5B = FineTuning(
+    config="dwm_cogvideox_5b",
+    rank=64,
+    times="uniform",
+    training=TrainConfig(
+        steps=8000,
+        batch_size=56,
+        grad_accum_steps=56,
+        optimizer=OptimizerConfig(
+            learning_rate=1e-4,
+            warmup_steps=100,
+            schedule="cosine_restarts",
+            weight_decay=0.01,
+            b2=0.95,
+        ),
+        save_every=500,
+        validate_every=500,
+        sample_every=500,
+    ),
+)
+r"""DWM's training: a LoRA of CogVideoX-Fun V1.1 5B InP, widened from 33 to 49 channels.
+
+    egosim-convert weights CogVideoX-Fun-V1.1-5b-InP --config dwm_cogvideox_5b \
+        --widen polarity --out weights/base
+    egosim data encode --config dwm_cogvideox_5b --weights weights/base --shards shards/train \
+        --out latents/train
+    egosim-train dwm_cogvideox_5b --weights weights/base --latents latents/train --out runs/dwm
+
+AdamW (0.9, 0.95) at 1e-4 on queries, keys, values and outputs, of rank and alpha 64, and on the
+patch projection: 66.7 million float32 weights. 56 clips of 49 frames per update, 8000 updates, as
+the released checkpoint has (its config asks for 15 000); no condition is dropped. The latents are
+drawn anew at each update.
+"""
+
+DWM_WAN_14B = FineTuning(
+    config="dwm_wan_14b",
+    rank=64,
+    times="uniform",
+    training=TrainConfig(
+        steps=5000,
+        batch_size=8,
+        grad_accum_steps=8,
+        optimizer=OptimizerConfig(
+            learning_rate=1e-4,
+            warmup_steps=100,
+            schedule="cosine_restarts",
+            weight_decay=0.01,
+        ),
+        save_every=500,
+        validate_every=500,
+        sample_every=500,
+    ),
+)
+r"""DWM's training on Wan 2.1 Fun V1.1 14B InP, widened from 36 to 52 channels.
+
+    egosim-convert weights Wan2.1-Fun-V1.1-14B-InP --config dwm_wan_14b --widen polarity \
+        --out weights/base
+
+and then as `dwm_cogvideox_5b`. A LoRA of rank and alpha 64 on all 488 linear layers, and the patch
+embedding; 5000 updates, as the released checkpoint has.
+"""
+
+
 def _muon(learning_rate: float, warmup_steps: int) -> OptimizerConfig:
     return OptimizerConfig(
         name="muon", learning_rate=learning_rate, warmup_steps=warmup_steps, schedule="cosine"
@@ -227,6 +290,8 @@ RECIPES: dict[str, tuple[str, Recipe]] = {
     "real_tiny": ("Train `real_tiny` from scratch on the clips of a metadata file.", REAL_TINY),
     "tabletop": ("Train `tabletop` from scratch on scenes of the tabletop world.", TABLETOP),
     "tabletop_vae": ("Train the VAE of `tabletop` further, with LPIPS.", TABLETOP_VAE),
+    "dwm_cogvideox_5b": ("Train DWM on CogVideoX-Fun 5B, as a LoRA.", DWM_COGVIDEOX_5B),
+    "dwm_wan_14b": ("Train DWM on Wan 2.1 Fun 14B, as a LoRA.", DWM_WAN_14B),
     "egosim_14b": ("Train EgoSim's 14B transformer from Wan 2.1 Fun InP.", EGOSIM_14B),
     "egosim_1_3b": ("Train the 1.3B transformer with EgoSim's conditioning.", EGOSIM_1_3B),
     "egosim_14b_robot": ("Train EgoSim's 14B transformer on clips of a robot.", EGOSIM_14B_ROBOT),

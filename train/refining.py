@@ -70,7 +70,6 @@ class RefineVAE(Recipe):
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.io import weights
         from egosim_jax.io.run import open_folder
-        from egosim_jax.models.wan.vae import standardize_latents
         from egosim_jax.train.loop import train
         from egosim_jax.train.tasks.autoencoding import latent_statistics
 
@@ -85,7 +84,7 @@ class RefineVAE(Recipe):
         ).vae
         if self.part == "all":
             videos = (record.arrays["target"] for record in ShardReader(frames / "train"))
-            standardize_latents(vae, *latent_statistics(vae, videos))
+            vae.standardize(*latent_statistics(vae, videos))
         folder = out / "weights"
         weights.save(folder / "vae.safetensors", vae, dtype=self.weights_dtype)
         weights.link_others(folder, start)

@@ -56,6 +56,10 @@ class Generate:
     """First frame of the window that is generated; several make several clips, {id}_{frame}."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
+    sampling: str | None = None
+    """Named sampling of the model, such as `released` or `paper` of DWM; None: the default one.
+
+    It may set steps, solver, guidance and prompt; --steps and --solver change it."""
     solver: Solver | None = None
     """Sampler, instead of the model's.
 
@@ -142,6 +146,7 @@ class Generate:
         from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
 
         config = configs.get(self.config)
+        config = config if self.sampling is None else configs.sampled(config, self.sampling)
         config = config if self._weights is None else config.at(self._weights)
         config = replace(config, steps=self.steps or config.steps)
         if self.solver is not None:

@@ -7,6 +7,7 @@ import importlib
 import json
 import pkgutil
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -32,6 +33,26 @@ def names() -> list[str]:
 def get(name: str) -> ModelConfig:
     """Return the config of a name; an unknown one raises `InputError` with the nearest."""
     return _module(name).CONFIG
+
+
+def sampled(config: ModelConfig, sampling: str) -> ModelConfig:
+    """Return a model with one of its named samplings, of which most models have none.
+
+    An unknown name raises `InputError` with the nearest.
+    """
+    known = getattr(_module(config.name), "SAMPLINGS", {})
+    if not known:
+        raise InputError(
+            f"{config.name} has no named samplings, so that there is no {sampling}: omit the "
+            "option. (--sampling)"
+        )
+    if sampling not in known:
+        near = difflib.get_close_matches(sampling, known, n=1, cutoff=0.0)
+        raise InputError(
+            f"{config.name} has no sampling {sampling!r}. Nearest: {near[0]}. All: "
+            f"{', '.join(known)}. (--sampling)"
+        )
+    return replace(config, **known[sampling])
 
 
 def allows_random_weights(name: str) -> bool:

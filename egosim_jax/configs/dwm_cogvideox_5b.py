@@ -1,14 +1,16 @@
 """DWM on CogVideoX-Fun V1.1 5B InP: 49 frames of 720 x 480 at 8 per second, as it was released.
 
 The prior is the video of the static scene along the camera path, observed everywhere, and the hands
-are shaded meshes on black. 50 DDIM steps with guidance away from the empty prompt.
-(Kim et al. 2026, Dexterous World Models.)
+are shaded meshes on black. 50 DDIM steps with guidance away from the empty prompt; the sampling
+`paper` is that of the paper's tables. (Kim et al. 2026, Dexterous World Models.)
 """
 
 from pathlib import Path
 
 from egosim_jax.conditioning.layout import DWM
+from egosim_jax.conditioning.posterior import EncodingNoise
 from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.diffusion.solver import DDIM
@@ -27,9 +29,32 @@ CONFIG = ModelConfig(
     image=None,
     layout=DWM,
     tokenizer=PromptTokenizer(kind=Path("tokenizer"), clean=False, max_tokens=226),
+    posterior="sampled",
+    encoding_noise=EncodingNoise(hands=True),
     process=VariancePreserving(),
     solver=DDIM(),
     guidance=Guidance(scale=6.0),
     unconditional_prompt="",
     steps=50,
 )
+
+NEGATIVE_PROMPT = (
+    "The video is not of a high quality, it has a low resolution. Watermark present in each frame. "
+    "The background is solid. Strange body and strange trajectory. Distortion. "
+)
+"""Prompt that the paper's evaluation guides away from: that of CogVideoX-Fun's pipeline."""
+SAMPLINGS = {
+    "released": {
+        "solver": CONFIG.solver,
+        "unconditional_prompt": CONFIG.unconditional_prompt,
+        "encoding_noise": CONFIG.encoding_noise,
+    },
+    "paper": {
+        "solver": DPMSolver(stochastic=True),
+        "unconditional_prompt": NEGATIVE_PROMPT,
+        "encoding_noise": EncodingNoise(hands=True, prior_pixels=0.0563),
+    },
+}
+"""Named samplings: the release's, and that of the scripts behind the paper's tables.
+
+The paper's is CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior."""

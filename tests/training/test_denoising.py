@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.conditioning.layout import ChannelLayout
-from egosim_jax.train.tasks.denoising import Denoising, loss_weights
+from egosim_jax.train.tasks.denoising import Denoising, drawn, loss_weights, without_hands
 from egosim_jax.types import InputError
 from tests.training.run_tiny import MODEL
 
@@ -47,6 +47,31 @@ def test_a_layout_without_a_prior_trains_unless_changes_shall_weigh_more():
     assert np.isfinite(loss)
     with pytest.raises(InputError, match="has no prior"):
         Denoising(model=model, change_loss_weight=1.0)
+
+
+def test_navigation_takes_the_hands_away_and_the_prior_for_target():
+    rng = np.random.default_rng(0)
+    batch = {n: jnp.asarray(rng.normal(size=(64, 1, 1, 1, 16))) for n in ("target", "prior")}
+    batch["hands"] = jnp.ones((64, 1, 1, 1, 16))
+    keys = jax.random.split(jax.random.key(0), 64)
+    changed = without_hands(batch, keys, 0.5)
+    gone = np.asarray(changed["hands"]).max(axis=(1, 2, 3, 4)) == 0
+    assert 15 < gone.sum() < 49
+    np.testing.assert_array_equal(changed["target"][gone], batch["prior"][gone])
+    np.testing.assert_array_equal(changed["target"][~gone], batch["target"][~gone])
+    one = without_hands({n: a[:1] for n, a in batch.items()}, keys[:1], 0.5)
+    np.testing.assert_array_equal(one["hands"], changed["hands"][:1])
+    with pytest.raises(InputError, match=r"must be in \[0, 1\], not 2"):
+        Denoising(model=MODEL, navigation=2.0)
+
+
+def test_drawn_latents_differ_by_stream_and_by_sample():
+    names = ("target", "prior", "hands")
+    batch = {name: jnp.zeros((2, 1, 1, 1, 16)) for name in names}
+    batch |= {f"{name}_std": jnp.ones((2, 1, 1, 1, 16)) for name in names}
+    found = drawn(batch, jax.random.split(jax.random.key(0), 2))
+    rows = np.stack([found[name] for name in names]).reshape(6, 16)
+    assert len({tuple(row) for row in rows}) == 6
 
 
 def test_a_lora_is_all_that_its_task_trains_and_the_rest_is_in_the_compute_dtype():

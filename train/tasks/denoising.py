@@ -1,7 +1,8 @@
 """Training the denoiser on cached latents, with its small encoders if the model trains them.
 
 The loss is the diffusion objective (`diffusion/objective.py`) under a condition from which prior,
-mask, hands and text are dropped at random (`conditioning/dropout.py`).
+mask, hands and text are dropped at random (`conditioning/dropout.py`). Latents may be drawn
+from their posteriors at each update (DWM; `conditioning/posterior.py`).
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning import Condition
 from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.posterior import STD, draw
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.models import lora
@@ -45,9 +48,23 @@ class Denoising:
     and are all that has to be learned."""
     rank: int | None = None
     """Rank of a LoRA, which is then trained instead of the weights; None: no LoRA."""
+    navigation: float | None = None
+    """Rate of samples without hands whose target is the prior, so that the camera alone moves.
+
+    DWM's regularizer, on in none of its releases; None: no such samples."""
 
     def __post_init__(self) -> None:
-        """Check that a weight of changes has a prior to compare with."""
+        """Check that a weight of changes, and navigation, have a prior to compare with."""
+        if self.navigation is not None and not 0 <= self.navigation <= 1:
+            raise InputError(
+                f"The rate of samples without hands must be in [0, 1], not {self.navigation}. "
+                "(--navigation)"
+            )
+        if self.navigation and not {"prior", "hands"} <= {*dict(self.model.layout.parts)}:
+            raise InputError(
+                f"{self.model.name} has no prior or no hands, so that it cannot be trained to move "
+                "the camera alone: omit the rate of such samples. (--navigation)"
+            )
         if self.change_loss_weight and "prior" not in self.model.layout:
             raise InputError(
                 f"{self.model.name} has no prior, from which a clip could change: the loss weight "
@@ -96,7 +113,12 @@ class Denoising:
         self, networks: Networks, batch: Batch, keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout."""
-        condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
+        if self.model.posterior == "sampled":
+            batch = drawn(batch, keys[:, 1])
+        if self.navigation:
+            batch = without_hands(batch, keys[:, 0], self.navigation)
+        zeros = self.model.zero_image(len(batch["target"]))
+        condition = self.dropout.apply(condition_of(networks, batch, zeros), keys[:, 0])
         process, target = self.model.process, batch["target"]
         denoise = _denoise(self.model, networks, condition, target)
         weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
@@ -106,7 +128,8 @@ class Denoising:
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return the errors at fixed noise levels with fixed noise, under the full condition."""
         target = batch["target"]
-        denoise = _denoise(self.model, networks, condition_of(networks, batch), target)
+        condition = condition_of(networks, batch, self.model.zero_image(len(target)))
+        denoise = _denoise(self.model, networks, condition, target)
         noise = jax.random.normal(jax.random.key(0), target.shape)
         errors = {
             f"loss_{sigma}": self.objective.loss_at(
@@ -122,22 +145,49 @@ class Denoising:
         forward = model.dit.forward_flops(
             latents=model.latent_shape,
             text=model.tokenizer.max_tokens,
-            image=0 if model.image is None else model.image.tokens,
+            image=model.image_tokens,
         )
         # Backward: gradients of activations and of weights; those of a LoRA's weights cost little.
         weights = 3 if self.rank is None else 2
         return samples * (weights * forward.weights + 3 * forward.attention)
 
 
-def condition_of(networks: Networks, batch: Batch) -> Condition:
-    """Return the condition of a cached batch, under encoders that are trained or cached."""
+def drawn(batch: Batch, keys: Key[Array, " b"]) -> Batch:
+    """Return a batch with latents drawn from the posteriors whose deviations it has."""
+    latents = {}
+    for number, name in enumerate(("target", "prior", "hands"), start=1):
+        if name in batch:
+            own = jax.vmap(jax.random.fold_in, (0, None))(keys, number)
+            latents[name] = draw(batch[name], batch[f"{name}{STD}"], own)
+    return {**batch, **latents}
+
+
+def without_hands(batch: Batch, keys: Key[Array, " b"], rate: float) -> Batch:
+    """Return a batch of which a share of samples has no hands and the prior as target."""
+    own = jax.vmap(jax.random.fold_in, (0, None))(keys, 1)
+    where = (jax.vmap(jax.random.uniform)(own) < rate)[:, None, None, None, None]
+    return {
+        **batch,
+        "hands": jnp.where(where, 0, batch["hands"]),
+        "target": jnp.where(where, batch["prior"], batch["target"]),
+    }
+
+
+def condition_of(networks: Networks, batch: Batch, zeros: np.ndarray | None = None) -> Condition:
+    """Return the condition of a cached batch, under encoders that are trained or cached.
+
+    `zeros` are the image tokens of a model without an encoder that has them.
+    """
     if networks.text is None:
         text, null_text = batch["text"], batch.get("null_text")
     else:
         text = networks.text(batch["ids"], batch["ids_mask"])
         null = "null_ids" in batch
         null_text = networks.text(batch["null_ids"], batch["null_mask"]) if null else None
-    image = batch.get("image") if networks.image is None else networks.image(batch["pixels"])
+    if networks.image is None:
+        image: Any = batch.get("image", zeros)
+    else:
+        image = networks.image(batch["pixels"])
     return Condition(
         mask=batch.get("mask"),
         prior=batch.get("prior"),

@@ -333,7 +333,7 @@ class CogVideoXVAE(nnx.Module):
 
     def encode(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
         """Return scaled mean latents, float32; raises as `moments` does."""
-        return self.config.scale * self.moments(video)[0]
+        return self.normalize(self.moments(video)[0])
 
     def decode(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
         """Return the video of scaled latents, float32 in [-1, 1].
@@ -345,9 +345,41 @@ class CogVideoXVAE(nnx.Module):
                 f"{latents.shape[1]} latent frames cannot be decoded: CogVideoX's VAE needs an odd "
                 "number, of videos of 8k+1 frames. Change the number of frames. (--num-frames)"
             )
-        latents = latents.astype(jnp.float32) / self.config.scale
+        latents = self.denormalize(latents.astype(jnp.float32))
+        return jnp.clip(self.decode_whole(latents), -1.0, 1.0)
+
+    def decode_whole(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
+        """Return the video of latents not scaled, not clipped, for training; chunked too."""
         video = _by_chunk(self.decoder, latents, first=CHUNK + 1, size=CHUNK)
-        return jnp.clip(video.astype(jnp.float32), -1.0, 1.0)
+        return video.astype(jnp.float32)
+
+    def normalize(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
+        """Scale latents."""
+        return self.config.scale * mean
+
+    def denormalize(self, latents: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
+        """Undo the scaling of latents (`normalize`)."""
+        return latents / self.config.scale
+
+    def standardize(self, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
+        """Fold a measured deviation of the latents into the layers that write and read them.
+
+        `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
+        the latents of `encode` have a mean square of 1 in each channel, and decoding what is
+        encoded gives the same video as before. Their mean stays: the decoder's first convolution
+        pads with zeros, so that no bias could replace it.
+        """
+        size = self.config.scale * jnp.sqrt(jnp.square(mean) + jnp.square(std))
+        out, shift = self.encoder.conv_out, jnp.concatenate([0 * size, -2 * jnp.log(size)])
+        scale = jnp.concatenate([1 / size, jnp.ones_like(size)])
+        out.kernel[...] = out.kernel[...] * scale
+        out.bias[...] = out.bias[...] * scale + shift
+        readers = [self.decoder.conv_in]
+        for _, layer in nnx.iter_modules(self.decoder):
+            if isinstance(layer, SpatialNorm):
+                readers += [layer.scale, layer.shift]
+        for layer in readers:
+            layer.kernel[...] = size[:, None] * layer.kernel[...]
 
     def _check(self, video: Array) -> None:
         if not jnp.issubdtype(video.dtype, jnp.floating):

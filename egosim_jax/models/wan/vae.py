@@ -265,6 +265,22 @@ class WanVAE(nnx.Module):
         """Undo the normalization of latents by channel (`normalize`)."""
         return latents * jnp.array(self.config.latent_std) + jnp.array(self.config.latent_mean)
 
+    def standardize(self, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
+        """Fold a measured latent mean and deviation into the two quantization convolutions.
+
+        `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
+        these have mean 0 and deviation 1, the log variances shrink by 2 log std, and decoding what
+        is encoded gives the same video as before.
+        """
+        encode, decode = self.to_moments, self.from_latents
+        encode_bias, decode_bias = cast(nnx.Param, encode.bias), cast(nnx.Param, decode.bias)
+        scale = jnp.concatenate([1 / std, jnp.ones_like(std)])
+        shift = jnp.concatenate([-mean / std, -2 * jnp.log(std)])
+        encode.kernel[...] = encode.kernel[...] * scale
+        encode_bias[...] = encode_bias[...] * scale + shift
+        decode_bias[...] = decode_bias[...] + mean @ decode.kernel[...]
+        decode.kernel[...] = std[:, None] * decode.kernel[...]
+
     def _check(self, video: Array) -> None:
         if not jnp.issubdtype(video.dtype, jnp.floating):
             raise InputError(
@@ -279,20 +295,3 @@ class WanVAE(nnx.Module):
                 f"A video of {height} x {width} pixels cannot be encoded: rows and columns must "
                 f"be multiples of {space}. Resize or crop it."
             )
-
-
-def standardize_latents(vae: WanVAE, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
-    """Fold a measured latent mean and deviation into the two quantization convolutions.
-
-    `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
-    these have mean 0 and deviation 1, the log variances shrink by 2 log std, and decoding what
-    is encoded gives the same video as before.
-    """
-    encode, decode = vae.to_moments, vae.from_latents
-    encode_bias, decode_bias = cast(nnx.Param, encode.bias), cast(nnx.Param, decode.bias)
-    scale = jnp.concatenate([1 / std, jnp.ones_like(std)])
-    shift = jnp.concatenate([-mean / std, -2 * jnp.log(std)])
-    encode.kernel[...] = encode.kernel[...] * scale
-    encode_bias[...] = encode_bias[...] * scale + shift
-    decode_bias[...] = decode_bias[...] + mean @ decode.kernel[...]
-    decode.kernel[...] = std[:, None] * decode.kernel[...]

@@ -1,9 +1,12 @@
 """The released models by name."""
 
+import dataclasses
+
 import pytest
 
 from egosim_jax import configs
 from egosim_jax.io.weights import flat_shapes
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.networks import Networks
 from egosim_jax.types import InputError
 
@@ -12,6 +15,8 @@ def test_every_config_knows_its_own_name():
     assert configs.names() == [
         "debug",
         "dwm_cogvideox_5b",
+        "dwm_tabletop",
+        "dwm_wan_14b",
         "egosim_14b",
         "egosim_1_3b",
         "real_tiny",
@@ -39,3 +44,34 @@ def test_egosim_14b_turns_on_the_quirks_of_the_release():
     assert config.process.timestep_rounding == "bfloat16"
     assert (config.process.shift, config.steps, config.guidance.scale) == (5.0, 50, 1.0)
     assert config.latent_shape == (16, 60, 104)
+
+
+def test_dwm_is_sampled_as_released_or_as_for_the_paper():
+    config = configs.get("dwm_cogvideox_5b")
+    assert configs.sampled(config, "released") == config
+    paper = configs.sampled(config, "paper")
+    assert paper.solver.stochastic
+    assert paper.unconditional_prompt.startswith("The video is not of a high quality")
+    assert paper.encoding_noise.prior_pixels == 0.0563
+    assert (paper.steps, paper.guidance.scale) == (50, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "sampling", "message"),
+    [
+        ("dwm_cogvideox_5b", "papers", "Nearest: paper. All: released, paper"),
+        ("egosim_14b", "paper", "egosim_14b has no named samplings"),
+    ],
+)
+def test_an_unknown_sampling_is_refused(name, sampling, message):
+    with pytest.raises(InputError, match=message):
+        configs.sampled(configs.get(name), sampling)
+
+
+def test_dwm_on_wan_has_image_tokens_of_zeros_and_no_encoder():
+    config = configs.get("dwm_wan_14b")
+    assert "image" not in config.networks
+    assert config.zero_image(2).shape == (2, 257, 1280)
+    assert (config.layout.channels, config.layout.mask_scale) == (52, 1.0)
+    with pytest.raises(InputError, match="without an image encoder"):
+        dataclasses.replace(config, image=CLIPVisionConfig())

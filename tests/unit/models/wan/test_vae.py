@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig, standardize_latents
+from egosim_jax.models.wan.vae import WanVAE, WanVAEConfig
 from egosim_jax.types import InputError
 
 SIZES = dict(dim=4, z_dim=2, res_blocks=1, latent_mean=(0.3, -0.2), latent_std=(0.5, 2.0))
@@ -110,7 +110,7 @@ def test_a_longer_clip_needs_more_memory_for_its_pixels_only(vae, method, short,
 def test_standardized_latents_have_the_moments_asked_for(vae):
     mean, std = np.array([1.5, -0.7], np.float32), np.array([3.0, 0.2], np.float32)
     ours = nnx.clone(vae)
-    standardize_latents(ours, mean, std)
+    ours.standardize(mean, std)
     before, after = (call(each, "moments", video_of()) for each in (vae, ours))
     np.testing.assert_allclose(after[0], (before[0] - mean) / std, atol=1e-5)
     np.testing.assert_allclose(after[1], before[1] - 2 * np.log(std), atol=1e-5)
@@ -119,7 +119,7 @@ def test_standardized_latents_have_the_moments_asked_for(vae):
 def test_standardized_latents_decode_to_the_same_video(vae):
     mean, std = np.array([1.5, -0.7], np.float32), np.array([3.0, 0.2], np.float32)
     ours = nnx.clone(vae)
-    standardize_latents(ours, mean, std)
+    ours.standardize(mean, std)
     have = call(ours, "decode_whole", latents_of())
     assert relative(have, call(vae, "decode_whole", latents_of() * std + mean)) <= REORDERED
 
