@@ -1,4 +1,4 @@
-"""Preflight of every recipe on every target: the README's tables, compiled cell by cell.
+"""Preflight of every recipe on every target: the tables of docs/performance.md.
 
     pip install -e '.[cuda,tpu]'
     python -m tests.benchmarks.preflight [--only TEXT]
@@ -6,7 +6,7 @@
 
 A cell takes from 10 s to 2 minutes on two cores, half a minute more for 64 chips. Cells are stored
 in tests/benchmarks/results/preflight.json: an interrupted run resumes, and a cell that is removed
-there is compiled again; `--write` puts the stored cells into the README.
+there is compiled again; `--write` puts the stored cells into that page.
 """
 
 from __future__ import annotations
@@ -173,8 +173,8 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
 
 
 def write(known: dict[str, dict[str, Any]]) -> None:
-    """Write the tables between the markers in the README."""
-    path = ROOT / "README.md"
+    """Write the tables between the markers in docs/performance.md."""
+    path = ROOT / "docs" / "performance.md"
     before, _, rest = path.read_text("utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
     write_text(path, f"{before}{BEGIN}\n\n{tables(known)}\n\n{END}{after}")

@@ -1,4 +1,4 @@
-"""The README's Python is run."""
+"""The Python of README and docs is run."""
 
 import os
 import re
@@ -18,8 +18,11 @@ BLOCK = re.compile(r"(?<=\n\n)(?: {4}(?:import|from) .*\n(?:(?: {4}.*)?\n)*)")
 
 def blocks():
     """Return the indented blocks that begin with an import."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     return [
-        textwrap.dedent(block).strip() for block in BLOCK.findall((ROOT / "README.md").read_text())
+        textwrap.dedent(block).strip()
+        for page in pages
+        for block in BLOCK.findall(page.read_text("utf-8"))
     ]
 
 
