@@ -178,6 +178,14 @@ class Make:
     """Frame rate of the clips in frames per second."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    prior: Literal["state", "static"] = "state"
+    """Rendering of the scene along the camera path.
+
+    state: points of the scene's state, with holes, as EgoSim's; static: the scene exactly as it was
+    in the first frame, as DWM's."""
+    hands: Literal["skeleton", "mesh", "mask"] = "skeleton"
+    """Rendering of the hands: skeletons as EgoSim's, shaded meshes as DWM's, or their binary mask.
+    """
     workers: int = os.cpu_count() or 1
     """Number of worker processes."""
     config: str | None = None
@@ -195,6 +203,8 @@ class Make:
             spec=spec,
             kind=self.kind,
             black_cloths=self.black_cloths,
+            prior=self.prior,
+            hands=self.hands,
         )
         progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))
         for _ in track(progress, "making", total=self.scenes):

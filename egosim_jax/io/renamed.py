@@ -78,6 +78,8 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
         },
     },
     "PromptTokenizer": {"clean": True},
+    "DatasetConfig": {"prior": "state", "hands": "skeleton"},
+    "Plan": {"prior": "state", "hands": "skeleton"},
     "Tabletop": {
         "crop": [48, 64],
         "dropout": _DROPOUT,

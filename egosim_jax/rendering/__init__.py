@@ -1,4 +1,4 @@
-"""Rendering of a scene's points and of hands along a camera path.
+"""Rendering of a scene's points, of hands and of meshes along a camera path.
 
 `reference` is in NumPy, `jitted` in JAX; both are a `Renderer` and draw the same pictures. Sources:
 EgoSim, section 3.2 (rendering of the prior) and the released `render_16fps_aligned.py`; colors and
@@ -13,6 +13,7 @@ from typing import Literal, Protocol, cast, runtime_checkable
 from jaxtyping import Float, Float32, UInt8
 from numpy import ndarray
 
+from egosim_jax.rendering.mesh import MovingMesh
 from egosim_jax.types import Cameras, Kind, SceneState, View
 
 RendererName = Literal["jax", "numpy"]
@@ -30,6 +31,12 @@ class Renderer(Protocol):
         self, joints_m: Float[ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
     ) -> tuple[UInt8[ndarray, "f h w 3"], Float32[ndarray, "f h w"]]:
         """Draw n hands; return the picture and its depth, black and infinite elsewhere."""
+        ...
+
+    def draw_mesh(
+        self, mesh: MovingMesh, cameras: Cameras
+    ) -> tuple[UInt8[ndarray, "f h w 3"], Float32[ndarray, "f h w"]]:
+        """Draw a shaded mesh; return the picture and its depth, black and infinite elsewhere."""
         ...
 
 

@@ -9,16 +9,15 @@ Hands: a shape is intersected only with the rays of the tiles that its bounding 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from einops import rearrange
 from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.rendering.mesh_jitted import draw_mesh as draw_mesh
 from egosim_jax.rendering.reference import check_visible
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
@@ -28,10 +27,16 @@ from egosim_jax.rendering.skeleton import (
     NEAR_M,
     SKELETONS,
 )
+from egosim_jax.rendering.tiles import (
+    Canvas,
+    chunks,
+    empty_canvas,
+    picture_of,
+    pixel_rays,
+    put,
+    tiles_of,
+)
 from egosim_jax.types import Cameras, Kind, SceneState, View
-
-TILE_PX, CHUNK = 16, 256
-"""Side of the tiles that hands are drawn in, and pairs of shape and tile drawn at a time."""
 
 
 def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
@@ -163,23 +168,19 @@ def draw_hands(
     joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
     """Draw n hands; return the picture and its depth, black and infinite where there is no hand."""
-    tiles = -(-cameras.height // TILE_PX), -(-cameras.width // TILE_PX)
+    tiles = tiles_of(cameras)
     intrinsics = jnp.asarray(cameras.intrinsics_px, jnp.float32)
     frames = []
     for joints, pose in zip(joints_m, cameras.world_from_camera, strict=True):
-        canvas = (
-            jnp.full((tiles[0] * tiles[1], TILE_PX, TILE_PX), jnp.inf),
-            jnp.zeros((tiles[0] * tiles[1], TILE_PX, TILE_PX, 3), jnp.uint8),
-        )
-        for chunk in _chunks(_shapes_of(joints, pose, kind), cameras, tiles):
-            canvas = _draw_chunk(*canvas, **chunk, intrinsics_px=intrinsics, columns=tiles[1])
+        canvas = empty_canvas(tiles)
+        shapes = _shapes_of(joints, pose, kind)
+        radius = shapes["radius"][:, None]
+        low = np.minimum(shapes["start"], shapes["end"]) - radius
+        high = np.maximum(shapes["start"], shapes["end"]) + radius
+        for chunk in chunks(shapes, low, high, cameras):
+            canvas = _draw_chunk(canvas, **chunk, intrinsics_px=intrinsics, columns=tiles[1])
         frames.append(canvas)
-    depth, picture = (np.stack([np.asarray(frame[k]) for frame in frames]) for k in range(2))
-    join = "f (r c) i j ... -> f (r i) (c j) ..."
-    depth = rearrange(depth, join.replace(" ...", ""), r=tiles[0])
-    picture = rearrange(picture, join, r=tiles[0])
-    inside = slice(None), slice(cameras.height), slice(cameras.width)
-    return picture[inside], depth[inside]
+    return picture_of(frames, cameras)
 
 
 def _shapes_of(
@@ -200,65 +201,9 @@ def _shapes_of(
     }
 
 
-def _chunks(
-    shapes: dict[str, np.ndarray], cameras: Cameras, tiles: tuple[int, int]
-) -> Iterator[dict[str, np.ndarray]]:
-    """Yield each shape with each tile that its bounding box meets, `CHUNK` pairs at a time.
-
-    The last chunk is padded with shapes that no ray meets.
-    """
-    first, last = _bounding_tiles(shapes, cameras, tiles)
-    counts = np.maximum(last - first, 0)
-    total = counts.prod(axis=1)
-    shape = np.repeat(np.arange(len(total)), total)
-    number = np.arange(len(shape)) - np.repeat(np.cumsum(total) - total, total)
-    row, column = np.divmod(number, counts[shape, 1])
-    tile = (first[shape, 0] + row) * tiles[1] + first[shape, 1] + column
-    for begin in range(0, len(tile), CHUNK):
-        here = slice(begin, begin + CHUNK)
-        padding = (0, CHUNK - len(tile[here]))
-        pairs = {name: values[shape[here]] for name, values in shapes.items()}
-        yield {
-            "tile": np.pad(tile[here], padding).astype(np.int32),
-            **{
-                name: np.pad(
-                    values.astype(np.uint8 if name == "color" else np.float32),
-                    (padding, *[(0, 0)] * (values.ndim - 1)),
-                    constant_values=0 if name == "color" else np.nan,
-                )
-                for name, values in pairs.items()
-            },
-        }
-
-
-def _bounding_tiles(
-    shapes: dict[str, np.ndarray], cameras: Cameras, tiles: tuple[int, int]
-) -> tuple[Int[np.ndarray, "s 2"], Int[np.ndarray, "s 2"]]:
-    """Return the first row and column of tiles of each shape, and those after the last.
-
-    They bound the picture of the corners of the box around the shape. A shape that reaches nearer
-    than `NEAR_M` may be anywhere in the picture; one that is nearer as a whole has no tiles.
-    """
-    radius = shapes["radius"][:, None]
-    low = np.minimum(shapes["start"], shapes["end"]) - radius
-    high = np.maximum(shapes["start"], shapes["end"]) + radius
-    box = np.stack([low, high], axis=1)
-    near = low[:, 2] < NEAR_M
-    box[near, :, 2] = NEAR_M
-    corners = np.stack([box[:, which, range(3)] for which in np.ndindex(2, 2, 2)], axis=1)
-    columns, rows = project(cameras.intrinsics_px, corners)
-    pixels = np.stack([rows, columns], axis=-1)
-    first = np.floor(pixels.min(axis=1) - 1) // TILE_PX
-    last = np.ceil(pixels.max(axis=1) + 1) // TILE_PX + 1
-    first = np.where(near[:, None], 0, np.clip(first, 0, tiles)).astype(int)
-    last = np.where(near[:, None], tiles, np.clip(last, 0, tiles)).astype(int)
-    return first, np.where(high[:, 2:] < NEAR_M, first, last)
-
-
-@partial(jax.jit, static_argnames="columns", donate_argnames=("depth", "picture"))
+@partial(jax.jit, static_argnames="columns", donate_argnames="canvas")
 def _draw_chunk(
-    depth: Float32[Array, "t p p"],
-    picture: UInt8[Array, "t p p 3"],
+    canvas: Canvas,
     *,
     tile: Int32[Array, " k"],
     start: Float32[Array, "k 3"],
@@ -267,23 +212,10 @@ def _draw_chunk(
     color: UInt8[Array, "k 3"],
     intrinsics_px: Float32[Array, "3 3"],
     columns: int,
-) -> tuple[Float32[Array, "t p p"], UInt8[Array, "t p p 3"]]:
+) -> Canvas:
     """Draw each shape into its tile; of equally near ones the first is seen."""
-    corner = jnp.stack([tile % columns, tile // columns]) * TILE_PX
-    pixel = (
-        corner[:, :, None, None]
-        + jnp.stack(jnp.meshgrid(jnp.arange(TILE_PX), jnp.arange(TILE_PX)))[:, None]
-    )
-    x = (pixel[0] - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
-    y = (pixel[1] - intrinsics_px[1, 2]) / intrinsics_px[1, 1]
-    met = _meet(x, y, start, end, radius)
-    count = len(tile)
-    nearest = depth.at[tile].min(met)
-    seen = (met <= nearest[tile]) & (met < depth[tile])
-    number = jnp.where(seen, jnp.arange(count)[:, None, None], count)
-    winner = jnp.full(depth.shape, count).at[tile].min(number)
-    drawn = color[jnp.minimum(winner, count - 1)]
-    return nearest, jnp.where((winner < count)[..., None], drawn, picture)
+    x, y = pixel_rays(tile, intrinsics_px, columns)
+    return put(canvas, tile, _meet(x, y, start, end, radius), color[:, None, None])
 
 
 def _meet(

@@ -1,4 +1,4 @@
-"""Renderer in NumPy, the reference for `jitted`; it does not import jax.
+"""Renderer in NumPy, and Open3D for meshes, the reference for `jitted`; it does not import jax.
 
 A point at depth z that projects to (u, v) is a square of p x p pixels: those (i, j) with
 -p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. A pixel sees the nearest of the points that cover it,
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
+from egosim_jax.rendering.mesh_reference import draw_mesh as draw_mesh
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
     FAR_M,

@@ -23,6 +23,7 @@ from egosim_jax.types import Action, Cameras, GroundTruth, Kind, SceneState, Tri
 from egosim_jax.worlds.tabletop import actions
 from egosim_jax.worlds.tabletop.actions import Hand, Moment
 from egosim_jax.worlds.tabletop.bodies import Part
+from egosim_jax.worlds.tabletop.hands import Side
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, RayCaster
 from egosim_jax.worlds.tabletop.scene import (
     FIRST_BODY,
@@ -67,6 +68,10 @@ class TabletopClip:
     """Instance id of every pixel (`scene.py`)."""
     joints_m: Float[np.ndarray, "f n j 3"]
     """World positions of the joints of n hands in meters."""
+    sides: tuple[Side, ...]
+    """Side of each hand."""
+    scene: Scene
+    """Arrangement of all bodies in the first frame."""
     world_from_body: Mapping[str, Float[np.ndarray, "f 4 4"]]
     """Pose of every body in every frame; for an articulated body, of its moving part."""
     body_ids: Mapping[str, int]
@@ -175,6 +180,8 @@ def _clip(
         depth_m=np.stack([picture.depth_m for picture in pictures]),
         ids=np.stack([picture.ids for picture in pictures]),
         joints_m=np.array(joints),
+        sides=tuple(hand.side for hand in moments[0].hands),
+        scene=moments[0].scene,
         world_from_body=_poses(moments),
         body_ids=_numbers(moments[0].scene),
         parts={body.name: body.parts[0] for body in moments[0].scene.bodies},

@@ -22,6 +22,7 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import quote_path
 from egosim_jax.types import WAN_GRID, InputError, Kind, SceneState, VideoGrid, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
+from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
 
 States = Callable[[Sequence[TabletopClip]], Iterable[SceneState | None]]
 """States that the priors of a sequence's clips are rendered from; None: the clip's own state."""
@@ -41,6 +42,10 @@ class DatasetConfig:
     """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    prior: PriorName = "state"
+    """Rendering of the scene: points of the state, or `static`, ray cast as it was at the start."""
+    hands: HandsName = "skeleton"
+    """Rendering of the hands: skeletons, shaded meshes, or the meshes' binary mask."""
 
     def kind_of(self, seed: int) -> Kind:
         """Return the kind of hands of a scene."""
@@ -55,12 +60,26 @@ class DatasetConfig:
                 f"The dataset is empty: it has {len(self.seeds)} scenes of {self.clips} clips; "
                 "both must be at least 1. (--scenes, --clips)"
             )
+        if self.hands != "skeleton" and self.kind != "human":
+            raise InputError(
+                f"Hands of kind {self.kind} have no {self.hands}: only human hands have meshes. "
+                "Use --kind human or --hands skeleton. (--kind, --hands)"
+            )
 
 
-def write_scenes(folder: Path, seeds: Iterable[int], *, spec: VideoSpec, kind: Kind) -> Path:
+def write_scenes(
+    folder: Path,
+    seeds: Iterable[int],
+    *,
+    spec: VideoSpec,
+    kind: Kind,
+    prior: PriorName = "state",
+    hands: HandsName = "skeleton",
+) -> Path:
     """Write the first clip of each seed as files in EgoSim's layout; return their metadata.csv."""
     clips = (next(make_sequence(seed, spec=spec, kind=kind)) for seed in seeds)
-    return write_clips(folder, map(to_triplet, clips), fps=spec.fps)
+    triplets = (with_conditions(clip, to_triplet(clip), prior, hands) for clip in clips)
+    return write_clips(folder, triplets, fps=spec.fps)
 
 
 def true_states(clips: Sequence[TabletopClip]) -> Iterator[SceneState | None]:
@@ -127,7 +146,8 @@ def _make(config: DatasetConfig, seed: int, parts: Path, states: States) -> None
     clips = list(sequence)
     for clip, state in zip(clips, states(clips), strict=True):
         with atomic_write(_part(parts, seed, clip.number)) as temporary:
-            temporary.write_bytes(to_bytes(triplet_record(to_triplet(clip, state))))
+            triplet = with_conditions(clip, to_triplet(clip, state), config.prior, config.hands)
+            temporary.write_bytes(to_bytes(triplet_record(triplet)))
 
 
 def _part(parts: Path, seed: int, number: int) -> Path:
@@ -136,7 +156,10 @@ def _part(parts: Path, seed: int, number: int) -> Path:
 
 def _gather(config: DatasetConfig, grid: VideoGrid, parts: Path, out: Path) -> None:
     """Write the parts to shards, in the order of the seeds, and remove them."""
-    provenance = {"world": "tabletop", "kind": config.kind, "seeds": list(config.seeds)}
+    conditions = {"prior": config.prior, "hands": config.hands}
+    provenance = {
+        "world": "tabletop", "kind": config.kind, "seeds": list(config.seeds), **conditions,
+    }  # fmt: skip
     complete = parts / "shards"
     with ShardWriter(
         complete,

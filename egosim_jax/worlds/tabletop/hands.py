@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Paint, Part, join, mesh
-
-Side = Literal["left", "right"]
 
 KNUCKLES_M = np.array([[-0.026, 0.090, 0.0], [-0.004, 0.094, 0.002], [0.017, 0.088, 0.0],
                        [0.036, 0.078, -0.004]])  # fmt: skip
