@@ -41,6 +41,10 @@ class RefineVAE(Recipe):
     """Weight of LPIPS in the loss."""
     perceptual_frames: int = 4
     """Frames of a crop that LPIPS compares."""
+    motion_weight: float = 0.0
+    """Additional weight of the squared error where something moves."""
+    stream_probs: tuple[float, float, float] = (0.6, 0.25, 0.15)
+    """Probabilities that a crop is of the target, the prior and the hands."""
     weights_dtype: str = "float16"
     """Dtype of the weights that are written."""
 
@@ -58,6 +62,8 @@ class RefineVAE(Recipe):
             part=self.part,
             perceptual_weight=self.perceptual_weight,
             perceptual_frames=self.perceptual_frames,
+            motion_weight=self.motion_weight,
+            stream_probs=self.stream_probs,
         )
 
     def stages(self) -> Mapping[str, Stage]:

@@ -80,6 +80,8 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
     "PromptTokenizer": {"clean": True},
     "DatasetConfig": {"prior": "state", "hands": "skeleton"},
     "Plan": {"prior": "state", "hands": "skeleton"},
+    "RefineVAE": {"motion_weight": 0.0, "stream_probs": [0.6, 0.25, 0.15]},
+    "Refining": {"motion_weight": 0.0},
     "Tabletop": {
         "crop": [48, 64],
         "dropout": _DROPOUT,
@@ -88,7 +90,7 @@ ADDED: Mapping[str, Mapping[str, Any]] = {
         "rollout_clips": 4,
     },
 }
-"""Fields that a class of config.json did not have under its old name, with their values then."""
+"""Fields that a class of config.json once did not have, by its name then, with their values."""
 DROPPED = {"Objective": ("schedule",)}
 """Fields of config.json that are gone, because another field always had the same value."""
 

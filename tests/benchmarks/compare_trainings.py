@@ -84,6 +84,7 @@ VAES: Mapping[str, Mapping[str, Any]] = {
     "lpips 0.3": {"perceptual_weight": 0.3},
     "decoder": {"part": "decoder"},
     "decoder 0.3": {"part": "decoder", "perceptual_weight": 0.3},
+    "decoder, motion 4": {"part": "decoder", "motion_weight": 4.0, "stream_probs": (1, 0, 0)},
     "all frames": {"perceptual_frames": 17},
     "large crops": {"crop": (96, 80)},
     "adversarial": {"part": "decoder", "critic": True},

@@ -15,7 +15,7 @@ from egosim_jax.networks import Networks
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.refining import RefineVAE
 from egosim_jax.train.tasks.autoencoding import Autoencoding
-from egosim_jax.train.tasks.refining import Refining
+from egosim_jax.train.tasks.refining import MOVING, Refining, motion_weights
 from egosim_jax.types import InputError, VideoSpec
 
 VAE = configs.get("debug").vae
@@ -57,6 +57,25 @@ def test_lpips_is_added_to_the_loss_of_autoencoding():
     plain, loss, metrics = losses(vae, {"video": jnp.asarray(crop)})
     assert 0.1 < metrics["lpips"] < 2
     np.testing.assert_allclose(loss, plain + 0.25 * metrics["lpips"], rtol=1e-6)
+
+
+def test_moving_places_weigh_more_and_a_still_video_weighs_alike():
+    still = jnp.zeros((1, 2, 4, 4, 3))
+    np.testing.assert_array_equal(motion_weights(still, 4.0), 1.0)
+    half = np.sqrt(2 * MOVING)  # 0, then this: a variance of MOVING / 2
+    moving = still.at[:, 1, 0].set(1.0).at[:, 1, 1].set(half)
+    expected = np.array([5.0, 3.0, 1.0, 1.0]) / 2.5
+    np.testing.assert_allclose(motion_weights(moving, 4.0)[0, 0, :, 0, 0], expected, rtol=1e-6)
+
+
+def test_without_a_weight_of_motion_the_squared_error_is_the_plain_one():
+    draws = np.random.default_rng(0).uniform(-1, 1, (2, 1, 5, 32, 32, 3)).astype(np.float32)
+    decoded, video = jnp.asarray(draws)
+    plain = Autoencoding(**SIZES).squared_error(decoded, video)
+    assert Refining(**SIZES).squared_error(decoded, video) == plain
+    weighted = Refining(**SIZES, motion_weight=4.0).squared_error(decoded, video)
+    by_hand = np.mean(motion_weights(video, 4.0) * np.square(draws[0] - draws[1]))
+    np.testing.assert_allclose(weighted, by_hand, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

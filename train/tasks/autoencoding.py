@@ -101,12 +101,18 @@ class Autoencoding:
         mean, logvar = vae.moments(video)
         latents = mean + jnp.exp(logvar / 2) * jax.random.normal(key, mean.shape)
         decoded = vae.decode_whole(latents)
-        mse = jnp.square(decoded - video).mean()
+        mse = self.squared_error(decoded, video)
         edge_loss = _edge_error(decoded, video)
         kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
         psnr = _psnr(decoded, video)
         metrics = {"mse": mse, "edge_loss": edge_loss, "kl": kl, "psnr": psnr}
         return decoded, mse + self.edge_weight * edge_loss + self.kl_weight * kl, metrics
+
+    def squared_error(
+        self, decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
+    ) -> jax.Array:
+        """Return the mean squared error of a reconstruction."""
+        return jnp.square(decoded - video).mean()
 
     def flops(self, samples: int) -> float:
         """Return NaN: not counted."""
