@@ -74,8 +74,10 @@ def diffusers(config: WanVAEConfig) -> list[Rule]:
 
 def arguments(config: WanVAEConfig) -> dict[str, Any]:
     """Return the arguments of diffusers' `AutoencoderKLWan`."""
+    decoder = {} if config.decoder_dim is None else {"decoder_base_dim": config.decoder_dim}
     return {
         "base_dim": config.dim,
+        **decoder,
         "z_dim": config.z_dim,
         "dim_mult": list(config.dim_mult),
         "num_res_blocks": config.res_blocks,

@@ -70,6 +70,19 @@ def test_decoding_gives_the_video_of_diffusers(ours, theirs, frames):
     assert relative_error(have, video.permute(0, 2, 3, 4, 1).numpy()) <= TOLERANCE
 
 
+def test_a_decoder_of_another_width_has_the_shapes_of_diffusers():
+    config = WanVAEConfig(dim=8, decoder_dim=12)
+    with torch.device("meta"):
+        module = AutoencoderKLWan(**table.arguments(config))
+    vae = nnx.eval_shape(lambda: WanVAE(config, rngs=nnx.Rngs(0)))
+    arrays = {
+        path: np.broadcast_to(np.float32(0), shape) for path, shape in flat_shapes(vae).items()
+    }
+    have = translate_back(arrays, table.diffusers(config))
+    want = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+    assert {name: tensor.shape for name, tensor in have.items()} == want
+
+
 def test_official_names_and_shapes_are_those_of_the_released_file():
     config = WanVAEConfig()
     vae = nnx.eval_shape(lambda: WanVAE(config, rngs=nnx.Rngs(0)))

@@ -54,10 +54,14 @@ class WanVAEConfig:
 
     dim: int = 96
     """Channels at full resolution."""
+    decoder_dim: int | None = None
+    """Channels of the decoder at full resolution; None: `dim`."""
     z_dim: int = 16
     """Channels of the latents."""
     dim_mult: tuple[int, ...] = (1, 2, 4, 4)
-    """Channels of each level, in units of `dim`; each level after the first halves the size."""
+    """Channels of each level, in units of those at full resolution.
+
+    Each level after the first halves the size."""
     res_blocks: int = 2
     """Residual blocks per level of the encoder; the decoder has one more."""
     temporal_downsample: tuple[bool, ...] = (False, True, True)
@@ -147,14 +151,14 @@ class Decoder(nnx.Module):
 
     def __init__(self, config: WanVAEConfig, *, rngs: nnx.Rngs):
         dtype = config.dtype
-        mults = config.dim_mult[::-1]
-        layers, dim = [], config.dim * mults[0]
+        mults, base = config.dim_mult[::-1], config.decoder_dim or config.dim
+        layers, dim = [], base * mults[0]
         cube, now = (3, 3, 3), identity_init((2, 1, 1))
         self.conv_in = Conv(cube, config.z_dim, dim, dtype=dtype, kernel_init=now, rngs=rngs)
         init_constant_channels(self.conv_in)
         self.middle = nnx.List(_middle(dim, dtype=dtype, rngs=rngs))
         for level, mult in enumerate(mults):
-            out = config.dim * mult
+            out = base * mult
             for _ in range(config.res_blocks + 1):
                 layers.append(ResidualBlock(dim, out, dtype=dtype, rngs=rngs))
                 dim = out
