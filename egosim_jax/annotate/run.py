@@ -15,10 +15,7 @@ are annotated.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,7 +23,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from egosim_jax import interrupts
 from egosim_jax.annotate import clip
 from egosim_jax.annotate.clip import ANNOTATION, WORK, Job
 from egosim_jax.annotate.config import AnnotateConfig
@@ -39,6 +35,7 @@ from egosim_jax.data.clips import write_table
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.io.untrusted import read_json
+from egosim_jax.processes import run_in_processes
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -146,23 +143,14 @@ def _each(run: Callable[..., T], calls: Sequence[tuple[Any, ...]], workers: int)
     if workers == 1 or len(calls) < 2:
         yield from (run(*call) for call in calls)
         return
-    # One thread per process: two processes that share the cores by threads take twice as long.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(calls)), mp_context=context)
     try:
-        with interrupts.not_inherited():
-            tasks = [pool.submit(run, *call) for call in calls]
-        for task in as_completed(tasks):
-            yield task.result()
+        yield from (result for _, result in run_in_processes(run, calls, workers=workers))
     except BrokenProcessPool as error:
         raise CommandExit(
             "error: a worker process was killed, maybe because memory ran out. Run the same "
             "command again with fewer --workers; finished stages are kept.",
             ExitCode.FAILED,
         ) from error
-    finally:  # after an error or Ctrl-C, clips that have not started are canceled
-        pool.shutdown(cancel_futures=True)
 
 
 def _scan_one(source: Source, out: Path, config: AnnotateConfig) -> Scanned:

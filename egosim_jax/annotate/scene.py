@@ -178,8 +178,7 @@ def plain_caption(record: Record, names: list[str]) -> str:
 
 def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[str, Any]]:
     """Return the triplet of a finished record, and figures of its prior."""
-    prior, mask, hands = _render(record, config)
-    seen = mask == 0
+    prior, mask, hands, drawn = _render(record, config)
     triplet = Triplet(
         video_id=record.video_id,
         prompt=record.require("prompt"),
@@ -194,11 +193,11 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
             "rung": record.require("estimate").verdict.rung,
         },
     )
-    judged = seen & ~record.moving
+    judged = drawn & ~record.moving  # the mask's observed part is wider than what is drawn
     judged[0] = False
     first = np.broadcast_to(record.frames[0], record.frames.shape)
     return triplet, {
-        "seen": float(seen.mean()),
+        "seen": float((mask == 0).mean()),
         "psnr_background": _psnr(prior, record.frames, judged),
         "psnr_first_frame": _psnr(first, record.frames, judged),
     }
@@ -206,8 +205,16 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
 
 def _render(
     record: Record, config: AnnotateConfig
-) -> tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"], UInt8[np.ndarray, "f h w 3"]]:
-    """Return prior, mask and hands, rendered some frames at a time for less memory."""
+) -> tuple[
+    UInt8[np.ndarray, "f h w 3"],
+    UInt8[np.ndarray, "f h w"],
+    UInt8[np.ndarray, "f h w 3"],
+    Bool[np.ndarray, "f h w"],
+]:
+    """Return prior, mask, hands and the pixels where a point is drawn.
+
+    They are rendered some frames at a time, for less memory.
+    """
     from egosim_jax import rendering
 
     renderer, cameras = rendering.get(config.renderer), record.cameras
@@ -220,9 +227,11 @@ def _render(
         some = replace(cameras, world_from_camera=cameras.world_from_camera[here])
         view = renderer.render(state, some, point_px=POINT_PX)
         hands, _ = renderer.draw_hands(joints_m[here], some, kind=record.recording.kind)
-        pieces.append((view.frames, view.mask, hands))
-    prior, mask, hands = (np.concatenate(part)[: last + 1] for part in zip(*pieces, strict=True))
-    return prior, mask, hands
+        pieces.append((view.frames, view.mask, hands, np.isfinite(view.depth_m)))
+    prior, mask, hands, drawn = (
+        np.concatenate(part)[: last + 1] for part in zip(*pieces, strict=True)
+    )
+    return prior, mask, hands, drawn
 
 
 def _psnr(

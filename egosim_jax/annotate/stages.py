@@ -105,15 +105,9 @@ def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) 
     if record.hands is None:
         from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 
-        cameras = _given_cameras(record)
-        joints = record.recording.joints_m
-        if cameras is None or joints is None:
-            raise InputError(
-                "The recording has hands, but not the intrinsics of its cameras: both are needed. "
-                "Import it with its intrinsics."
-            )
-        joints = joints[_source_frames(record)]
-        moving = hand_silhouette(joints, record.recording.kind, cameras, HandShape()) >= 0
+        kind, cameras = record.recording.kind, _cameras_of_given_hands(record)
+        joints = np.asarray(record.recording.joints_m)[_source_frames(record)]
+        moving = hand_silhouette(joints, kind, cameras, HandShape()) >= 0
     else:
         from egosim_jax.perception.silhouettes import hand_silhouettes
 
@@ -128,15 +122,20 @@ def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
     A hand that is seen for less than 0.3 s while the other one is seen, and not for half a second
     before and after, is the other one again.
     """
-    found, joints_px = visible(hands), hands.joints_px.copy()
-    joints_hand_m, presence = hands.joints_hand_m.copy(), hands.presence.copy()
+    found = visible(hands)
+    dropped = np.zeros_like(found)
     for side in (LEFT, RIGHT):
         frames = np.flatnonzero(found[:, side])
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > HOLD_S * fps) + 1):
             if 0 < len(run) < FLASH_S * fps and found[run, 1 - side].all():
-                joints_px[run, side], joints_hand_m[run, side] = np.nan, np.nan
-                presence[run, side] = 0
-    return HandTracks(joints_px=joints_px, joints_hand_m=joints_hand_m, presence=presence)
+                dropped[run, side] = True
+    joints = dropped[..., None, None]
+    return HandTracks(
+        joints_px=np.where(joints, np.nan, hands.joints_px),
+        joints_hand_m=np.where(joints, np.nan, hands.joints_hand_m),
+        presence=np.where(dropped, 0, hands.presence),
+        filled=None if hands.filled is None else hands.filled & ~dropped,
+    )
 
 
 def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
@@ -236,14 +235,15 @@ def _on_side(hands: HandTracks, side: Side) -> HandTracks:
     if side == "auto":
         return hands
     own = LEFT if side == "left" else RIGHT
-    presence = np.where(visible(hands), hands.presence, -1)
-    best = np.argmax(presence, axis=1)
-    rows = np.arange(len(best))
-    moved: dict[str, Any] = {}
-    for name, missing in (("joints_px", np.nan), ("joints_hand_m", np.nan), ("presence", 0.0)):
-        values = getattr(hands, name)
-        moved[name] = np.full_like(values, missing)
-        moved[name][:, own] = values[rows, best]
+    best = np.argmax(np.where(visible(hands), hands.presence, -1), axis=1)
+    frames = np.arange(len(best))
+    moved: dict[str, Any] = {"filled": None}
+    for name, missing in (
+        ("joints_px", np.nan), ("joints_hand_m", np.nan), ("presence", 0), ("filled", False)
+    ):  # fmt: skip
+        if (values := getattr(hands, name)) is not None:
+            moved[name] = np.full_like(values, missing)
+            moved[name][:, own] = values[frames, best]
     return HandTracks(**moved)
 
 
@@ -263,6 +263,17 @@ def _given_cameras(record: Record) -> Cameras | None:
         height=record.plan.height,
         width=record.plan.width,
     )
+
+
+def _cameras_of_given_hands(record: Record) -> Cameras:
+    """Return the recording's cameras. Raises `InputError` if it knows hands alone."""
+    cameras = _given_cameras(record)
+    if cameras is None:
+        raise InputError(
+            "The recording has hands, but not the poses and intrinsics of its cameras: all are "
+            "needed. Import it with them, or without hands."
+        )
+    return cameras
 
 
 def _given_points(record: Record) -> SparsePoints | None:
@@ -301,12 +312,7 @@ def _given_depth(record: Record, frame: int) -> np.ndarray | None:
 
 def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:
     """Return the recording's joints as tracks in the pixels of the clip."""
-    cameras = _given_cameras(record)
-    if cameras is None:
-        raise InputError(
-            "The recording has hands, but not the intrinsics of its cameras: both are needed. "
-            "Import it with its intrinsics."
-        )
+    cameras = _cameras_of_given_hands(record)
     joints = joints_m[_source_frames(record)][:, :2]
     local = transform(rearrange(invert(cameras.world_from_camera), "f a b -> f 1 a b"), joints)
     pixels = np.stack(project(cameras.intrinsics_px, local), axis=-1)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from egosim_jax import interrupts
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.pack import triplet_record
@@ -20,6 +16,7 @@ from egosim_jax.data.shards import ShardWriter, gather
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import quote_path
+from egosim_jax.processes import run_in_processes
 from egosim_jax.types import WAN_GRID, InputError, Kind, SceneState, VideoGrid, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
@@ -120,18 +117,9 @@ def make_shards(
     parts.mkdir(exist_ok=True)
     missing = [seed for seed in config.seeds if not _part(parts, seed, config.clips - 1).exists()]
     yield from (seed for seed in config.seeds if seed not in missing)
-    # One thread per process: two processes that share the cores by threads take twice as long.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
-    pool = ProcessPoolExecutor(workers, mp_context=context)
-    try:
-        with interrupts.not_inherited():
-            jobs = {pool.submit(_make, config, seed, parts, states): seed for seed in missing}
-        for job in as_completed(jobs):
-            job.result()
-            yield jobs[job]
-    finally:  # after an error or Ctrl-C, scenes that have not started are canceled
-        pool.shutdown(cancel_futures=True)
+    calls = [(config, seed, parts, states) for seed in missing]
+    for number, _ in run_in_processes(_make, calls, workers=workers):
+        yield missing[number]
     _gather(config, grid, parts, out)
 
 

@@ -1,15 +1,33 @@
 """Stages of an annotation."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
+from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.prepare import RefusedError
-from egosim_jax.annotate.scene import check_prior
+from egosim_jax.annotate.scene import STAGES, check_prior, to_triplet
+from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.annotate.stages import drop_flashes, hold_hands, visible
 from egosim_jax.perception.estimates import LEFT, RIGHT
-from tests.unit.annotate.stubs import StubHands, config
+from tests.unit.annotate.stubs import StubHands, config, textured_video, write
+
+
+def stages_of(tmp_path, settings, *, last="caption"):
+    """Return the record of a video of a fixed camera after a stage."""
+    recording = open_source(Source(name="cup", path=write(tmp_path / "cup.mp4", np.repeat(
+        textured_video(1), 9, axis=0
+    ))))  # fmt: skip
+    recording.save(tmp_path / "cup")
+    job = Job(video_id="cup", recording=str(tmp_path / "cup"), start=0, stop=9, figures={})
+    record, parts = open_record(job, settings), settings.build()
+    for stage in STAGES:
+        record = stage.run(record, parts, settings)
+        if stage.name == last:
+            break
+    return record
 
 
 def test_a_hand_keeps_its_silhouette_for_half_a_second():
@@ -39,8 +57,37 @@ def test_a_second_hand_for_a_moment_is_the_first_one_again():
     for frames in (slice(10, 14), slice(30, 45)):
         hands.joints_px[frames, LEFT] = hands.joints_px[frames, RIGHT] + 20
         hands.joints_hand_m[frames, LEFT] = hands.joints_hand_m[frames, RIGHT]
-    kept = drop_flashes(hands, Fraction(16))
+    filled = np.zeros((60, 2), bool)
+    filled[[12, 40], LEFT] = True
+    kept = drop_flashes(replace(hands, filled=filled), Fraction(16))
+    assert np.argwhere(kept.filled).tolist() == [[40, LEFT]]
     assert np.flatnonzero(visible(kept)[:, LEFT]).tolist() == list(range(30, 45))
     assert visible(kept)[:, RIGHT].all()
     alone = StubHands(0.05, None)(np.zeros((60, 48, 80, 3), np.uint8))
     assert visible(drop_flashes(alone, Fraction(16))).sum() == 3
+
+
+def test_all_hands_are_of_the_given_side(tmp_path):
+    hands = stages_of(tmp_path, config(side="left"), last="hands").hands
+    assert visible(hands).all(axis=0).tolist() == [True, False]
+    assert (hands.presence[:, LEFT] == 0.9).all()
+
+
+def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
+    record = stages_of(tmp_path, config())
+    state = record.state
+    column = np.arange(48 * 80) % 80
+    hidden = (
+        (60 <= column) & (column < 78) & (column % 6 < 2)
+    )  # a crack of one pixel between squares of two
+    state = replace(
+        state,
+        points_m=state.points_m[~hidden],
+        colors=state.colors[~hidden],
+        object_ids=state.object_ids[~hidden],
+        last_seen=state.last_seen[~hidden],
+    )
+    still = np.repeat(record.first_frame[None], len(record.frames), axis=0)
+    _, figures = to_triplet(replace(record, state=state, frames=still), config())
+    assert figures["seen"] == 1
+    assert figures["psnr_background"] > 35  # 22 with the cracks
