@@ -78,7 +78,7 @@ def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
     state = record.state
     column = np.arange(48 * 80) % 80
     hidden = (
-        (60 <= column) & (column < 78) & (column % 6 < 2)
+        (column >= 60) & (column < 78) & (column % 6 < 2)
     )  # a crack of one pixel between squares of two
     state = replace(
         state,
