@@ -49,6 +49,7 @@ from egosim_jax.types import (
     Cameras,
     GroundTruth,
     InputError,
+    Kind,
     SceneState,
     check_counts,
 )
@@ -111,9 +112,7 @@ class Episode:
         for number, action in enumerate(self.actions, start=1):
             with _named(f"clip {number}"):
                 _check_equal(action, self.actions[0])
-                _check_speed(action.cameras, self.fps)
-                _check_order(action)
-                _check_scene(self.state, action.cameras)
+                check_action(action, state=self.state, fps=self.fps)
         shape = self.shape
         image = self.first_frame
         if image is not None and (image.shape != (*shape[1:], 3) or image.dtype != np.uint8):
@@ -211,6 +210,13 @@ class Episode:
             return _read(folder)
 
 
+def check_action(action: Action, *, state: SceneState, fps: int) -> None:
+    """Raise `InputError` for a camera too fast, joints in another order, or a scene out of sight."""
+    _check_speed(action.cameras, fps)
+    _check_order(action)
+    _check_scene(state, action.cameras)
+
+
 def _check_equal(action: Action, first: Action) -> None:
     """Raise `InputError` unless a clip has the first one's kind, length and size."""
     have, want = (
@@ -284,18 +290,39 @@ def _check_scene(state: SceneState, cameras: Cameras) -> None:
         )
 
 
-def _write(folder: Path, episode: Episode) -> None:
-    snapshot.save(folder / "state", episode.state)
-    for number, action in enumerate(episode.actions, start=1):
-        clip = folder / f"clip_{number}"
-        clip.mkdir()
-        cameras = action.cameras
+def save_action(path: Path, action: Action) -> None:
+    """Write cameras and joints of an action to an .npz file."""
+    cameras = action.cameras
+    with atomic_write(path) as temporary:
         np.savez(
-            clip / "action.npz",
+            temporary,
             world_from_camera=np.ascontiguousarray(cameras.world_from_camera, float),
             intrinsics_px=np.ascontiguousarray(cameras.intrinsics_px, float),
             joints_m=np.ascontiguousarray(action.joints_m),
         )
+
+
+def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -> Action:
+    """Read an action's cameras and joints; `size` is height and width of its pictures."""
+    names = {"world_from_camera": "float64", "intrinsics_px": "float64"}
+    arrays = read_arrays(path, names, others=("joints_m",))
+    return Action(
+        cameras=Cameras(
+            world_from_camera=arrays["world_from_camera"],
+            intrinsics_px=arrays["intrinsics_px"],
+            height=size[0],
+            width=size[1],
+        ),
+        joints_m=arrays["joints_m"],
+        kind=kind,
+        prompt=prompt,
+    )
+
+
+def _write(folder: Path, episode: Episode) -> None:
+    snapshot.save(folder / "state", episode.state)
+    for number, action in enumerate(episode.actions, start=1):
+        save_action(folder / f"clip_{number}" / "action.npz", action)
     for number, known in enumerate(episode.ground_truth, start=1):
         arrays: dict[str, Any] = {
             name: np.ascontiguousarray(value)
@@ -385,12 +412,14 @@ def _read(folder: Path) -> Episode:
             *([FIRST_FRAME] if has_image else []),
         },
     )
+    size, actions = (written["height"], written["width"]), []
+    for number, prompt in enumerate(prompts, start=1):
+        with _named(name := f"clip_{number}"):
+            path = folder / name / "action.npz"
+            actions.append(load_action(path, kind=written["kind"], size=size, prompt=prompt))
     return Episode(
         state=snapshot.load(folder / "state"),
-        actions=tuple(
-            _read_action(folder / f"clip_{number}" / "action.npz", written, prompt)
-            for number, prompt in enumerate(prompts, start=1)
-        ),
+        actions=tuple(actions),
         fps=written["fps"],
         first_frame=read_image(folder / FIRST_FRAME) if has_image else None,
         ground_truth=tuple(
@@ -413,23 +442,6 @@ def _check_files(folder: Path, recorded: Mapping[str, Any], *, expected: set[str
                 f"{name} is damaged or was changed after the episode was written (SHA-256). "
                 "Restore it, or write the episode again."
             )
-
-
-def _read_action(path: Path, written: Mapping[str, Any], prompt: str) -> Action:
-    names = {"world_from_camera": "float64", "intrinsics_px": "float64"}
-    arrays = read_arrays(path, names, others=("joints_m",))
-    with _named(path.parent.name):
-        return Action(
-            cameras=Cameras(
-                world_from_camera=arrays["world_from_camera"],
-                intrinsics_px=arrays["intrinsics_px"],
-                height=written["height"],
-                width=written["width"],
-            ),
-            joints_m=arrays["joints_m"],
-            kind=written["kind"],
-            prompt=prompt,
-        )
 
 
 def _read_ground_truth(path: Path, target_id: int | None) -> GroundTruth:

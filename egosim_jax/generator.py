@@ -327,6 +327,16 @@ class Generator:
     ) -> UInt8[np.ndarray, "f h w 3"]:
         """Generate one clip of a simulation (`simulator.VideoGenerator`).
 
+        Raises what `condition` raises.
+        """
+        check_seed(seed, name="seed")
+        return self.generate([self.condition(view, action, first_frame)], [seed])[0].frames
+
+    def condition(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
+    ) -> Triplet:
+        """Return the conditions of one clip of a simulation.
+
         Raises `InputError` unless view, action and first frame have the length and size of the
         model's clips.
         """
@@ -339,8 +349,7 @@ class Generator:
                 f"The action has {len(action.joints_m)} frames, the clips of {self.config.name} "
                 f"have {video.frames}: give as many cameras and hands."
             )
-        check_seed(seed, name="seed")
-        triplet = Triplet(
+        return Triplet(
             video_id="clip",
             prompt=action.prompt,
             prior=view.frames,
@@ -348,7 +357,6 @@ class Generator:
             hands=self.renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0],
             first_frame=first_frame,
         )
-        return self.generate([triplet], [seed])[0].frames
 
     def fingerprint(self) -> str:
         """Return the content hash of the config and all weights, as they are in memory."""

@@ -95,7 +95,7 @@ class Rollout:
             folder / "frames.npz",
             make=lambda: simulator.generate(view, action, seed=seed, first_frame=first_frame),
             save=_save_frames,
-            load=lambda path: _load_frames(path, simulator.fps),
+            load=lambda path: load_clip(path, simulator.fps),
         )
         perception = simulator.perception
         if perception is None:
@@ -122,5 +122,6 @@ def _save_frames(path: Path, clip: Clip) -> None:
         np.savez(temporary, frames=clip.frames)
 
 
-def _load_frames(path: Path, fps: int) -> Clip:
+def load_clip(path: Path, fps: int) -> Clip:
+    """Read the clip of a step from its frames.npz."""
     return Clip(frames=read_arrays(path, {"frames": "uint8"})["frames"], fps=fps)

@@ -79,10 +79,13 @@ class Simulator:
         """
         view = self.render(state, action)
         clip = self.generate(view, action, seed=seed, first_frame=first_frame)
+        return Step(view=view, clip=clip, state=self.update(state, clip, action))
+
+    def update(self, state: SceneState, clip: Clip, action: Action) -> SceneState:
+        """Return the state after a clip: what is perceived in it, fused into the state before."""
         if self.perception is None:
-            return Step(view=view, clip=clip, state=state)
-        perceived = self.perception(clip, action, state)
-        return Step(view=view, clip=clip, state=fuse(state, perceived, fusion=self.fusion))
+            return state
+        return fuse(state, self.perception(clip, action, state), fusion=self.fusion)
 
     def render(self, state: SceneState, action: Action) -> View:
         """Render the state along the action's camera path."""

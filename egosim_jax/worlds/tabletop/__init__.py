@@ -101,13 +101,7 @@ def make_sequence(
     same clips without hands and manipulated body, which gives their background. `black_cloths` is
     the most that lie on the table; they change nothing else.
     """
-    stream = 0 if kind == "human" else 1
-    rng = np.random.default_rng([seed, stream])
-    scene = make_scene(rng)
-    if black_cloths is not None:
-        scene = with_cloths(scene, np.random.default_rng([seed, stream, 1]), black_cloths)
-    sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
-    eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
+    rng, scene, eye, sway = _begin(seed, kind, black_cloths)
     hands: tuple[Hand, ...] = ()
     for number in range(clips):
         intent = actions.choose(scene, rng, hand=hands[0] if hands else None)
@@ -119,6 +113,34 @@ def make_sequence(
         cameras = _cameras(number + np.linspace(0, 1, spec.frames), eye, sway, spec)
         yield _clip(seed, number, kind, intent, moments, cameras, bare=bare)
         scene, hands = moments[-1].scene, moments[-1].hands
+
+
+def opening(
+    seed: int, *, spec: VideoSpec, kind: Kind = "human"
+) -> tuple[Scene, Cameras, Picture, SceneState]:
+    """Return scene, camera, first frame without hands and state of a seed's first clip."""
+    _, scene, eye, sway = _begin(seed, kind, None)
+    cameras = _cameras(np.zeros(1), eye, sway, spec)
+    first, state = _first_view(scene, cameras)
+    return scene, cameras, first, replace(state, provenance=_provenance(seed))
+
+
+def _begin(
+    seed: int, kind: Kind, black_cloths: int | None
+) -> tuple[np.random.Generator, Scene, np.ndarray, tuple[Any, Any]]:
+    """Return generator of random numbers, scene, eye and sway of the head of a seed."""
+    stream = 0 if kind == "human" else 1
+    rng = np.random.default_rng([seed, stream])
+    scene = make_scene(rng)
+    if black_cloths is not None:
+        scene = with_cloths(scene, np.random.default_rng([seed, stream, 1]), black_cloths)
+    sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
+    eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
+    return rng, scene, eye, sway
+
+
+def _provenance(seed: int) -> dict[str, str]:
+    return {"world": "tabletop", "seed": str(seed)}
 
 
 def _cameras(times: np.ndarray, eye: np.ndarray, sway: tuple[Any, Any], spec: VideoSpec) -> Cameras:
@@ -187,7 +209,7 @@ def _clip(
         parts={body.name: body.parts[0] for body in moments[0].scene.bodies},
         paints=paints,
         first=first,
-        state=replace(state, step=number, provenance={"world": "tabletop", "seed": str(seed)}),
+        state=replace(state, step=number, provenance=_provenance(seed)),
     )
 
 

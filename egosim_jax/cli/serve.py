@@ -1,0 +1,115 @@
+"""`egosim serve`: sessions of a world for policies on this machine or others."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from egosim_jax.command import ExitCode
+from egosim_jax.types import InputError, check_counts
+
+if TYPE_CHECKING:
+    from egosim_jax.serving.service import Service
+
+TOKEN = "EGOSIM_TOKEN"  # noqa: S105 - the name of the variable that has it
+NEEDS = ("fastapi", "uvicorn", "websockets", "msgpack", "prometheus_client")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve:
+    """Serve sessions of a world over websocket and HTTP, for policies to step.
+
+    openpi-client connects to it; docs/serving.md has the requests. Sessions are kept in OUT: after
+    a crash the same command resumes all of them. SIGTERM finishes the steps under way first. Needs
+    the extra `serve`. Prints the address when it takes requests.
+    """
+
+    out: Path = Path("runs/serve")
+    """Folder of the sessions."""
+    config: str = "tabletop"
+    """Name of the model."""
+    weights: Path | None = None
+    """Folder of weights, if not those that come with the package."""
+    world: Literal["generated", "true"] = "generated"
+    """World of the sessions: the model's, or the tabletop world itself."""
+    perception: str = "classical"
+    """Perception pipeline by name, with its options."""
+    steps: int | None = None
+    """Denoising steps, instead of the model's."""
+    batch: int = 4
+    """Most clips that are generated together; 1 turns batching off, which makes every clip equal
+    to the byte."""
+    host: str = "127.0.0.1"
+    """Address to listen on; another than the loopback's needs a token in EGOSIM_TOKEN."""
+    port: int = 8000
+    """Port to listen on; 0 for a free one."""
+    sessions: int = 64
+    """Most open sessions."""
+    queue: int = 32
+    """Most requests that wait or run; further ones are refused with status 429."""
+    threads: int = 8
+    """Most steps that run at the same time."""
+    max_steps: int = 10_000
+    """Most steps of a session."""
+    step_timeout: float = 120.0
+    """Longest time in seconds that a client waits for a step, which goes on without it."""
+
+    def run(self) -> int:
+        """Check, load, compile, resume all sessions, serve."""
+        missing = [name for name in NEEDS if find_spec(name) is None]
+        if missing:
+            raise InputError(
+                f"egosim serve needs {', '.join(missing)}, which is not installed: pip install "
+                "'egosim-jax[serve]'."
+            )
+        check_counts({"--batch": self.batch, "--steps": self.steps, "--threads": self.threads})
+        if not 0 <= self.port < 1 << 16:
+            raise InputError(f"--port must be from 0 to 65535, not {self.port}.")
+        from egosim_jax.serving.server import is_loopback, serve
+
+        token = os.environ.get(TOKEN) or None
+        if not is_loopback(self.host) and token is None:
+            raise InputError(
+                f"{self.host} can be reached from other machines: the server needs a token to "
+                f"listen on it. Set {TOKEN}, or listen on 127.0.0.1. (--host)"
+            )
+        service = self._service()
+        try:
+            serve(service, host=self.host, port=self.port, token=token, ready=self._ready)
+        finally:
+            service.store.close()
+        return ExitCode.DONE
+
+    def _service(self) -> Service:
+        from egosim_jax.env import backend_of
+        from egosim_jax.io.executables import share_with_jax
+        from egosim_jax.serving.metrics import Metrics
+        from egosim_jax.serving.service import Service
+        from egosim_jax.serving.store import Limits, Store
+
+        limits = Limits(
+            sessions=self.sessions,
+            queue=self.queue,
+            threads=self.threads,
+            steps=self.max_steps,
+            step_timeout_s=self.step_timeout,
+        )
+        share_with_jax()
+        backend = backend_of(
+            self.world,
+            config=self.config,
+            weights=self.weights,
+            perception=self.perception,
+            steps=self.steps,
+            batch=self.batch,
+        )
+        store = Store(self.out, backend, limits, Metrics())
+        print(f"{len(store.sessions)} sessions are resumed", file=sys.stderr)
+        return Service(store, world=self.world)
+
+    def _ready(self, port: int) -> None:
+        print(f"http://{self.host}:{port}", flush=True)

@@ -1,0 +1,32 @@
+"""Prometheus metrics of a server."""
+
+from __future__ import annotations
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128)
+"""Upper bounds of the histogram of seconds."""
+
+
+class Metrics:
+    """Metrics in a registry of their own, so that one process may hold several servers."""
+
+    def __init__(self) -> None:
+        self.registry = registry = CollectorRegistry()
+        self.sessions = Gauge("egosim_sessions", "Open sessions.", registry=registry)
+        self.queued = Gauge("egosim_queue", "Requests that wait or run.", registry=registry)
+        self.connections = Gauge("egosim_connections", "Open websockets.", registry=registry)
+        self.steps = Counter("egosim_steps", "Steps that were answered.", registry=registry)
+        self.refused = Counter(
+            "egosim_refused", "Requests that were refused.", ["code"], registry=registry
+        )
+        self.seconds = Histogram(
+            "egosim_request_seconds",
+            "Seconds of a request in its thread.",
+            buckets=SECONDS,
+            registry=registry,
+        )
+
+    def text(self) -> bytes:
+        """Return the metrics in Prometheus's text format."""
+        return generate_latest(self.registry)

@@ -1,0 +1,194 @@
+"""What the server does for a request, whatever it came by: a map in, a map out."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import asdict
+from importlib import metadata
+from typing import Any, TypeVar
+
+import numpy as np
+
+from egosim_jax.env.actions import LAYOUTS
+from egosim_jax.io.untrusted import quote
+from egosim_jax.serving.errors import RequestError, as_request_error
+from egosim_jax.serving.session import Result, Session, vars_of
+from egosim_jax.serving.store import Store
+from egosim_jax.types import InputError
+
+T = TypeVar("T")
+OBSERVATIONS = ("frames", "depth", "keypoints", "state")
+FIELDS = {
+    "create": ("session", "seed", "prompt", "episode", "actions", "observe"),
+    "step": ("session", "step_id", "actions", "prompt", "observe"),
+    "reset": ("session", "seed", "prompt", "episode", "observe"),
+    "save": ("session", "name"),
+    "load": ("session", "name", "observe"),
+    "close": ("session", "keep"),
+    "status": ("session",),
+}
+"""Fields of each request."""
+
+
+class Service:
+    """Requests of clients to the sessions of a store."""
+
+    def __init__(self, store: Store, *, world: str):
+        self.store, self._world = store, world
+        self._active = 0
+        self._quiet = threading.Condition()
+
+    def describe(self) -> dict[str, Any]:
+        """Return what a client is told when it connects."""
+        video, limits = self.store.backend.video, self.store.limits
+        return {
+            "server": "egosim_jax",
+            "version": metadata.version("egosim-jax"),
+            "protocol": 1,
+            "world": self._world,
+            "frames": video.frames,
+            "height": video.height,
+            "width": video.width,
+            "fps": video.fps,
+            "rows": video.frames - 1,
+            "layouts": list(LAYOUTS),
+            "observations": list(OBSERVATIONS),
+            "requests": {name: list(fields) for name, fields in FIELDS.items()},
+            "limits": asdict(limits),
+        }
+
+    async def handle(self, message: Any) -> dict[str, Any]:
+        """Return the reply to a request. Raises `RequestError`."""
+        with self._quiet:
+            self._active += 1
+        try:
+            return await self._handle(message)
+        except Exception as error:
+            raise as_request_error(error) from error
+        finally:
+            with self._quiet:
+                self._active -= 1
+                self._quiet.notify_all()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Refuse new work; return True when no request is under way any more."""
+        self.store.draining = True
+        with self._quiet:
+            return self._quiet.wait_for(lambda: not self._active, timeout_s)
+
+    async def _handle(self, message: Any) -> dict[str, Any]:
+        name, request = _parsed(message)
+        observe = _observe(request.get("observe", ["frames"]))
+        store = self.store
+        if name == "status":
+            return self.status(request)
+        if name == "create":
+            session = await self._thread(lambda: store.create(request))
+            low, high = session.actions.bounds
+            spec = {**vars_of(session.actions), "names": list(session.actions.names)}
+            reply = await self._reply(session, session.result, observe)
+            return {**reply, "actions": {**spec, "low": low, "high": high}}
+        session = store.get(request.get("session"))
+        if name == "save":
+            saved = await self._wait(store.save(request))
+            return {"session": session.id, "step_id": session.committed, "name": saved}
+        if name == "close":
+            return {"session": await self._wait(store.remove(request)), "closed": True}
+        run = {"step": store.step, "reset": store.reset, "load": store.load}[name]
+        result = await self._wait(run(request))
+        if name == "step":
+            store.metrics.steps.inc()
+        return await self._reply(session, result, observe)
+
+    def status(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return where a session is, or without one the sessions of the server."""
+        if request.get("session") is None:
+            steps = {name: s.committed for name, s in sorted(self.store.sessions.items())}
+            return {
+                "sessions": steps,
+                "damaged": sorted(self.store.damaged),
+                "draining": self.store.draining,
+            }
+        session = self.store.get(request["session"])
+        saved = (session.folder / "saved").glob("*")
+        return {
+            "session": session.id,
+            "committed_step_id": session.committed,
+            "busy": session.busy.locked(),
+            "saved": sorted(path.name for path in saved),
+            "actions": vars_of(session.actions),
+            **session.result.info,
+        }
+
+    async def _wait(self, future: Future[T]) -> T:
+        """Return a result that may take a while; the request goes on if the client vanishes."""
+        timeout = self.store.limits.step_timeout_s
+        waiting = asyncio.shield(asyncio.wrap_future(future))
+        try:
+            return await asyncio.wait_for(waiting, timeout)
+        except TimeoutError:
+            raise RequestError(
+                504,
+                "timeout",
+                f"The request has taken more than {timeout:g} s, the longest that a client waits: "
+                "it goes on. Ask for the status, or send the same step_id again.",
+                retry_after_s=timeout,
+            ) from None
+
+    async def _thread(self, run: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(None, run)
+
+    async def _reply(
+        self, session: Session, result: Result, observe: tuple[str, ...]
+    ) -> dict[str, Any]:
+        found: dict[str, Any] = {
+            "session": session.id,
+            "step_id": result.step_id,
+            "row": result.row,
+            "info": dict(result.info),
+        }
+        if "frames" in observe:
+            found["frames"] = result.frames
+        if "keypoints" in observe:
+            found["keypoints"] = session.actions.joints(result.row[None])[0]
+        if "state" in observe:
+            names = ("points_m", "colors", "object_ids")
+            found["state"] = {name: getattr(result.state, name) for name in names}
+        if "depth" in observe:
+            simulator = session.backend.simulator(session.now)
+            view = await self._thread(lambda: simulator.render(result.state, result.camera))
+            found["depth"] = np.asarray(view.depth_m[0])
+        return found
+
+
+def _parsed(message: Any) -> tuple[str, Mapping[str, Any]]:
+    """Return name and fields of a request. Raises `InputError` for an unknown one."""
+    if not isinstance(message, dict):
+        raise InputError(
+            f"The message is {quote(message)}: it must be a map with the field request."
+        )
+    name = message.get("request")
+    if not isinstance(name, str) or name not in FIELDS:
+        raise InputError(
+            f"The request is {quote(name)}: it must be one of {', '.join(FIELDS)}. (request)"
+        )
+    allowed = ("request", *FIELDS[name])
+    if unknown := [key for key in message if key not in allowed]:
+        raise InputError(
+            f"The request {name} has no field {quote(unknown[0])}: its fields are "
+            f"{', '.join(FIELDS[name])}."
+        )
+    return name, {key: value for key, value in message.items() if key != "request"}
+
+
+def _observe(names: Any) -> tuple[str, ...]:
+    texts = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
+    if not texts or (unknown := [name for name in names if name not in OBSERVATIONS]):
+        wrong = quote(unknown[0]) if texts else quote(names)
+        raise InputError(f"observe has {wrong}: choose from {', '.join(OBSERVATIONS)}.")
+    return tuple(names)
+
+

@@ -1,0 +1,346 @@
+"""One session: journaled steps in a folder.
+
+    session.json              settings
+    starts/N/                 start after committed step N, where a reset or load chose one
+    steps/N/request.json      row, prompt and hash of a step's request
+    steps/N/action.npz        cameras and joints
+    steps/N/rollout/          journal, clip and state (rollout.py)
+    steps/N/info.json         what is known of the step; it is committed when this is there
+    saved/NAME/               starts that the client saved
+
+A request is on disk before its step runs, so a killed server finishes the step that was under way,
+from its last finished phase. A step that fails is removed: the session is where it was.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.env.actions import ActionSpec
+from egosim_jax.env.backends import Backend
+from egosim_jax.env.batching import announced
+from egosim_jax.env.chunks import Chunk, last_camera, make_chunk, validity
+from egosim_jax.env.start import Start
+from egosim_jax.episode import Episode, check_action, load_action, save_action
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import quote, read_json
+from egosim_jax.rollout import Rollout, load_clip
+from egosim_jax.serving.errors import RequestError
+from egosim_jax.state import snapshot
+from egosim_jax.types import Action, Cameras, InputError, SceneState
+
+SETTINGS, INFO, REQUEST = "session.json", "info.json", "request.json"
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Where a session is, with the clip of its last step."""
+
+    step_id: int
+    """Committed steps of the session."""
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """Frames of the clip; after a reset its first frame alone."""
+    state: SceneState
+    """State after the step."""
+    row: np.ndarray
+    """Last row of hands and camera."""
+    camera: Cameras
+    """Camera of the last frame."""
+    info: Mapping[str, Any]
+    """What is known of the step."""
+
+
+class Session:
+    """Session of a backend in a folder; one request at a time changes it."""
+
+    def __init__(self, folder: Path, backend: Backend):
+        """Open the session that `create` wrote. Raises `InputError` if it is damaged."""
+        self.folder, self.backend = folder, backend
+        self.id = folder.name
+        settings = read_json(folder / SETTINGS)
+        if not isinstance(settings, dict) or not isinstance(settings.get("actions"), dict):
+            raise InputError(f"{folder / SETTINGS} does not describe a session. Restore it.")
+        self.actions = spec_of(settings["actions"])
+        self.busy = threading.Lock()
+        self.flight: tuple[tuple[int, str], Future[Result]] | None = None
+        """Number and hash of the step that is under way, and its future result."""
+        steps = [int(p.name) for p in (folder / "steps").glob("[0-9]*")]
+        self.committed = max((n for n in steps if self._is_committed(n)), default=0)
+        self.pending = self.committed + 1 in steps and self._is_accepted(self.committed + 1)
+        self.now, self.result = self._where()
+
+    @classmethod
+    def create(
+        cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start
+    ) -> Session:
+        """Write the folder of a new session and open it."""
+        start.save(folder / "starts" / "0")
+        write_json(folder / SETTINGS, {"actions": vars_of(actions), "seed": start.seed})
+        return cls(folder, backend)
+
+    def _step(self, number: int) -> Path:
+        return self.folder / "steps" / str(number)
+
+    def _is_committed(self, number: int) -> bool:
+        return (self._step(number) / INFO).exists()
+
+    def _is_accepted(self, number: int) -> bool:
+        return (self._step(number) / "action.npz").exists()
+
+    def _where(self) -> tuple[Start, Result]:
+        """Return start and result of a session that is read from its folder."""
+        chosen = self.folder / "starts" / str(self.committed)
+        if chosen.exists():
+            now = Start.load(chosen)
+            return now, self._opening(now)
+        base = max(int(p.name) for p in (self.folder / "starts").iterdir() if p.name.isdigit())
+        past: tuple[Action, ...] = ()
+        if self.backend.needs_past:
+            past = tuple(self._action(n) for n in range(base + 1, self.committed + 1))
+        result, start = self.repeat(self.committed), Start.load(self.folder / "starts" / str(base))
+        now = replace(
+            start,
+            state=result.state,
+            row=result.row,
+            steps=start.steps + self.committed - base,
+            first_frame=None,
+            past=(*start.past, *past),
+        )
+        return now, result
+
+    def _opening(self, start: Start) -> Result:
+        """Return the result of a reset: the first frame alone."""
+        image = start.first_frame
+        if image is None:
+            image = self.backend.simulator(start).render(start.state, start.camera).frames[0]
+        return Result(
+            step_id=self.committed,
+            frames=image[None],
+            state=start.state,
+            row=self.actions.rest if start.row is None else start.row,
+            camera=start.camera,
+            info=self._facts(start.state, self.committed),
+        )
+
+    def _facts(self, state: SceneState, number: int) -> dict[str, Any]:
+        names = {str(key): name for key, name in state.names.items()}
+        return {"chunk": number, "state_sha256": snapshot.fingerprint(state), "objects": names}
+
+    def _action(self, number: int) -> Action:
+        request = read_json(self._step(number) / REQUEST)
+        return load_action(
+            self._step(number) / "action.npz",
+            kind=self.actions.kind,
+            size=(self.backend.video.height, self.backend.video.width),
+            prompt=request["prompt"],
+        )
+
+    def request(self, number: int) -> str:
+        """Return the hash of the request of a step that is on disk."""
+        return read_json(self._step(number) / REQUEST)["request"]
+
+    def repeat(self, number: int) -> Result:
+        """Return the result of a committed step from its files."""
+        folder, action = self._step(number), self._action(number)
+        request, clip = read_json(folder / REQUEST), folder / "rollout" / "clip_1"
+        info = read_json(folder / INFO)
+        state = clip / "state"
+        return Result(
+            step_id=number,
+            frames=load_clip(clip / "frames.npz", self.backend.video.fps).frames,
+            state=snapshot.load(state if state.exists() else self._base(number) / "state"),
+            row=np.array(request["row"], float),
+            camera=last_camera(action),
+            info=info,
+        )
+
+    def _base(self, number: int) -> Path:
+        """Return the start of the run of steps that a step belongs to."""
+        starts = [int(p.name) for p in (self.folder / "starts").iterdir() if p.name.isdigit()]
+        return self.folder / "starts" / str(max(n for n in starts if n < number))
+
+    def step(self, step_id: int, rows: object, prompt: str | None) -> Result:
+        """Make a step, or return the result of the same one that was made before.
+
+        Raises `RequestError` for a step out of order, or for another action under a used number.
+        """
+        request = request_hash(rows, prompt)
+        if step_id <= self.committed or (self.pending and step_id == self.committed + 1):
+            return self._again(step_id, request)
+        if step_id != self.committed + 1:
+            raise RequestError(
+                409,
+                "step_out_of_order",
+                f"Step {step_id} cannot follow step {self.committed}: step_id must be one more "
+                f"than the last committed step. Send step {self.committed + 1}.",
+            )
+        video, now = self.backend.video, self.now
+        chunk = make_chunk(self.actions, rows, start=now, frames=video.frames, prompt=prompt)
+        check_action(chunk.action, state=now.state, fps=video.fps)
+        self._accept(step_id, chunk, request)
+        return self.finish()
+
+    def _again(self, step_id: int, request: str) -> Result:
+        known = None
+        if 1 <= step_id <= self.committed + self.pending:
+            known = self.request(step_id)
+        if known != request or step_id < 1:
+            raise RequestError(
+                409,
+                "step_used",
+                f"Step {step_id} was made with another action: a used step_id repeats its result "
+                f"only for the same action. Committed is step {self.committed}; send step "
+                f"{self.committed + 1 + self.pending}.",
+            )
+        if step_id > self.committed:
+            return self.finish()
+        return self.result if step_id == self.result.step_id else self.repeat(step_id)
+
+    def _accept(self, number: int, chunk: Chunk, request: str) -> None:
+        folder = self._step(number)
+        shutil.rmtree(folder, ignore_errors=True)
+        about = {
+            "prompt": chunk.action.prompt,
+            "row": chunk.rows[-1].tolist(),
+            "request": request,
+            **chunk.info(self.actions),
+        }
+        write_json(folder / REQUEST, about)
+        save_action(folder / "action.npz", chunk.action)
+        self.pending = True
+
+    def finish(self) -> Result:
+        """Make the step whose request is on disk, from its last finished phase; commit it."""
+        number, now = self.committed + 1, self.now
+        folder, action = self._step(number), self._action(number)
+        simulator = self.backend.simulator(now)
+        rollout = Rollout(simulator, folder / "rollout")
+        try:
+            with announced(simulator.generator):
+                (step,) = rollout.run(
+                    now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
+                )
+        except Exception:
+            shutil.rmtree(folder, ignore_errors=True)
+            self.pending = False
+            raise
+        request = read_json(folder / REQUEST)
+        info = {
+            **self._facts(step.state, number),
+            "padded_frames": request["padded_frames"],
+            "hidden_hands": request["hidden_hands"],
+            "validity": validity(step, action, simulator.renderer),
+        }
+        write_json(folder / INFO, info)
+        row = np.array(request["row"], float)
+        self.committed, self.pending = number, False
+        self.now = now.after(step.state, row, action if self.backend.needs_past else None)
+        self.result = Result(
+            step_id=number,
+            frames=step.clip.frames,
+            state=step.state,
+            row=row,
+            camera=last_camera(action),
+            info=info,
+        )
+        return self.result
+
+    def restart(self, start: Start) -> Result:
+        """Go on from another start; step numbers continue."""
+        start.save(self.folder / "starts" / str(self.committed))
+        self.now, self.result = start, self._opening(start)
+        return self.result
+
+    def save(self, name: str) -> None:
+        """Save where the session is under a name."""
+        self.now.save(self.folder / "saved" / name)
+
+    def load(self, name: str) -> Result:
+        """Go on from a saved start. Raises `RequestError` if there is none of that name."""
+        folder = self.folder / "saved" / name
+        if not folder.exists():
+            known = sorted(path.name for path in (self.folder / "saved").glob("*"))
+            raise RequestError(
+                404,
+                "unknown_name",
+                f"The session has saved nothing as {quote(name)}; it has {known[:20]}. Save it "
+                "first.",
+            )
+        return self.restart(Start.load(folder))
+
+    def episode(self) -> Episode:
+        """Return the steps since the last reset as an episode."""
+        base = int(self._base(self.committed).name) if self.committed else 0
+        start = Start.load(self.folder / "starts" / str(base))
+        return Episode(
+            state=start.state,
+            actions=tuple(self._action(n) for n in range(base + 1, self.committed + 1)),
+            fps=self.backend.video.fps,
+            first_frame=start.first_frame,
+        )
+
+
+def request_hash(rows: object, prompt: str | None) -> str:
+    """Return the hash by which a repeated request is recognized; of no numbers, none."""
+    return fingerprint((np.asarray(rows, float), prompt)) if _is_numbers(rows) else ""
+
+
+def _is_numbers(rows: object) -> bool:
+    try:
+        return np.asarray(rows).dtype.kind in "biuf"
+    except ValueError:
+        return False
+
+
+def vars_of(actions: ActionSpec) -> dict[str, Any]:
+    """Return the fields of an action spec as JSON."""
+    return {
+        "layout": actions.layout,
+        "sides": list(actions.sides),
+        "camera": actions.camera,
+        "workspace_m": [list(corner) for corner in actions.workspace_m],
+        "camera_reach": list(actions.camera_reach),
+    }
+
+
+def spec_of(fields: Mapping[str, Any]) -> ActionSpec:
+    """Return the action spec of a client or file. Raises `InputError` for what is not one."""
+    known = vars_of(ActionSpec())
+    if unknown := sorted(fields.keys() - known.keys()):
+        raise InputError(
+            f"The actions have no setting {quote(unknown[0])}: choose from {', '.join(known)}."
+        )
+    given = {**known, **fields}
+    corners, reach = given["workspace_m"], given["camera_reach"]
+    shapes = _shape(corners) == (2, 3) and _shape(reach) == (2,)
+    texts = isinstance(given["sides"], list) and all(isinstance(s, str) for s in given["sides"])
+    if not (shapes and texts and isinstance(given["camera"], bool)):
+        raise InputError(
+            "The actions need sides, a list of 'left' and 'right', camera, true or false, "
+            "workspace_m, two corners of three numbers in meters, and camera_reach, two numbers."
+        )
+    if not isinstance(given["layout"], str):
+        raise InputError(f"The layout of the actions is {quote(given['layout'])}, not a text.")
+    low, high = (tuple(map(float, corner)) for corner in corners)
+    return ActionSpec(
+        layout=given["layout"],
+        sides=tuple(given["sides"]),
+        camera=given["camera"],
+        workspace_m=(low, high),
+        camera_reach=tuple(map(float, reach)),
+    )
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    return np.shape(value) if _is_numbers(value) else None

@@ -1,0 +1,142 @@
+"""Messages in MessagePack with NumPy arrays, as OpenPI's clients and servers exchange them.
+
+An array is a map of `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one of
+`__npgeneric__`, `data` and `dtype`; their keys are bytes. Nothing is unpickled: dtypes are numbers
+only, and an array's size must be that of its data.
+"""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.io.untrusted import quote, quote_text
+from egosim_jax.types import InputError
+
+MAX_BYTES = 16 << 20
+"""Largest message from a client in bytes."""
+MAX_DEPTH = 16
+"""Deepest nesting of a message."""
+
+
+def pack(value: Any) -> bytes:
+    """Return the bytes of a message."""
+    import msgpack
+
+    return msgpack.packb(value, default=_packed)
+
+
+def unpack(data: bytes, *, limit: int | None = None) -> Any:
+    """Return the message of some bytes. Raises `InputError` for what is not one.
+
+    Messages from outside are given a `limit` in bytes.
+    """
+    import msgpack
+
+    if limit is not None and len(data) > limit:
+        raise InputError(f"The message has {len(data):,} bytes: it may have at most {limit:,}.")
+    try:
+        value = msgpack.unpackb(data, object_hook=_unpacked, strict_map_key=True)
+    except InputError:
+        raise
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError) as error:
+        raise InputError(
+            "The message is not MessagePack with arrays of numbers, as openpi_client.msgpack_numpy "
+            f"packs it: {quote_text(str(error) or type(error).__name__)}."
+        ) from error
+    if limit is not None:
+        _check_depth(value)
+    return value
+
+
+def _packed(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "biuf":
+        raise TypeError(f"an array of {value.dtype} cannot be sent")
+    if isinstance(value, np.ndarray):
+        data = np.ascontiguousarray(value).tobytes()
+        return {
+            b"__ndarray__": True,
+            b"data": data,
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    raise TypeError(f"{type(value).__name__} cannot be sent")
+
+
+def _unpacked(value: dict[Any, Any]) -> Any:
+    if b"__ndarray__" in value:
+        return _array(value.get(b"data"), value.get(b"dtype"), value.get(b"shape"))
+    if b"__npgeneric__" in value:
+        number = value.get(b"data")
+        if not isinstance(number, bool | int | float):
+            raise InputError(f"A NumPy scalar is {quote(number)}: it must be a number.")
+        try:
+            return _dtype(value.get(b"dtype")).type(number)
+        except (OverflowError, ValueError) as error:
+            raise InputError(f"A NumPy scalar is {quote(number)}: {quote_text(str(error))}.") from (
+                error
+            )
+    return value
+
+
+def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
+    kind = _dtype(dtype)
+    sizes = isinstance(shape, list) and all(type(n) is int and 0 <= n < 1 << 31 for n in shape)
+    if not isinstance(data, bytes) or not sizes or len(shape) > 8:
+        raise InputError(
+            f"An array has data {quote(data)} and shape {quote(shape)}: data must be bytes, the "
+            "shape a list of at most 8 whole numbers."
+        )
+    count = 1
+    for size in shape:
+        count *= size
+    if count * kind.itemsize != len(data):
+        raise InputError(
+            f"An array of {kind} has {len(data):,} bytes, its shape asks for "
+            f"{quote(count * kind.itemsize)}: they must agree."
+        )
+    return np.frombuffer(data, kind).reshape(shape)
+
+
+def _dtype(name: Any) -> np.dtype:
+    try:
+        dtype = np.dtype(name if isinstance(name, str) and len(name) <= 4 else "O")
+    except (TypeError, ValueError):
+        dtype = np.dtype("O")
+    if dtype.kind not in "biuf":
+        raise InputError(f"The dtype of an array is {quote(name)}: it must be of numbers or bool.")
+    return dtype
+
+
+def _check_depth(value: Any) -> None:
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+        if not level:
+            return
+    raise InputError(f"The message is nested more than {MAX_DEPTH} levels deep.")
+
+
+def to_json(value: Any) -> Any:
+    """Return a value with arrays as maps of dtype, shape and Base64 data, and NaN as null."""
+    if isinstance(value, np.ndarray):
+        data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "base64": data}
+    if isinstance(value, np.generic):
+        return to_json(value.item())
+    if isinstance(value, dict):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
