@@ -211,7 +211,7 @@ class Episode:
 
 
 def check_action(action: Action, *, state: SceneState, fps: int) -> None:
-    """Raise `InputError` for a camera too fast, joints in another order, or a scene out of sight."""
+    """Raise `InputError` for too fast a camera, joints in another order, a scene out of sight."""
     _check_speed(action.cameras, fps)
     _check_order(action)
     _check_scene(state, action.cameras)

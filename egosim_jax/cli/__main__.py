@@ -22,6 +22,7 @@ from egosim_jax.cli.experiment import Experiment
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.models import Models
 from egosim_jax.cli.preflight import Preflight
+from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.view import View
 
@@ -30,6 +31,7 @@ Commands = (
     | Annotated[Preflight, tyro.conf.subcommand("preflight")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Episode, tyro.conf.subcommand("episode")]
+    | Annotated[Serve, tyro.conf.subcommand("serve")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Data, tyro.conf.subcommand("data")]

@@ -41,8 +41,9 @@ class Serve:
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     batch: int = 4
-    """Most clips that are generated together; 1 turns batching off, which makes every clip equal
-    to the byte."""
+    """Most clips that are generated together.
+
+    1 turns batching off: then a clip is equal to the byte whatever other sessions do."""
     host: str = "127.0.0.1"
     """Address to listen on; another than the loopback's needs a token in EGOSIM_TOKEN."""
     port: int = 8000
@@ -56,7 +57,7 @@ class Serve:
     max_steps: int = 10_000
     """Most steps of a session."""
     step_timeout: float = 120.0
-    """Longest time in seconds that a client waits for a step, which goes on without it."""
+    """Longest time in seconds that a client waits for a step, which continues without it."""
 
     def run(self) -> int:
         """Check, load, compile, resume all sessions, serve."""

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from egosim_jax.io.untrusted import quote
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import Side, joints_of
 
@@ -52,7 +53,7 @@ class ActionSpec:
 
     def __post_init__(self) -> None:
         """Raise `InputError` for an unknown layout, no hands, or an empty workspace."""
-        if self.layout not in LAYOUTS:
+        if self.layout not in LAYOUTS:  # which a client may have chosen
             raise InputError(
                 f"There is no action layout {str(self.layout)[:40]!r}: it must be one of "
                 f"{', '.join(LAYOUTS)}."
@@ -121,7 +122,7 @@ class ActionSpec:
             found = np.asarray(rows, float)
         except (TypeError, ValueError):
             raise InputError(
-                f"The actions are {type(rows).__name__}: they must be numbers of shape (rows, "
+                f"The actions are {quote(rows)}: they must be numbers of shape (rows, "
                 f"{len(self.names)})."
             ) from None
         if found.ndim != 2 or not 1 <= len(found) <= most or found.shape[1] != len(self.names):
@@ -163,7 +164,9 @@ class ActionSpec:
         """
         cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
         joints = self.joints(rows)
-        lost = ~near_view(cameras, joints).any(axis=0) if hide else np.zeros(len(self.sides), bool)
+        lost = np.zeros(len(self.sides), bool)
+        if hide:
+            lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
         joints = np.where(lost[None, :, None, None], np.nan, joints)
         return Action(cameras=cameras, joints_m=joints, kind=self.kind, prompt=prompt), lost
 

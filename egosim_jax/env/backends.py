@@ -18,10 +18,15 @@ from egosim_jax.worlds.tabletop import opening
 class Backend(Protocol):
     """World of which episodes are simulated."""
 
-    video: VideoSpec
-    """Length, size and rate of its clips."""
-    needs_past: bool
-    """Simulators depend on the actions since the seed."""
+    @property
+    def video(self) -> VideoSpec:
+        """Length, size and rate of its clips."""
+        ...
+
+    @property
+    def needs_past(self) -> bool:
+        """Simulators depend on the actions since the seed."""
+        ...
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
         """Return the start of a seed's episode."""

@@ -1,6 +1,6 @@
 """Clips of many callers, generated together by one program.
 
-Callers run in threads of their own and call the batcher like the generator. A thread of the batcher
+Each caller runs in its thread and calls the batcher like the generator. A thread of the batcher
 takes what waits and runs the program of the largest batch size that it fills, so that nothing is
 padded but to the devices of a mesh. It waits for callers that have announced themselves, for a
 moment at most: while one batch runs, the next one gathers.

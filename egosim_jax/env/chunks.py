@@ -43,7 +43,7 @@ class Chunk:
     """Hands that never come near the view and are given as missing."""
 
     def info(self, spec: ActionSpec) -> dict[str, Any]:
-        """Return what a caller is told about its action."""
+        """Return what a caller needs to know of its action."""
         hidden = [side for side, lost in zip(spec.sides, self.hidden, strict=True) if lost]
         return {"padded_frames": self.padded, "hidden_hands": hidden}
 
@@ -123,6 +123,11 @@ def timed_step(
         update_s=time.monotonic() - generated,
     )
     return Step(view=view, clip=clip, state=after), timing
+
+
+def view_of(simulator: Simulator, state: SceneState, cameras: Cameras) -> View:
+    """Return the view of a state along a camera path, as the simulator renders it."""
+    return simulator.renderer.render(state, cameras, point_px=simulator.point_px)
 
 
 def validity(step: Step, action: Action, renderer: Renderer) -> float:

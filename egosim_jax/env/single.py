@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,6 +21,7 @@ from egosim_jax.env.chunks import (
     straight,
     timed_step,
     validity,
+    view_of,
 )
 from egosim_jax.env.rewards import Outcome, RewardFn, no_reward
 from egosim_jax.env.start import Start, check_size
@@ -116,11 +117,11 @@ class Running:
             self.actions, rows, start=self.now, frames=frames, prompt=prompt, hide=True
         )
 
-    def advance(self, chunk: Chunk) -> dict[str, Any]:
-        """Simulate a chunk; return what is known of it."""
+    def advance(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
+        """Simulate a chunk; return its step and what is known of it."""
         now, action = self.now, chunk.action
         simulator = self.backend.simulator(now)
-        step, seconds = timed_step(
+        step, timing = timed_step(
             simulator,
             now.state,
             action,
@@ -130,11 +131,11 @@ class Running:
         kept = action if self.backend.needs_past else None
         self.last, self.now = step, now.after(step.state, chunk.rows[-1], kept)
         self.camera = last_camera(action)
-        return {
+        return step, {
             **self.info(),
             **chunk.info(self.actions),
             "validity": validity(step, action, simulator.renderer),
-            "timing": seconds,
+            "timing": timing,
         }
 
     def info(self) -> dict[str, Any]:
@@ -156,14 +157,13 @@ class Running:
         return np.repeat(first[None], self.backend.video.frames, axis=0)
 
     def _view(self) -> View:
-        simulator = self.backend.simulator(self.now)
-        return simulator.render(self.now.state, self.camera)
+        return view_of(self.backend.simulator(self.now), self.now.state, self.camera)
 
     def observation(self, observe: tuple[str, ...]) -> dict[str, Any]:
         """Return the observation of what is asked for."""
-        found: dict[str, Any] = {"row": self.row}
+        found: dict[str, Any] = {"row": self.row.copy()}
         if "frames" in observe:
-            found["frames"] = self.frames()
+            found["frames"] = self.frames().copy()
         if "depth" in observe:
             found["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
         if "keypoints" in observe:
@@ -178,7 +178,7 @@ class Running:
 class WorldEnv(gymnasium.Env):
     """World of one episode, stepped by chunks of actions."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012
 
     def __init__(
         self,
@@ -238,9 +238,8 @@ class WorldEnv(gymnasium.Env):
         hands, hash of the state, seconds of each phase, `validity` and `success`.
         """
         running = self.running
-        info = running.advance(running.chunk(actions, prompt=prompt))
-        assert running.last is not None
-        result = self._reward(Outcome(first=running.start.state, step=running.last))
+        step, info = running.advance(running.chunk(actions, prompt=prompt))
+        result = self._reward(Outcome(first=running.start.state, step=step))
         truncated = running.chunks >= self._max_chunks and not result.terminated
         info["success"] = result.success
         observation = running.observation(self._observe)

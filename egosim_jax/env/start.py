@@ -1,9 +1,9 @@
 """The start of a clip: scene, camera, hands and prompt, as a folder.
 
-    state/          scene (state/snapshot.py)
-    start.json      camera, row, prompt, seed, clips since the seed, kinds of past actions
-    first_frame.png first frame without hands, if it is known
-    past/1.npz ...  actions that led here from the seed, which the true world repeats
+state/          scene (state/snapshot.py)
+start.json      camera, row, prompt, seed, clips since the seed, kinds of past actions
+first_frame.png first frame without hands, if it is known
+past/1.npz ...  actions that led here from the seed, which the true world repeats
 """
 
 from __future__ import annotations
@@ -125,9 +125,7 @@ class Start:
             row=np.array(written["row"], float) if written["row"] else None,
             first_frame=read_image(image) if image.exists() else None,
             past=tuple(
-                load_action(
-                    folder / "past" / f"{number}.npz", kind=kind, size=size, prompt=prompt
-                )
+                load_action(folder / "past" / f"{number}.npz", kind=kind, size=size, prompt=prompt)
                 for number, (kind, prompt) in enumerate(written["past"], start=1)
             ),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import Backend
-from egosim_jax.env.chunks import Chunk, straight
+from egosim_jax.env.chunks import straight
 from egosim_jax.env.rewards import Outcome, RewardFn, no_reward
 from egosim_jax.env.single import Running, observation_space, start_of
 from egosim_jax.types import InputError, check_counts
@@ -31,12 +31,12 @@ Result = tuple[
 class WorldVectorEnv(VectorEnv):
     """Episodes of a world that are stepped together; an ended one waits until it is reset.
 
-    Each step runs in a thread of its own, so that perception overlaps, and a backend with a
+    Each step runs in its own thread, so that perception overlaps, and a backend with a
     `Batcher` generates all clips in one program. Episodes are reset with the option `reset_mask`
     (`AutoresetMode.DISABLED`).
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own
         "render_modes": [],
         "autoreset_mode": AutoresetMode.DISABLED,
     }
@@ -62,8 +62,9 @@ class WorldVectorEnv(VectorEnv):
         low, high = self.actions.bounds
         self.single_action_space = spaces.Box(low, high, dtype=np.float64)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.single_observation_space = observation_space(backend.video, self.actions, self._observe)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        space = observation_space(backend.video, self.actions, self._observe)
+        self.single_observation_space = space
+        self.observation_space = batch_space(space, num_envs)
         self._running: list[Running | None] = [None] * num_envs
         self._ended = np.zeros(num_envs, bool)
         self._threads = ThreadPoolExecutor(num_envs, thread_name_prefix="episode")
@@ -105,7 +106,7 @@ class WorldVectorEnv(VectorEnv):
             seeds: Sequence[int | None] = [first + n for n in range(self.num_envs)]
         else:
             seeds = seed
-        for number in np.flatnonzero(mask):
+        for number in np.flatnonzero(mask).tolist():
             chosen = seeds[number]
             chosen = int(np.random.default_rng().integers(2**31)) if chosen is None else chosen
             start = start_of(self.backend, self.actions, seed=chosen, options=starts[number])
@@ -143,12 +144,13 @@ class WorldVectorEnv(VectorEnv):
             running.chunk(rows, prompt=prompt)
             for running, rows, prompt in zip(self.running, actions, texts, strict=True)
         ]
-        infos = list(self._threads.map(_advance, self.running, chunks))
-        results = []
-        for running, reward, info in zip(self.running, self._rewards, infos, strict=True):
-            assert running.last is not None
-            results.append(reward(Outcome(first=running.start.state, step=running.last)))
-            info["success"] = results[-1].success
+        steps, infos = zip(*self._threads.map(Running.advance, self.running, chunks), strict=True)
+        results = [
+            reward(Outcome(first=running.start.state, step=step))
+            for running, reward, step in zip(self.running, self._rewards, steps, strict=True)
+        ]
+        for info, result in zip(infos, results, strict=True):
+            info["success"] = result.success
         rewards = np.array([result.reward for result in results])
         terminated = np.array([result.terminated for result in results])
         chunks_done = np.array([running.chunks for running in self.running])
@@ -170,7 +172,3 @@ class WorldVectorEnv(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """End the threads."""
         self._threads.shutdown()
-
-
-def _advance(running: Running, chunk: Chunk) -> dict[str, Any]:
-    return running.advance(chunk)

@@ -10,9 +10,7 @@ from egosim_jax.types import InputError
 class RequestError(InputError):
     """Request that is refused: what happened, the rule, the value and the fix."""
 
-    def __init__(
-        self, status: int, code: str, message: str, *, retry_after_s: float | None = None
-    ):
+    def __init__(self, status: int, code: str, message: str, *, retry_after_s: float | None = None):
         super().__init__(message)
         self.status, self.code, self.retry_after_s = status, code, retry_after_s
 

@@ -9,14 +9,14 @@ SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128)
 
 
 class Metrics:
-    """Metrics in a registry of their own, so that one process may hold several servers."""
+    """Metrics in their own registry, so that one process may hold several servers."""
 
     def __init__(self) -> None:
         self.registry = registry = CollectorRegistry()
         self.sessions = Gauge("egosim_sessions", "Open sessions.", registry=registry)
         self.queued = Gauge("egosim_queue", "Requests that wait or run.", registry=registry)
         self.connections = Gauge("egosim_connections", "Open websockets.", registry=registry)
-        self.steps = Counter("egosim_steps", "Steps that were answered.", registry=registry)
+        self.steps = Counter("egosim_steps", "Steps whose results were sent.", registry=registry)
         self.refused = Counter(
             "egosim_refused", "Requests that were refused.", ["code"], registry=registry
         )

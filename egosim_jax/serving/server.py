@@ -189,9 +189,9 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
 
     for name, summary in {
         "step": "Make a step; a repeated step_id returns the result of the first time",
-        "reset": "Go on from a seed or episode",
+        "reset": "Continue from a seed or episode",
         "save": "Save where the session is under a name",
-        "load": "Go on from what was saved",
+        "load": "Continue from what was saved",
     }.items():
         _add(app, name, summary, call)
 
@@ -305,5 +305,3 @@ def serve(service: Service, *, host: str, port: int, token: str | None, ready: A
         await listening
 
     asyncio.run(run())
-
-

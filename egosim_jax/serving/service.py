@@ -1,4 +1,4 @@
-"""What the server does for a request, whatever it came by: a map in, a map out."""
+"""Requests of clients by websocket or HTTP: a map in, a map out."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from egosim_jax.env.actions import LAYOUTS
+from egosim_jax.env.chunks import view_of
 from egosim_jax.io.untrusted import quote
 from egosim_jax.serving.errors import RequestError, as_request_error
 from egosim_jax.serving.session import Result, Session, vars_of
@@ -42,7 +43,7 @@ class Service:
         self._quiet = threading.Condition()
 
     def describe(self) -> dict[str, Any]:
-        """Return what a client is told when it connects."""
+        """Return the description that a client gets when it connects."""
         video, limits = self.store.backend.video, self.store.limits
         return {
             "server": "egosim_jax",
@@ -124,7 +125,7 @@ class Service:
         }
 
     async def _wait(self, future: Future[T]) -> T:
-        """Return a result that may take a while; the request goes on if the client vanishes."""
+        """Return a result that may take a while; the request continues if the client vanishes."""
         timeout = self.store.limits.step_timeout_s
         waiting = asyncio.shield(asyncio.wrap_future(future))
         try:
@@ -134,7 +135,7 @@ class Service:
                 504,
                 "timeout",
                 f"The request has taken more than {timeout:g} s, the longest that a client waits: "
-                "it goes on. Ask for the status, or send the same step_id again.",
+                "it continues. Ask for the status, or send the same step_id again.",
                 retry_after_s=timeout,
             ) from None
 
@@ -159,7 +160,7 @@ class Service:
             found["state"] = {name: getattr(result.state, name) for name in names}
         if "depth" in observe:
             simulator = session.backend.simulator(session.now)
-            view = await self._thread(lambda: simulator.render(result.state, result.camera))
+            view = await self._thread(lambda: view_of(simulator, result.state, result.camera))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
 
@@ -185,10 +186,9 @@ def _parsed(message: Any) -> tuple[str, Mapping[str, Any]]:
 
 
 def _observe(names: Any) -> tuple[str, ...]:
-    texts = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
-    if not texts or (unknown := [name for name in names if name not in OBSERVATIONS]):
-        wrong = quote(unknown[0]) if texts else quote(names)
-        raise InputError(f"observe has {wrong}: choose from {', '.join(OBSERVATIONS)}.")
-    return tuple(names)
-
-
+    given = names if isinstance(names, list | tuple) else [names]
+    if unknown := [name for name in given if name not in OBSERVATIONS]:
+        raise InputError(
+            f"observe has {quote(unknown[0])}: it must be a list of {', '.join(OBSERVATIONS)}."
+        )
+    return tuple(given)

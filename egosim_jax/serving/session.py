@@ -28,7 +28,7 @@ from jaxtyping import UInt8
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import Backend
 from egosim_jax.env.batching import announced
-from egosim_jax.env.chunks import Chunk, last_camera, make_chunk, validity
+from egosim_jax.env.chunks import Chunk, last_camera, make_chunk, validity, view_of
 from egosim_jax.env.start import Start
 from egosim_jax.episode import Episode, check_action, load_action, save_action
 from egosim_jax.io.fingerprint import fingerprint
@@ -45,7 +45,7 @@ SETTINGS, INFO, REQUEST = "session.json", "info.json", "request.json"
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Where a session is, with the clip of its last step."""
+    """Position of a session: its last step with clip and state."""
 
     step_id: int
     """Committed steps of the session."""
@@ -58,7 +58,7 @@ class Result:
     camera: Cameras
     """Camera of the last frame."""
     info: Mapping[str, Any]
-    """What is known of the step."""
+    """Hash of the state, padded frames, validity and more of the step."""
 
 
 class Session:
@@ -81,9 +81,7 @@ class Session:
         self.now, self.result = self._where()
 
     @classmethod
-    def create(
-        cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start
-    ) -> Session:
+    def create(cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start) -> Session:
         """Write the folder of a new session and open it."""
         start.save(folder / "starts" / "0")
         write_json(folder / SETTINGS, {"actions": vars_of(actions), "seed": start.seed})
@@ -123,7 +121,7 @@ class Session:
         """Return the result of a reset: the first frame alone."""
         image = start.first_frame
         if image is None:
-            image = self.backend.simulator(start).render(start.state, start.camera).frames[0]
+            image = view_of(self.backend.simulator(start), start.state, start.camera).frames[0]
         return Result(
             step_id=self.committed,
             frames=image[None],
@@ -257,7 +255,7 @@ class Session:
         return self.result
 
     def restart(self, start: Start) -> Result:
-        """Go on from another start; step numbers continue."""
+        """Continue from another start; step numbers continue."""
         start.save(self.folder / "starts" / str(self.committed))
         self.now, self.result = start, self._opening(start)
         return self.result
@@ -267,7 +265,7 @@ class Session:
         self.now.save(self.folder / "saved" / name)
 
     def load(self, name: str) -> Result:
-        """Go on from a saved start. Raises `RequestError` if there is none of that name."""
+        """Continue from a saved start. Raises `RequestError` if there is none of that name."""
         folder = self.folder / "saved" / name
         if not folder.exists():
             known = sorted(path.name for path in (self.folder / "saved").glob("*"))
@@ -330,16 +328,12 @@ def spec_of(fields: Mapping[str, Any]) -> ActionSpec:
             "The actions need sides, a list of 'left' and 'right', camera, true or false, "
             "workspace_m, two corners of three numbers in meters, and camera_reach, two numbers."
         )
-    if not isinstance(given["layout"], str):
-        raise InputError(f"The layout of the actions is {quote(given['layout'])}, not a text.")
-    low, high = (tuple(map(float, corner)) for corner in corners)
-    return ActionSpec(
-        layout=given["layout"],
-        sides=tuple(given["sides"]),
-        camera=given["camera"],
-        workspace_m=(low, high),
-        camera_reach=tuple(map(float, reach)),
-    )
+    numbers: Any = {
+        "workspace_m": tuple(tuple(map(float, corner)) for corner in corners),
+        "camera_reach": tuple(map(float, reach)),
+    }
+    layout: Any = given["layout"]
+    return ActionSpec(layout=layout, sides=tuple(given["sides"]), camera=given["camera"], **numbers)
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:

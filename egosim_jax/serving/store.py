@@ -45,7 +45,7 @@ class Limits:
     saved: int = 100
     """Most starts that a session saves."""
     step_timeout_s: float = 120.0
-    """Longest time that a request waits for its step, which goes on without it."""
+    """Longest time that a request waits for its step, which continues without it."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` unless all are positive."""

@@ -25,7 +25,7 @@ def pack(value: Any) -> bytes:
     """Return the bytes of a message."""
     import msgpack
 
-    return msgpack.packb(value, default=_packed)
+    return bytes(msgpack.Packer(default=_packed).pack(value))
 
 
 def unpack(data: bytes, *, limit: int | None = None) -> Any:

@@ -1,0 +1,122 @@
+"""Client of a server of sessions, over its websocket. Needs no jax.
+
+with Client("ws://127.0.0.1:8000") as client:
+    session = client.create(seed=3)
+    reply = session.step(rows)          # {"frames": ..., "row": ..., "info": ...}
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.serving import wire
+from egosim_jax.serving.errors import RequestError
+
+
+class Client:
+    """Connection to a server, for one thread."""
+
+    def __init__(self, address: str, *, token: str | None = None, timeout_s: float = 600.0):
+        """Connect to an address such as ws://127.0.0.1:8000."""
+        import websockets.sync.client
+
+        self._timeout_s = timeout_s
+        headers = {"Authorization": f"Bearer {token}"} if token else None
+        self._socket = websockets.sync.client.connect(
+            address.replace("http", "ws", 1) if address.startswith("http") else address,
+            compression=None,
+            max_size=None,
+            additional_headers=headers,
+            ping_timeout=None,
+        )
+        self.server: dict[str, Any] = wire.unpack(self._received())
+        """Description of the server: world, size and rate of clips, limits."""
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; the sessions stay."""
+        self._socket.close()
+
+    def _received(self) -> bytes:
+        reply = self._socket.recv(timeout=self._timeout_s)
+        if isinstance(reply, bytes):
+            return reply
+        error = json.loads(reply)
+        raise RequestError(
+            error["status"],
+            error["code"],
+            error["message"],
+            retry_after_s=error.get("retry_after_s"),
+        )
+
+    def request(self, kind: str, /, **fields: Any) -> dict[str, Any]:
+        """Return the reply to a request. Raises `RequestError` with the server's message."""
+        self._socket.send(wire.pack({"request": kind, **fields}))
+        return wire.unpack(self._received())
+
+    def create(self, **fields: Any) -> RemoteSession:
+        """Create a session of a `seed` or `episode`."""
+        return RemoteSession(self, self.request("create", **fields))
+
+    def attach(self, session: str) -> RemoteSession:
+        """Continue a session by its id, from any client."""
+        status = self.request("status", session=session)
+        return RemoteSession(self, {**status, "step_id": status["committed_step_id"]})
+
+
+class RemoteSession:
+    """Session on a server."""
+
+    def __init__(self, client: Client, reply: dict[str, Any]):
+        self._client, self.id = client, reply["session"]
+        self.reply = reply
+        """Reply to the request that created or attached it."""
+        self.step_id: int = reply["step_id"]
+        """Last committed step."""
+
+    def step(self, rows: np.ndarray, *, patience_s: float = 600.0, **fields: Any) -> dict[str, Any]:
+        """Make the next step; wait for `patience_s` while the server is full or busy."""
+        until = time.monotonic() + patience_s
+        rows = np.asarray(rows, float)
+        while True:
+            try:
+                reply = self._client.request(
+                    "step", session=self.id, step_id=self.step_id + 1, actions=rows, **fields
+                )
+            except RequestError as error:
+                wait = error.retry_after_s
+                if wait is None or error.status == 503 or time.monotonic() + wait > until:
+                    raise
+                time.sleep(wait)
+                continue
+            self.step_id = reply["step_id"]
+            return reply
+
+    def reset(self, **fields: Any) -> dict[str, Any]:
+        """Continue from a `seed` or `episode`; without one from the first start."""
+        return self._client.request("reset", session=self.id, **fields)
+
+    def save(self, name: str) -> None:
+        """Save where the session is under a name."""
+        self._client.request("save", session=self.id, name=name)
+
+    def load(self, name: str) -> dict[str, Any]:
+        """Continue from what was saved under a name."""
+        return self._client.request("load", session=self.id, name=name)
+
+    def status(self) -> dict[str, Any]:
+        """Return committed step, hash of the state and saved names."""
+        return self._client.request("status", session=self.id)
+
+    def close(self, *, keep: bool = False) -> None:
+        """End the session and remove its files on the server, unless `keep` is set."""
+        self._client.request("close", session=self.id, keep=keep)

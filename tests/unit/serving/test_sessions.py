@@ -1,0 +1,177 @@
+"""Sessions of a painted world: journaled, resumed, never disturbed by each other."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from egosim_jax.serving.errors import RequestError
+from egosim_jax.serving.metrics import Metrics
+from egosim_jax.serving.session import Session
+from egosim_jax.serving.store import Limits, Store
+from egosim_jax.types import InputError
+from tests.unit.env.worlds import painted
+
+
+@pytest.fixture
+def store(tmp_path):
+    opened = Store(tmp_path / "sessions", painted(), Limits(), Metrics())
+    yield opened
+    opened.close()
+
+
+def rows(session, step=1):
+    return session.actions.rest + step * 0.02 * np.eye(7)[1][None]
+
+
+def step(store, session, number, actions=None):
+    actions = rows(session, number) if actions is None else actions
+    request = {"session": session.id, "step_id": number, "actions": actions}
+    return store.step(request).result()
+
+
+def hashes(results):
+    return [result.info["state_sha256"] for result in results]
+
+
+def test_a_repeated_step_returns_the_same_result(store):
+    session = store.create({"seed": 3})
+    first = step(store, session, 1)
+    second = step(store, session, 2)
+    for known in (first, second):
+        again = step(store, session, known.step_id)
+        np.testing.assert_array_equal(again.frames, known.frames)
+        assert again.info == known.info
+    assert session.committed == 2
+
+
+@pytest.mark.parametrize(("number", "code"), [(3, "step_out_of_order"), (1, "step_used")])
+def test_a_step_out_of_order_or_of_another_action_is_refused(store, number, code):
+    session = store.create({"seed": 3})
+    step(store, session, 1)
+    with pytest.raises(RequestError) as refused:
+        step(store, session, number, rows(session, 9))
+    assert (refused.value.status, refused.value.code) == (409, code)
+    assert step(store, session, 2).step_id == 2
+
+
+def test_a_failed_step_leaves_the_session_where_it_was(store, monkeypatch):
+    session = store.create({"seed": 3})
+    first = step(store, session, 1)
+
+    def fail(*_):
+        raise FloatingPointError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(store.backend.generator), "__call__", fail)
+        with pytest.raises(RequestError, match="not finite"):
+            step(store, session, 2)
+    assert not (session.folder / "steps" / "2").exists()
+    assert session.result == first
+    assert step(store, session, 2, rows(session, 5)).step_id == 2
+
+
+def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
+    session = store.create({"seed": 3, "session": "one"})
+    wanted = [step(store, session, number) for number in (1, 2, 3)]
+    store.close()
+    copy = tmp_path / "copy"
+    shutil.copytree(store.folder, copy)
+    last = copy / "one" / "steps" / "3"
+    (last / "info.json").unlink()
+    shutil.rmtree(last / "rollout")
+    again = Store(copy, painted(), Limits(), Metrics())
+    found = again.sessions["one"]
+    result = step(again, found, 3)
+    assert hashes([result]) == hashes(wanted[2:])
+    np.testing.assert_array_equal(result.frames, wanted[2].frames)
+    assert step(again, found, 4).step_id == 4
+    again.close()
+
+
+def test_a_reset_and_a_load_continue_the_step_numbers(store):
+    session = store.create({"seed": 3})
+    first = step(store, session, 1)
+    store.save({"session": session.id, "name": "here"}).result()
+    step(store, session, 2)
+    loaded = store.load({"session": session.id, "name": "here"}).result()
+    assert (loaded.step_id, loaded.info["state_sha256"]) == (2, first.info["state_sha256"])
+    third = step(store, session, 3, rows(session, 2))
+    assert np.array_equal(third.frames, step(store, session, 2).frames)
+    reset = store.reset({"session": session.id, "seed": 4}).result()
+    assert reset.step_id == 3
+    reopened = Session(session.folder, store.backend)
+    assert reopened.now.seed == 4
+    assert reopened.result.info == reset.info
+
+
+def test_an_episode_of_a_session_can_be_simulated_again(store):
+    session = store.create({"seed": 3})
+    for number in (1, 2):
+        step(store, session, number)
+    episode = session.episode()
+    assert len(episode.actions) == 2
+    created = store.create({"seed": 3, "episode": episode.to_bytes()})
+    assert created.result.info["state_sha256"] == session.result.info["state_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"session": "../x"}, "letters, digits"),
+        ({"seed": -1}, "whole number"),
+        ({"seed": "7"}, "whole number"),
+        ({"actions": {"layout": "feet"}}, "no action layout"),
+        ({"actions": {"fingers": 5}}, "no setting 'fingers'"),
+        ({"actions": {"workspace_m": [[0, 0, 0], [0, 0, "x"]]}}, "workspace_m"),
+        ({"episode": b"PK"}, "not a readable zip"),
+        ({"prompt": 5}, "must be a text"),
+    ],
+)
+def test_an_invalid_session_is_refused_and_not_made(store, request_, message):
+    with pytest.raises(InputError, match=message):
+        store.create(request_)
+    assert not store.sessions
+    assert [path.name for path in store.folder.iterdir()] == [".lock"]
+
+
+def test_limits_are_kept(tmp_path):
+    limits = Limits(sessions=1, queue=1, steps=2)
+    store = Store(tmp_path, painted(), limits, Metrics())
+    session = store.create({})
+    with pytest.raises(RequestError, match="Close one"):
+        store.create({})
+    with pytest.raises(RequestError, match="more than a session's 2"):
+        step(store, session, 3)
+    session.busy.acquire()
+    with pytest.raises(RequestError, match="one at a time"):
+        step(store, session, 1)
+    session.busy.release()
+    store.draining = True
+    with pytest.raises(RequestError, match="shutting down"):
+        step(store, session, 1)
+    store.close()
+
+
+def test_a_second_store_of_a_folder_is_refused(store):
+    import subprocess
+    import sys
+
+    code = "import sys; from pathlib import Path; from egosim_jax.io.atomic import lock_folder\n"
+    code += "with lock_folder(Path(sys.argv[1])): pass"
+    command = [sys.executable, "-c", code, str(store.folder)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "is in use by another process" in found.stderr
+
+
+def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):
+    for name in ("good", "bad"):
+        step(store, store.create({"session": name}), 1)
+    store.close()
+    (store.folder / "bad" / "starts" / "0" / "start.json").write_text("{")
+    (store.folder / "bad" / "steps" / "1" / "info.json").unlink()
+    again = Store(store.folder, painted(), Limits(), Metrics())
+    assert set(again.sessions) == {"good"}
+    with pytest.raises(RequestError, match="could not be resumed"):
+        again.get("bad")
+    again.close()
