@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, no_type_check
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ REST = (0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25)
 """Row of a right hand at rest: position in meters, rotation vector in radians, closure."""
 
 
+@no_type_check
 @dataclass(frozen=True, kw_only=True)
 class ActionSpec:
     """Meaning and bounds of the rows of an action."""
