@@ -26,13 +26,14 @@ class Client:
 
         self._timeout_s = timeout_s
         headers = {"Authorization": f"Bearer {token}"} if token else None
-        self._socket = websockets.sync.client.connect(
+        self._connection = websockets.sync.client.connect(
             address.replace("http", "ws", 1) if address.startswith("http") else address,
             compression=None,
             max_size=None,
             additional_headers=headers,
             ping_timeout=None,
         )
+        self._socket = self._connection.__enter__()
         self.server: dict[str, Any] = wire.unpack(self._received())
         """Description of the server: world, size and rate of clips, limits."""
 
@@ -44,7 +45,7 @@ class Client:
 
     def close(self) -> None:
         """Disconnect; the sessions stay."""
-        self._socket.close()
+        self._connection.__exit__(None, None, None)
 
     def _received(self) -> bytes:
         reply = self._socket.recv(timeout=self._timeout_s)

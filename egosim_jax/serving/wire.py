@@ -17,6 +17,8 @@ from egosim_jax.types import InputError
 
 MAX_BYTES = 16 << 20
 """Largest message from a client in bytes."""
+LISTED = 512
+"""Most numbers of an array that JSON has as a list."""
 MAX_DEPTH = 16
 """Deepest nesting of a message."""
 
@@ -127,7 +129,12 @@ def _check_depth(value: Any) -> None:
 
 
 def to_json(value: Any) -> Any:
-    """Return a value with arrays as maps of dtype, shape and Base64 data, and NaN as null."""
+    """Return a value for JSON: short arrays as lists, others as dtype, shape and Base64 data.
+
+    NaN and infinity are null.
+    """
+    if isinstance(value, np.ndarray) and value.size <= LISTED:
+        return to_json(value.tolist())
     if isinstance(value, np.ndarray):
         data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
         return {"dtype": value.dtype.str, "shape": list(value.shape), "base64": data}

@@ -10,7 +10,7 @@ from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.session import Session
 from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
-from tests.unit.env.worlds import painted
+from tests.painted import painted
 
 
 @pytest.fixture

@@ -1,0 +1,99 @@
+"""Fuzzing target: messages of clients to a server of sessions."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.serving import wire
+from egosim_jax.serving.errors import RequestError
+from egosim_jax.types import InputError
+from tests.fuzz.target import Target
+from tests.fuzz.targets_run import json_value
+
+SESSION, WATCH = "fuzzed", "watched"
+
+
+@functools.cache
+def _service() -> Any:
+    """Service of a painted world with a session that no message names."""
+    from egosim_jax.serving.metrics import Metrics
+    from egosim_jax.serving.service import Service
+    from egosim_jax.serving.store import Limits, Store
+    from tests.painted import painted
+
+    folder = Path(tempfile.mkdtemp())
+    service = Service(Store(folder, painted(), Limits(), Metrics()), world="painted")
+    watched = service.store.create({"session": WATCH, "seed": 3})
+    rows = watched.actions.rest[None]
+    service.store.step({"session": WATCH, "step_id": 1, "actions": rows}).result()
+    return service
+
+
+def _messages() -> dict[str, dict[str, Any]]:
+    rows = np.tile([0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25], (4, 1))
+    own = {"session": SESSION, "observe": ["frames", "depth", "keypoints", "state"]}
+    return {
+        "create": {"request": "create", "seed": 7, "actions": {"layout": "gripper"}, "prompt": "x"},
+        "step": {"request": "step", "step_id": 1, "actions": rows, **own},
+        "json_step": {"request": "step", "step_id": 1, "actions": rows.tolist(), **own},
+        "reset": {"request": "reset", "seed": 3, **own},
+        "save": {"request": "save", "session": SESSION, "name": "a"},
+        "load": {"request": "load", "session": SESSION, "name": "a"},
+        "close": {"request": "close", "session": SESSION, "keep": False},
+        "status": {"request": "status", "session": SESSION},
+    }
+
+
+def _make(folder: Path) -> None:
+    for name, message in _messages().items():
+        (folder / f"{name}.bin").write_bytes(wire.pack(message))
+
+
+def _read(folder: Path) -> Any:
+    """Send all messages; the session that they name is there again before each of them."""
+    names = []
+    for name in _messages():
+        data = (folder / f"{name}.bin").read_bytes()
+        if data == wire.pack(_messages()[name]) and name != "status":
+            continue  # only what was changed, so that a case is one message
+        names.append(_send(data))
+    return names
+
+
+def _send(data: bytes) -> str:
+    service = _service()
+    store = service.store
+    if SESSION not in store.sessions:
+        store.create({"session": SESSION, "seed": 3})
+    try:
+        reply = asyncio.run(service.handle(wire.unpack(data, limit=wire.MAX_BYTES)))
+        wire.pack(reply)
+    except RequestError as error:
+        if error.code == "internal":
+            raise (error.__cause__ or error) from None
+        raise InputError(str(error)) from None
+    finally:
+        watched = store.sessions[WATCH]
+        assert watched.committed == 1
+        assert not watched.busy.locked()
+        for name in set(store.sessions) - {SESSION, WATCH}:
+            store.remove({"session": name}).result()
+    return "done"
+
+
+TARGETS = [
+    Target(
+        name="message",
+        make=_make,
+        read=_read,
+        files=("*.bin",),
+        lossy="a changed message may be another valid one",
+        mutations=(json_value,),
+    )
+]

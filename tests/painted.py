@@ -1,0 +1,67 @@
+"""A small world whose clips are its views with the hands painted over them, and a server of it.
+
+    python -m tests.painted FOLDER [--pause S]
+
+serves it on a free port and prints the address.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egosim_jax.env.backends import GeneratedWorld
+from egosim_jax.rendering import reference
+from egosim_jax.types import VideoSpec
+
+VIDEO = VideoSpec(frames=5, height=24, width=40, fps=8)
+
+
+@dataclass(frozen=True)
+class Painter:
+    """Generator that paints the hands over the view, and a little noise of the seed."""
+
+    pause: float = 0.0
+    renderer = reference
+
+    def __call__(self, view, action, first_frame, seed):
+        time.sleep(self.pause)
+        hands, depth = reference.draw_hands(action.joints_m, action.cameras, kind=action.kind)
+        frames = np.where((depth < view.depth_m)[..., None], hands, view.frames).astype(float)
+        noise = np.random.default_rng(seed).normal(0, 2, frames.shape)
+        return np.clip(np.rint(frames + noise), 0, 255).astype(np.uint8)
+
+    def fingerprint(self):
+        return "painter"
+
+
+def painted(perception=None, pause=0.0):
+    """World of the painter, by default without perception, which takes longest."""
+    return GeneratedWorld(generator=Painter(pause), video=VIDEO, perception=perception)
+
+
+def main():
+    """Serve the painted world with perception."""
+    from egosim_jax.serving.metrics import Metrics
+    from egosim_jax.serving.server import serve
+    from egosim_jax.serving.service import Service
+    from egosim_jax.serving.store import Limits, Store
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--pause", type=float, default=0.0)
+    given = parser.parse_args()
+    backend = painted("classical", given.pause)
+    service = Service(Store(given.folder, backend, Limits(), Metrics()), world="painted")
+
+    def ready(port):
+        print(f"http://127.0.0.1:{port}", flush=True)
+
+    serve(service, host="127.0.0.1", port=0, token=None, ready=ready)
+    service.store.close()
+
+
+if __name__ == "__main__":
+    main()

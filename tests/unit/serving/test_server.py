@@ -1,0 +1,189 @@
+"""The server over its sockets, in this process."""
+
+import http.client as http_client
+import json
+import threading
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+import websockets.sync.client
+
+from egosim_jax.serving import wire
+from egosim_jax.serving.client import Client
+from egosim_jax.serving.errors import RequestError
+from egosim_jax.serving.metrics import Metrics
+from egosim_jax.serving.server import _Server, serve
+from egosim_jax.serving.service import Service
+from egosim_jax.serving.store import Limits, Store
+from egosim_jax.types import InputError
+from tests.painted import painted
+
+TOKEN = "secret"  # noqa: S105
+
+
+def run(folder, token=None):
+    """A service, its port, and the thread that serves it."""
+    service = Service(Store(folder, painted(), Limits(), Metrics()), world="painted")
+    ports, ready = [], threading.Event()
+
+    def note(port):
+        ports.append(port)
+        ready.set()
+
+    options = {"host": "127.0.0.1", "port": 0, "token": token, "ready": note}
+    thread = threading.Thread(target=serve, args=(service,), kwargs=options, daemon=True)
+    thread.start()
+    assert ready.wait(30)
+    return service, ports[0], thread
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    service, port, _ = run(tmp_path_factory.mktemp("sessions"))
+    yield service, port
+    service.store.close()
+
+
+def http(port, path, fields=None, method=None, **headers):
+    data = None if fields is None else json.dumps(fields).encode()
+    headers = {"Content-Type": "application/json", **headers}
+    request = urllib.request.Request(
+        f"http://127.0.0.1:{port}{path}", data=data, headers=headers, method=method
+    )
+    try:
+        with urllib.request.urlopen(request, timeout=60) as reply:  # noqa: S310 - of this machine
+            return reply.status, reply.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read()
+
+
+def test_two_clients_step_their_sessions_and_one_continues_the_others(server):
+    _, port = server
+    with Client(f"ws://127.0.0.1:{port}") as a, Client(f"ws://127.0.0.1:{port}") as b:
+        assert a.server["rows"] == 4
+        one, two = a.create(seed=3), b.create(seed=3)
+        rows = np.tile(one.reply["row"], (4, 1))
+        replies = [session.step(rows, observe=["frames", "depth"]) for session in (one, two)]
+        np.testing.assert_array_equal(replies[0]["frames"], replies[1]["frames"])
+        assert replies[0]["depth"].shape == replies[0]["frames"].shape[1:3]
+        same = b.attach(one.id)
+        assert same.step(rows)["step_id"] == 2
+        with pytest.raises(RequestError, match="made with another action"):
+            one.step(rows + 0.01)
+        assert one.status()["committed_step_id"] == 2
+        one.close()
+        with pytest.raises(RequestError, match="no session"):
+            same.status()
+
+
+def test_a_client_that_vanishes_loses_nothing(server):
+    _, port = server
+    client = Client(f"ws://127.0.0.1:{port}")
+    session = client.create(seed=3)
+    rows = np.tile(session.reply["row"], (4, 1))
+    fields = {"session": session.id, "step_id": 1, "actions": rows}
+    client._socket.send(wire.pack({"request": "step", **fields}))
+    client.close()
+    with Client(f"ws://127.0.0.1:{port}") as again:
+        assert again.attach(session.id).step_id in (0, 1)
+        found = again.attach(session.id)
+        found.step_id = 0
+        assert found.step(rows)["step_id"] == 1
+
+
+def test_http_has_the_same_requests(server):
+    _, port = server
+    status, body = http(port, "/sessions", {"seed": 3})
+    session = json.loads(body)
+    assert status == 200
+    rows = [session["row"]]
+    path = f"/sessions/{session['session']}"
+    _, body = http(port, f"{path}/step", {"step_id": 1, "actions": rows, "observe": ["frames"]})
+    assert json.loads(body)["frames"]["shape"] == [5, 24, 40, 3]
+    status, body = http(port, f"{path}/step", {"step_id": 9, "actions": rows})
+    assert (status, json.loads(body)["code"]) == (409, "step_out_of_order")
+    assert http(port, f"{path}/save", {"name": "a"})[0] == 200
+    assert json.loads(http(port, path)[1])["saved"] == ["a"]
+    assert http(port, path, method="DELETE")[0] == 200
+    assert http(port, path)[0] == 404
+    paths = json.loads(http(port, "/openapi.json")[1])["paths"]
+    assert "/sessions/{session}/step" in paths
+
+
+def test_health_and_metrics(server):
+    _, port = server
+    assert http(port, "/healthz") == (200, b"OK\n")
+    assert http(port, "/readyz")[0] == 200
+    assert b"egosim_sessions" in http(port, "/metrics")[1]
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [({"Origin": "http://evil.example"}, 403), ({"Host": "evil.example"}, 403)],
+)
+def test_pages_of_other_origins_are_refused(server, headers, status):
+    _, port = server
+    assert http(port, "/sessions", **headers)[0] == status
+    address = f"ws://127.0.0.1:{port}"
+    with (
+        pytest.raises(websockets.exceptions.InvalidStatus),
+        websockets.sync.client.connect(address, additional_headers=headers),
+    ):
+        pass
+
+
+def test_a_body_too_large_or_no_json_is_refused(server):
+    _, port = server
+    connection = http_client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.putrequest("POST", "/sessions")
+    connection.putheader("Content-Length", str(wire.MAX_BYTES + 1))
+    connection.endheaders()
+    with connection.getresponse() as reply:
+        assert (reply.status, json.loads(reply.read())["code"]) == (413, "too_large")
+    connection.close()
+    assert http(port, "/sessions", [1])[0] == 422
+
+
+def test_text_and_damaged_messages_are_refused_and_the_connection_stays(server):
+    _, port = server
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        for data in ("text", b"\xc1", wire.pack([1]), wire.pack({"request": "fly"})):
+            client._socket.send(data)
+            assert json.loads(client._socket.recv())["status"] == 422
+        with pytest.raises(RequestError, match="no field 'seeds'"):
+            client.request("create", seeds=3)
+        assert client.request("status")["draining"] is False
+
+
+def test_a_token_is_asked_for(tmp_path):
+    service, port, _ = run(tmp_path, token=TOKEN)
+    assert http(port, "/healthz")[0] == 200
+    assert http(port, "/sessions")[0] == 401
+    assert http(port, "/sessions", Authorization="Bearer wrong")[0] == 401
+    assert http(port, "/sessions", Authorization=f"Api-Key {TOKEN}")[0] == 200
+    with Client(f"ws://127.0.0.1:{port}", token=TOKEN) as client:
+        assert client.request("status")["sessions"] == {}
+    service.store.close()
+
+
+def test_another_address_needs_a_token(server):
+    with pytest.raises(InputError, match="needs a token"):
+        serve(server[0], host="0.0.0.0", port=0, token=None)  # noqa: S104
+
+
+def test_sigterm_drains_then_ends(tmp_path):
+    import uvicorn
+
+    service = Service(Store(tmp_path, painted(), Limits(), Metrics()), world="painted")
+    server = _Server(uvicorn.Config(lambda: None), service)
+    server.handle_exit(15, None)
+    for _ in range(100):
+        if server.should_exit:
+            break
+        threading.Event().wait(0.05)
+    assert server.should_exit
+    assert service.store.draining
+    service.store.close()
