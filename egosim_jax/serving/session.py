@@ -78,6 +78,7 @@ class Session:
         steps = [int(p.name) for p in (folder / "steps").glob("[0-9]*")]
         self.committed = max((n for n in steps if self._is_committed(n)), default=0)
         self.pending = self.committed + 1 in steps and self._is_accepted(self.committed + 1)
+        self._made: Result | None = None
         self.now, self.result = self._where()
 
     @classmethod
@@ -203,7 +204,8 @@ class Session:
             )
         if step_id > self.committed:
             return self.finish()
-        return self.result if step_id == self.result.step_id else self.repeat(step_id)
+        made = self._made
+        return made if made is not None and made.step_id == step_id else self.repeat(step_id)
 
     def _accept(self, number: int, chunk: Chunk, request: str) -> None:
         folder = self._step(number)
@@ -244,7 +246,7 @@ class Session:
         row = np.array(request["row"], float)
         self.committed, self.pending = number, False
         self.now = now.after(step.state, row, action if self.backend.needs_past else None)
-        self.result = Result(
+        self.result = self._made = Result(
             step_id=number,
             frames=step.clip.frames,
             state=step.state,

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -175,10 +176,14 @@ class Store:
             raise InputError("The step has no actions: give rows of numbers.")
         rows = request["actions"]
         flight = session.flight
-        if flight is not None and flight[0] == (step_id, request_hash(rows, prompt)):
+        key = step_id, request_hash(rows, prompt)
+        if flight is not None and flight[0] == key and not flight[1].done():
             return flight[1]  # a client that vanished and came back waits for its step
-        future = self.submit(session, lambda: session.step(step_id, rows, prompt))
-        session.flight = (step_id, request_hash(rows, prompt)), future
+        run = partial(session.step, step_id, rows, prompt)
+        if step_id <= session.committed:
+            return self.submit(session, run, exclusive=False)
+        future = self.submit(session, run)
+        session.flight = key, future
         return future
 
     def reset(self, request: Mapping[str, Any]) -> Future[Result]:
@@ -234,8 +239,13 @@ class Store:
 
         return self.submit(session, run)
 
-    def submit(self, session: Session, run: Callable[[], T]) -> Future[T]:
-        """Run a request of a session in a thread; refuse it if the queue or session is full."""
+    def submit(
+        self, session: Session, run: Callable[[], T], *, exclusive: bool = True
+    ) -> Future[T]:
+        """Run a request of a session in a thread; refuse it if the queue is full.
+
+        Of the `exclusive` ones, which change the session, another one must not be under way.
+        """
         self._check_open()
         with self._changing:
             if self._queued >= self.limits.queue:
@@ -247,7 +257,7 @@ class Store:
                     f"{self.limits.queue}. Send it again later.",
                     retry_after_s=1.0,
                 )
-            if not session.busy.acquire(blocking=False):
+            if exclusive and not session.busy.acquire(blocking=False):
                 self.metrics.refused.labels("session_busy").inc()
                 raise RequestError(
                     409,
@@ -258,9 +268,9 @@ class Store:
                 )
             self._queued += 1
             self.metrics.queued.set(self._queued)
-        return self._threads.submit(self._run, session, run)
+        return self._threads.submit(self._run, session, run, exclusive)
 
-    def _run(self, session: Session, run: Callable[[], T]) -> T:
+    def _run(self, session: Session, run: Callable[[], T], exclusive: bool) -> T:
         then = time.monotonic()
         try:
             return run()
@@ -271,8 +281,9 @@ class Store:
             self.metrics.refused.labels(found.code).inc()
             raise found from error
         finally:
-            session.flight = None
-            session.busy.release()
+            if exclusive:
+                session.flight = None
+                session.busy.release()
             with self._changing:
                 self._queued -= 1
                 self.metrics.queued.set(self._queued)

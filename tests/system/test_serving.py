@@ -1,0 +1,151 @@
+"""A killed server resumes its sessions; clients go on, also OpenPI's from its own environment.
+
+    python -m venv openpi && openpi/bin/pip install openpi-client typing_extensions
+    OPENPI_PYTHON=openpi/bin/python pytest -m slow tests/system/test_serving.py
+
+The same with the model that comes with the package, printed step by step:
+
+    OPENPI_PYTHON=openpi/bin/python python -m tests.system.test_serving FOLDER
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+STEPS = 4
+NEEDS_OPENPI = pytest.mark.skipif("OPENPI_PYTHON" not in os.environ, reason="no OPENPI_PYTHON")
+
+OURS = """
+import sys
+from egosim_jax.serving.client import Client
+def connect(port):
+    client = Client(f"ws://127.0.0.1:{port}")
+    return lambda name, **fields: client.request(name, **fields), client.server
+"""
+OPENPI = """
+import sys
+from openpi_client.websocket_client_policy import WebsocketClientPolicy
+def connect(port):
+    policy = WebsocketClientPolicy("127.0.0.1", port)
+    ask = lambda name, **fields: policy.infer({"request": name, **fields})
+    return ask, policy.get_server_metadata()
+"""
+DRIVE = """
+import json, numpy as np
+port, session, seed, steps = int(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+ask, server = connect(port)
+if session not in ask("status")["sessions"]:
+    ask("create", session=session, seed=seed)
+row = np.array([0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25])
+path = np.linspace(0, 0.03, server["rows"])[:, None] * np.eye(7)[1]
+for number in range(1, steps + 1):
+    rows = row + path + 0.03 * (number - 1) * np.eye(7)[1]
+    reply = ask("step", session=session, step_id=number, actions=rows)
+    state, frames = reply["info"]["state_sha256"], int(reply["frames"].sum())
+    print(json.dumps([number, state, frames]), flush=True)
+"""
+
+
+class Server:
+    """A server in a process, and the port it listens on."""
+
+    def __init__(self, folder, command):
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", *command, str(folder)],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=environment,
+        )
+        self.port = self.process.stdout.readline().strip().rpartition(":")[2]
+        assert self.port, "the server does not start"
+
+    def end(self, number):
+        self.process.send_signal(number)
+        code = self.process.wait(120)
+        self.process.stdout.close()
+        return code
+
+
+def client(kind, port, session, seed):
+    """A process that makes all steps of a session; steps that were made before are repeated."""
+    python = os.environ["OPENPI_PYTHON"] if kind is OPENPI else sys.executable
+    command = [python, "-c", kind + DRIVE, port, session, str(seed), str(STEPS)]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=ROOT
+    )
+
+
+def lines(process, found):
+    """Collect a client's lines as they come."""
+    with process:
+        for line in process.stdout:
+            found.append(json.loads(line))
+            print(found[-1], flush=True)
+
+
+def drive(kind, port, *, until=None):
+    """Run two clients at once until they end, or until one has made some steps."""
+    clients = [client(kind, port, name, seed) for name, seed in (("a", 3), ("b", 4))]
+    found = [[], []]
+    threads = [
+        threading.Thread(target=lines, args=pair) for pair in zip(clients, found, strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    if until is not None:
+        while max(map(len, found)) < until and any(p.poll() is None for p in clients):
+            time.sleep(0.01)
+        return clients, threads, found
+    for thread in threads:
+        thread.join()
+    return clients, threads, found
+
+
+def kill_and_continue(kind, command, folder):
+    """Kill the server in mid step, go on; the same without a kill; the steps of both."""
+    server = Server(folder / "killed", command)
+    clients, threads, before = drive(kind, server.port, until=2)
+    time.sleep(0.3)
+    server.end(signal.SIGKILL)
+    for process, thread in zip(clients, threads, strict=True):
+        process.wait(60)
+        thread.join()
+    journals = list((folder / "killed").glob("*/steps/*/info.json"))
+    print(f"killed with {len(journals)} committed steps", flush=True)
+    server = Server(folder / "killed", command)
+    after = drive(kind, server.port)[2]
+    assert server.end(signal.SIGTERM) == 0
+    server = Server(folder / "straight", command)
+    straight = drive(kind, server.port)[2]
+    assert server.end(signal.SIGTERM) == 0
+    return before, after, straight
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [OURS, pytest.param(OPENPI, marks=NEEDS_OPENPI)], ids=len)
+def test_clients_continue_after_a_kill_to_the_same_states(tmp_path, kind):
+    command = ["tests.painted", "--pause", "0.5"]
+    before, after, straight = kill_and_continue(kind, command, tmp_path)
+    assert after == straight
+    assert [len(steps) for steps in straight] == [STEPS, STEPS]
+    assert max(map(len, before)) < STEPS
+    for some, all_ in zip(before, straight, strict=True):
+        assert some == all_[: len(some)]
+
+
+if __name__ == "__main__":
+    batch = sys.argv[2:] or ["1"]
+    served = ["egosim_jax.cli", "serve", "--port", "0", "--batch", *batch, "--out"]
+    kinds = OPENPI if "OPENPI_PYTHON" in os.environ else OURS
+    results = kill_and_continue(kinds, served, Path(sys.argv[1]))
+    print("equal to the byte" if results[1] == results[2] else f"DIFFERENT: {results}")
