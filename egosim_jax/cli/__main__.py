@@ -24,6 +24,7 @@ from egosim_jax.cli.models import Models
 from egosim_jax.cli.preflight import Preflight
 from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
+from egosim_jax.cli.table import TableCommand
 from egosim_jax.cli.view import View
 
 Commands = (
@@ -34,6 +35,7 @@ Commands = (
     | Annotated[Serve, tyro.conf.subcommand("serve")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[TableCommand, tyro.conf.subcommand("table")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Models, tyro.conf.subcommand("models")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]

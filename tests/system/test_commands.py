@@ -218,7 +218,7 @@ def test_without_metadata_a_scene_is_drawn_by_seed(tmp_path):
 def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
     weights, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(lpips, "alex_if_installed", lambda: None)  # slow in the tests' code
+    monkeypatch.setattr(lpips, "load_if_installed", lambda name: None)  # slow in the tests' code
     out = tmp_path / "out"
     fixed = ["--steps", "2", "--config", "debug", "--weights", str(weights), "--out", str(out)]
     counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2"]

@@ -30,7 +30,7 @@ def network(monkeypatch):
     stage = (lpips.Convolution(features=4),)
     alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
     found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
-    monkeypatch.setattr(lpips, "alex_if_installed", lambda: found)
+    monkeypatch.setattr(lpips, "load_if_installed", lambda name: found)
     return found
 
 
@@ -44,7 +44,7 @@ def metrics(folder):
 
 
 def test_a_clip_is_compared_with_its_ground_truth_from_frame_1_on(clips, run):
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.DONE
     generated, reference = read_video(run / "clip1.mp4").frames, target_of(clips, "clip1")
     scores = metrics(run)["clip1"]
     assert scores["generated"]["psnr"] == pytest.approx(psnr(generated, reference)[1:].mean())
@@ -53,7 +53,7 @@ def test_a_clip_is_compared_with_its_ground_truth_from_frame_1_on(clips, run):
 
 
 def test_lpips_is_a_column_with_its_protocol(clips, run, network, capsys):
-    Evaluate(generated=run, metadata=clips).run()
+    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
     generated, reference = read_video(run / "clip1.mp4").frames, target_of(clips, "clip1")
     expected = lpips.frame_distances(network, generated, reference)[1:].mean()
     assert metrics(run)["clip1"]["generated"]["lpips_alex"] == pytest.approx(expected, abs=1e-6)
@@ -67,15 +67,16 @@ def test_lpips_is_a_column_with_its_protocol(clips, run, network, capsys):
 def test_without_the_extra_the_column_is_absent_and_the_report_says_so(
     clips, run, monkeypatch, capsys
 ):
-    monkeypatch.setattr(lpips, "alex_if_installed", lambda: None)
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
-    assert set(metrics(run)["clip1"]["generated"]) == {"psnr", "ssim"}
+    monkeypatch.setattr(lpips, "load_if_installed", lambda name: None)
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.DONE
+    found = set(metrics(run)["clip1"]["generated"])
+    assert found == {"psnr", "ssim", "psnr_clip", "color_drift"}
     assert "lpips_alex" not in json.loads((run / "report.json").read_text())["splits"]["test"]
     assert "Install egosim-jax[metrics]" in capsys.readouterr().out
 
 
 def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):
-    Evaluate(generated=run, metadata=clips).run()
+    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
     scores, reference = metrics(run)["clip0"], target_of(clips, "clip0")
     prior = read_video(clips.parent / "clip0" / "ego_prior_video.mp4").frames
     still = np.broadcast_to(reference[:1], reference.shape)
@@ -87,7 +88,7 @@ def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):
 
 def test_a_reconstruction_is_compared_as_the_upper_bound(clips, run):
     write_video(run / "clip0_vae.mp4", target_of(clips, "clip0"), 16)
-    Evaluate(generated=run, metadata=clips).run()
+    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
     copy, reference = read_video(run / "clip0_vae.mp4").frames, target_of(clips, "clip0")
     assert metrics(run)["clip0"]["vae"]["psnr"] == pytest.approx(psnr(copy, reference)[1:].mean())
     assert "vae" not in metrics(run)["clip1"]
@@ -96,7 +97,7 @@ def test_a_reconstruction_is_compared_as_the_upper_bound(clips, run):
 def test_the_ground_truth_is_resized_to_the_generated_size(clips, run):
     small = target_of(clips, "clip0")[:, ::2, ::2]
     write_video(run / "clip0.mp4", small, 16)
-    Evaluate(generated=run, metadata=clips).run()
+    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
     assert metrics(run)["clip0"]["generated"]["psnr"] > 25
 
 
@@ -104,7 +105,7 @@ def test_results_name_the_windows(clips, run):
     write_video(run / "clip0_3.mp4", target_of(clips, "clip0")[3:8], 16)
     line = {"video_id": "clip0_3", "source_id": "clip0", "start": 3, "status": "done"}
     (run / "results.jsonl").write_text(json.dumps(line) + "\n")
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.DONE
     assert list(metrics(run)) == ["clip0_3"]
     generated, reference = read_video(run / "clip0_3.mp4").frames, target_of(clips, "clip0")[3:8]
     expected = psnr(generated, reference)[1:].mean()
@@ -115,7 +116,7 @@ def test_the_last_line_of_a_clip_counts(clips, run):
     lines = [{"video_id": "clip0", "source_id": "clip0", "start": 0, "status": "failed"}]
     lines.append({**lines[0], "status": "done"})
     (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.DONE
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.DONE
 
 
 def test_a_clip_that_failed_is_skipped_and_named(clips, run, capsys):
@@ -124,26 +125,29 @@ def test_a_clip_that_failed_is_skipped_and_named(clips, run, capsys):
         for name, status in (("clip0", "failed"), ("clip1", "done"))
     ]
     (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.PARTIAL
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.PARTIAL
     assert "skipped: clip0: its generation failed" in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
 
 
 def test_a_missing_clip_is_skipped_and_named(clips, run, capsys):
     (run / "clip0.mp4").unlink()
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.PARTIAL
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.PARTIAL
     assert f"skipped: clip0: {run / 'clip0.mp4'} cannot be read: No such" in capsys.readouterr().err
 
 
 def test_rows_are_selected_by_column(clips, run):
-    assert Evaluate(generated=run, metadata=clips, where="split=test").run() == ExitCode.DONE
+    assert (
+        Evaluate(generated=(str(run),), page_clips=0, metadata=clips, where="split=test").run()
+        == ExitCode.DONE
+    )
     assert list(metrics(run)) == ["clip1"]
 
 
 def test_the_report_has_definitions_and_a_summary_for_each_split(clips, run, tmp_path, capsys):
-    Evaluate(generated=run, metadata=clips, out=tmp_path / "report").run()
+    Evaluate(generated=(str(run),), page_clips=0, metadata=clips, out=tmp_path / "report").run()
     report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert set(report["definitions"]) == {"psnr", "ssim", "spread", "frames"}
+    assert {"psnr", "ssim", "lpips_alex", "spread", "frames"} <= set(report["definitions"])
     assert report["splits"]["train"]["generated"]["clips"] == 1
     printed = capsys.readouterr().out
     assert "train, 1 clips" in printed
@@ -154,7 +158,7 @@ def test_a_ground_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
     for name in ("clip0", "clip1"):
         write_video(run / f"{name}.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
     with pytest.raises(InputError, match="could be compared"):
-        Evaluate(generated=run, metadata=clips).run()
+        Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
     assert "ends before frame 13" in capsys.readouterr().err
 
 
@@ -162,17 +166,17 @@ def test_metadata_without_ground_truth_is_refused(clips, run):
     lines = clips.read_text().splitlines()
     clips.write_text("\n".join(line.split(",", 1)[1] for line in lines))
     with pytest.raises(InputError, match="could be compared"):
-        Evaluate(generated=run, metadata=clips).run()
+        Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
 
 
 def test_a_missing_folder_is_refused(clips, tmp_path):
     with pytest.raises(InputError, match="There is no folder"):
-        Evaluate(generated=tmp_path / "none", metadata=clips).run()
+        Evaluate(generated=(str(tmp_path / "none"),), metadata=clips).run()
 
 
 def test_a_clip_of_fewer_frames_is_skipped_and_named(clips, run, capsys):
     write_video(run / "clip0.mp4", target_of(clips, "clip0")[:5], 16)
-    assert Evaluate(generated=run, metadata=clips).run() == ExitCode.PARTIAL
+    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.PARTIAL
     assert "skipped: clip0: it has 5 frames, most clips 9." in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
 
@@ -180,7 +184,7 @@ def test_a_clip_of_fewer_frames_is_skipped_and_named(clips, run, capsys):
 def test_the_report_names_the_protocol(clips, run, capsys):
     for name in ("clip0", "clip1"):
         write_video(run / f"{name}.mp4", target_of(clips, name)[:, ::2, :32], 16)
-    Evaluate(generated=run, metadata=clips).run()
+    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
     protocol = json.loads((run / "report.json").read_text())["protocol"]
     assert (protocol["size"], protocol["pixels"], protocol["frames"]) == (
         "output",
@@ -196,11 +200,11 @@ def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, r
     for name in ("clip0", "clip1"):
         write_video(small / f"{name}.mp4", read_video(run / f"{name}.mp4").frames[:, ::2, ::3], 16)
     for folder in (run, small):
-        Evaluate(generated=folder, metadata=clips, size="target").run()
+        Evaluate(generated=(str(folder),), page_clips=0, metadata=clips, size="target").run()
     assert json.loads((small / "report.json").read_text())["protocol"]["pixels"] == ["48x32"]
     for method in ("prior", "still"):  # of which neither depends on what was generated
         assert metrics(small)["clip0"][method] == metrics(run)["clip0"][method]
-    Evaluate(generated=small, metadata=clips).run()
+    Evaluate(generated=(str(small),), page_clips=0, metadata=clips).run()
     assert metrics(small)["clip0"]["prior"] != metrics(run)["clip0"]["prior"]
 
 
@@ -211,4 +215,4 @@ def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, r
 def test_invalid_results_are_refused(clips, run, line):
     (run / "results.jsonl").write_text(line + "\n")
     with pytest.raises(InputError, match=r"results\.jsonl, line 1"):
-        Evaluate(generated=run, metadata=clips).run()
+        Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()

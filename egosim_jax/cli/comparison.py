@@ -1,0 +1,111 @@
+"""Options that `egosim evaluate` and `egosim table` share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.data.metadata import ClipFiles
+    from egosim_jax.evaluation.measures import Measure
+    from egosim_jax.evaluation.methods import Folder, Method
+    from egosim_jax.evaluation.result import Evaluation
+    from egosim_jax.evaluation.scoring import Protocol
+
+Baseline = Literal["prior", "prior_fit", "still"]
+Network = Literal["alex", "vgg"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Clips, baselines and measures of a table."""
+
+    metadata: Path
+    """CSV or JSONL in EgoSim's columns, with video."""
+    generated: tuple[str, ...]
+    """Folders of {id}.mp4, each as DIR or NAME=DIR.
+
+    A clip may also be in the subfolder of its dataset or split. The results.jsonl of a folder, if
+    it has one, lists its clips and windows. Differences are from the first folder."""
+    where: str | None = None
+    """Take rows whose column has this value, for instance split=test."""
+    baselines: tuple[Baseline, ...] = ("prior", "prior_fit", "still")
+    """Baselines without a model: the prior, the prior with fitted colors, and frame 0 repeated."""
+    lpips: tuple[Network, ...] = ("alex",)
+    """Networks of LPIPS, which needs the extra `metrics`."""
+    page_clips: int = 8
+    """Most clips of each group that the page shows; 0: neither page nor picture."""
+
+    def read_clips(self) -> list[ClipFiles]:
+        """Read the selected rows of the metadata."""
+        from egosim_jax.data.metadata import read_metadata, select
+
+        return select(read_metadata(self.metadata), where=self.where)
+
+    def methods(self, folders: Sequence[Folder]) -> list[Method]:
+        """Return the rows of the table. Raises `InputError` if names are repeated."""
+        from egosim_jax.evaluation.methods import BASELINES, check_names
+
+        methods: list[Method] = [*folders, *(BASELINES[name] for name in self.baselines)]
+        check_names(methods)
+        return methods
+
+    def measures(self, networks: Sequence[Network]) -> tuple[list[Measure], list[str]]:
+        """Return the measures, and why others are unavailable."""
+        from egosim_jax.evaluation.measures import LpipsDistance, Pixels
+        from egosim_jax.metrics import lpips
+
+        measures: list[Measure] = [Pixels()]
+        unavailable: list[str] = []
+        for name in networks:
+            network = lpips.load_if_installed(name)
+            if network is None:
+                unavailable.append(lpips.MISSING)
+            else:
+                measures.append(LpipsDistance(network, name))
+        return measures, unavailable
+
+    def compare(
+        self,
+        folders: Sequence[Folder],
+        clips: Sequence[ClipFiles],
+        *,
+        protocol: Protocol,
+        out: Path,
+        title: str,
+        networks: Sequence[Network],
+        **result: Any,
+    ) -> Evaluation:
+        """Compare, print, and write all files of the table to a folder."""
+        from egosim_jax.evaluation.files import draw, write_files
+        from egosim_jax.evaluation.page import PAGE, check_jinja, write_page
+        from egosim_jax.evaluation.result import Evaluation
+        from egosim_jax.evaluation.scoring import CACHE, ScoreCache, Scoring
+
+        if self.page_clips:
+            check_jinja()
+        if self.page_clips < 0:
+            raise InputError(
+                f"The number of clips must be at least 0, not {self.page_clips}. (--page-clips)"
+            )
+        methods = self.methods(folders)
+        measures, unavailable = self.measures(networks)
+        scoring = Scoring(
+            methods=methods,
+            measures=measures,
+            protocol=protocol,
+            cache=ScoreCache(out / CACHE),
+        )
+        rows = scoring.run(clips)
+        evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
+        write_files(evaluation, out)
+        if self.page_clips:
+            draw(evaluation, out / "scores.png")
+            write_page(evaluation, methods, out / PAGE, title=title, clips=self.page_clips)
+        evaluation.print()
+        print(out / (PAGE if self.page_clips else "report.json"))
+        return evaluation

@@ -1,0 +1,143 @@
+"""Files of an evaluation: JSON, CSV, LaTeX, and a picture of the scores.
+
+metrics.jsonl   one line per clip, with the scores of each method
+report.json     definitions, protocol, summaries, paired differences, published figures
+scores.csv      one row per clip and method, with the compared frames and sizes
+table.tex       a LaTeX table of each group
+scores.png      means and spreads of each group and column
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from egosim_jax.evaluation.result import Evaluation
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.run import write_json, write_text
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$",
+}  # fmt: skip
+ARROWS = {"higher": "↑", "lower": "↓"}
+"""Mark of the better direction of a measure."""
+
+
+def write_files(evaluation: Evaluation, out: Path) -> None:
+    """Write all files of an evaluation but the picture to a folder."""
+    lines: dict[str, dict] = {}
+    for row in evaluation.rows:
+        window = row.window
+        line = {"video_id": window.output_id, "split": window.split}
+        lines.setdefault(window.output_id, line)[row.method] = dict(row.scores)
+    text = "".join(f"{json.dumps(line)}\n" for line in lines.values())
+    write_text(out / "metrics.jsonl", text)
+    write_json(out / "report.json", evaluation.report)
+    write_text(out / "scores.csv", to_csv(evaluation))
+    write_text(out / "table.tex", to_latex(evaluation))
+
+
+def to_csv(evaluation: Evaluation) -> str:
+    """Return a row per clip and method."""
+    buffer = io.StringIO()
+    table = csv.writer(buffer, lineterminator="\n")
+    table.writerow(
+        [
+            "video_id", "source_id", evaluation.group, "method", "first_frame", "frames_scored",
+            "width", "height", "source", *evaluation.measured,
+        ]
+    )  # fmt: skip
+    first = evaluation.protocol.first
+    for row in evaluation.rows:
+        table.writerow(
+            [
+                row.window.output_id,
+                row.window.files.video_id,
+                evaluation.group_of(row),
+                row.method,
+                row.window.start + first,
+                row.shape.frames - first,
+                row.shape.width,
+                row.shape.height,
+                row.source,
+                *(repr(row.scores[k]) if k in row.scores else "" for k in evaluation.measured),
+            ]
+        )
+    return buffer.getvalue()
+
+
+def cell_of(value: Mapping[str, float], form: str) -> str:
+    """Return a cell of a table: the mean, and the spread if there is one."""
+    return " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)
+
+
+def to_latex(evaluation: Evaluation) -> str:
+    """Return a table of each group, with the protocol as its caption."""
+    tables = []
+    for group in evaluation.summaries():
+        headings = evaluation.headings(group)
+        heads = [f"{escape(c.heading)} ${_arrow(c.better)}$" for c in headings.values()]
+        rows = [
+            " & ".join(
+                [escape(title)]
+                + [escape(cell_of(row.get(key, {}), c.form)) for key, c in headings.items()]
+            )
+            for title, row in evaluation.table(group).items()
+        ]
+        body = " \\\\\n".join([" & ".join(["method", *heads]), *rows])
+        caption = f"{evaluation.caption(group)}, mean ± spread. {' '.join(evaluation.notes()[:2])}"
+        tables.append(
+            "\\begin{table}\n\\centering\n"
+            f"\\begin{{tabular}}{{l{'r' * len(headings)}}}\n\\hline\n{body} \\\\\n\\hline\n"
+            f"\\end{{tabular}}\n\\caption{{{escape(caption)}}}\n\\end{{table}}\n"
+        )
+    return "\n".join(tables)
+
+
+def _arrow(better: str) -> str:
+    return r"\uparrow" if better == "higher" else r"\downarrow"
+
+
+def escape(text: str) -> str:
+    """Return text with LaTeX's special characters escaped."""
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+def draw(evaluation: Evaluation, path: Path) -> None:
+    """Draw means and spreads: a row of plots for each group, a column for each measure."""
+    matplotlib.use("agg")
+    groups = list(evaluation.summaries())
+    shown = [key for key in evaluation.shown if key in evaluation.measured]
+    count = max(len(evaluation.table(group)) for group in groups)
+    size = (4.2 * len(shown) + 2, (0.34 * count + 1.0) * len(groups))
+    figure = Figure(figsize=size, layout="constrained")
+    plots = figure.subplots(len(groups), len(shown), squeeze=False, sharey="row")
+    for group, row in zip(groups, plots, strict=True):
+        table = evaluation.table(group)
+        for key, axes in zip(shown, row, strict=True):
+            column = evaluation.columns[key]
+            for place, (title, summary) in enumerate(table.items()):
+                if key in summary:
+                    value, published = summary[key], title.endswith("(published)")
+                    axes.errorbar(
+                        value["mean"],
+                        place,
+                        xerr=value.get("spread"),
+                        fmt="s" if published else "o",
+                        color="tab:gray" if published else "tab:blue",
+                        capsize=3,
+                    )
+            axes.set_yticks(range(len(table)), list(table))
+            axes.set_ylim(len(table) - 0.5, -0.5)
+            axes.set_title(f"{evaluation.groups.get(group, group)}: {column.heading} "
+                           f"{ARROWS[column.better]}", fontsize=9)  # fmt: skip
+            axes.grid(axis="x", alpha=0.3)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=100)

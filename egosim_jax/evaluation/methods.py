@@ -1,0 +1,191 @@
+"""Methods of a table: folders of clips, by whomever they were made, and baselines without a model.
+
+A method returns a video of a window at a wanted length and size. The baselines derive theirs from
+the clip's own files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.batch import Window
+from egosim_jax.data.metadata import is_safe_id
+from egosim_jax.data.transforms import resize_image
+from egosim_jax.io.untrusted import quote_path, quote_text
+from egosim_jax.io.video import read_video
+from egosim_jax.metrics.image import fit_colors
+from egosim_jax.types import InputError
+
+MAX_BORDER_PX = 8
+"""Most rows or columns by which a video may exceed the wanted size and is cropped to its center."""
+FIT = (
+    "Pillow LANCZOS, the picture stretched to the size of the comparison; a video that exceeds it "
+    f"by at most {MAX_BORDER_PX} rows and columns has a border, and is cropped to its center"
+)
+
+
+class Shape(NamedTuple):
+    """Number of frames and size at which videos are compared."""
+
+    frames: int
+    height: int
+    width: int
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A row of a table."""
+
+    name: str
+    """Key of a method in reports."""
+    title: str
+    """Name of a method in tables."""
+
+    def sources(self, window: Window) -> tuple[Path, ...]:
+        """Return the files that determine the video, in addition to the ground truth."""
+        ...
+
+    def video(
+        self, window: Window, shape: Shape, target: UInt8[np.ndarray, "f h w 3"]
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return the video of a window. Raises `InputError` if there is none."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folder:
+    """Clips in a folder: {id}.mp4, in it or in the subfolder of the clip's dataset or split."""
+
+    path: Path
+    """Folder of generated clips."""
+    name: str
+    """Key of the folder in reports."""
+    title: str
+    """Name of the folder in tables."""
+    suffix: str = ""
+    """End of the file names, before .mp4."""
+    optional: bool = False
+    """True if missing clips are not a problem."""
+
+    @classmethod
+    def parse(cls, text: str) -> Folder:
+        """Parse NAME=DIR, or DIR, which is named as its last part. Raises `InputError`."""
+        name, equals, path = text.rpartition("=")
+        folder = Path(path)
+        name = name if equals else folder.resolve().name
+        if not is_safe_id(name) or "/" in name:
+            raise InputError(
+                f"{quote_text(name)!r} does not name a method: a name has letters, digits, '.', "
+                "'_' and '-'. Give NAME=DIR. (--generated)"
+            )
+        if not folder.is_dir():
+            raise InputError(f"There is no folder {quote_path(folder)}. (--generated)")
+        return cls(path=folder, name=name, title=name)
+
+    def file(self, window: Window) -> Path:
+        """Return the path of a window's clip, that in the folder itself if there is none."""
+        name = f"{window.output_id}{self.suffix}.mp4"
+        columns = (window.files.extra.get(column, "") for column in ("dataset", "split"))
+        below = [self.path / value / name for value in columns if is_safe_id(value)]
+        return next((path for path in below if path.is_file()), self.path / name)
+
+    def sources(self, window: Window) -> tuple[Path, ...]:
+        """Return the clip."""
+        return (self.file(window),)
+
+    def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
+        """Return the clip, fitted to the shape."""
+        return read_at(self.file(window), shape, 0, border=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """The prior, copied; or with one affine map of its colors fitted to the ground truth."""
+
+    fitted: bool = False
+    """True to fit the colors."""
+
+    @property
+    def name(self) -> str:
+        """Key of the baseline in reports."""
+        return "prior_fit" if self.fitted else "prior"
+
+    @property
+    def title(self) -> str:
+        """Name of the baseline in tables."""
+        return "prior, colors fitted to the ground truth" if self.fitted else "prior"
+
+    def sources(self, window: Window) -> tuple[Path, ...]:
+        """Return the prior's file."""
+        return (window.files.prior,)
+
+    def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
+        """Return the prior over the window's frames."""
+        prior = read_at(window.files.prior, shape, window.start)
+        return fit_colors(prior, target) if self.fitted else prior
+
+
+@dataclass(frozen=True, kw_only=True)
+class Still:
+    """First frame of the ground truth, repeated."""
+
+    name: str = "still"
+    """Key of the baseline in reports."""
+    title: str = "first frame of the ground truth, repeated"
+    """Name of the baseline in tables."""
+
+    def sources(self, window: Window) -> tuple[Path, ...]:
+        """Return nothing: the ground truth determines it."""
+        return ()
+
+    def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
+        """Return the first frame at all frames."""
+        return np.broadcast_to(target[:1], target.shape)
+
+
+BASELINES: dict[str, Method] = {
+    "prior": Prior(),
+    "prior_fit": Prior(fitted=True),
+    "still": Still(),
+}
+"""Baselines without a model, by name."""
+
+
+def check_names(methods: Sequence[Method]) -> None:
+    """Raise `InputError` if two methods have one name."""
+    names = [method.name for method in methods]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(
+            f"Several methods are named {', '.join(repeated)}: each row of a table needs a name. "
+            "Give NAME=DIR. (--generated)"
+        )
+
+
+def read_at(
+    path: Path, shape: Shape, start: int, *, border: bool = False
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """Read frames from `start`, fitted to a shape. Raises `InputError` if there are too few.
+
+    With `border`, a narrow border around the picture is cut off.
+    """
+    fit = partial(_fit, height=shape.height, width=shape.width, border=border)
+    frames = read_video(path, start=start, stop=start + shape.frames, each=fit).frames
+    if len(frames) < shape.frames:
+        raise InputError(f"{path} ends before frame {start + shape.frames}, which was generated.")
+    return frames
+
+
+def _fit(frame: np.ndarray, *, height: int, width: int, border: bool) -> np.ndarray:
+    rows, columns = frame.shape[0] - height, frame.shape[1] - width
+    if border and 0 <= rows <= MAX_BORDER_PX and 0 <= columns <= MAX_BORDER_PX:
+        top, left = rows // 2, columns // 2
+        return frame[top : top + height, left : left + width]
+    return resize_image(frame, height, width)

@@ -1,0 +1,203 @@
+"""The result of an evaluation: summaries by group and method, paired differences, protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from egosim_jax.evaluation.measures import Column, columns_of
+from egosim_jax.evaluation.methods import FIT
+from egosim_jax.evaluation.scoring import Protocol, Row, Scoring
+from egosim_jax.metrics import lpips
+from egosim_jax.metrics.report import DEFINITIONS, paired_difference, print_table, summarize
+
+KNOWN = {
+    "depth_err": Column("Depth ERR of the paper", "{:.3f}", "lower"),
+    "cam_err": Column("Cam ERR of the paper", "{:.4f}", "lower"),
+    "lpips_alex": Column("LPIPS-Alex", "{:.4f}", "lower"),
+    "lpips_vgg": Column("LPIPS-VGG", "{:.4f}", "lower"),
+    "dreamsim": Column("DreamSim", "{:.4f}", "lower"),
+}
+"""Columns that published rows may have although they were not measured."""
+SHOWN = ("psnr", "ssim", "lpips_alex")
+"""Columns of printed tables by default; files have all."""
+Summaries = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""Number of clips, mean and spread of each measure by group and method."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Scores of methods on clips, and what they mean."""
+
+    rows: Sequence[Row]
+    """Scores of each clip and method."""
+    titles: Mapping[str, str]
+    """Names of the methods in tables, by name."""
+    columns: Mapping[str, Column]
+    """Measured columns by key."""
+    shown: Sequence[str]
+    """Keys of the columns of tables."""
+    definitions: Mapping[str, str]
+    """Definitions by key."""
+    protocol: Protocol
+    group: str = "split"
+    """Column of the metadata by whose values clips are summarized separately."""
+    groups: Mapping[str, str] = field(default_factory=dict)
+    """Titles of some groups."""
+    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+    """Published figures by group, row and column, which others measured on other clips."""
+    source: str = ""
+    """Source of the published figures."""
+    unavailable: Sequence[str] = ()
+    """Measures that were not computed, with the reasons."""
+    skipped: Sequence[str] = ()
+    """Clips that were not compared, with the reasons."""
+
+    @classmethod
+    def of(cls, scoring: Scoring, rows: Sequence[Row], **options: Any) -> Evaluation:
+        """Return the result of a scoring."""
+        columns = {**KNOWN, **columns_of(scoring.measures)}
+        definitions = {k: v for measure in scoring.measures for k, v in measure.definitions.items()}
+        options.setdefault("shown", SHOWN)
+        present = {row.method for row in rows}
+        return cls(
+            rows=rows,
+            titles={m.name: m.title for m in scoring.methods if m.name in present},
+            columns=columns,
+            definitions=definitions,
+            protocol=scoring.protocol,
+            skipped=scoring.skipped,
+            **options,
+        )
+
+    @property
+    def measured(self) -> list[str]:
+        """Keys of the columns that any row has."""
+        return list(dict.fromkeys(key for row in self.rows for key in row.scores))
+
+    def group_of(self, row: Row) -> str:
+        """Return the group of a row."""
+        return row.window.files.extra.get(self.group, "all")
+
+    def summaries(self) -> Summaries:
+        """Return the summary of each method over the clips of each group."""
+        return {
+            group: {
+                method: {
+                    "clips": len(scores),
+                    **summarize([row.scores for row in scores], self.measured),
+                }
+                for method, scores in by_method.items()
+            }
+            for group, by_method in self._grouped().items()
+        }
+
+    def differences(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+        """Return how each method differs from the first one on the same clips, by group."""
+        found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+        reference, *others = self.titles
+        for group, by_method in self._grouped().items():
+            start = {row.window: row.scores for row in by_method.get(reference, ())}
+            for method in others:
+                pairs = [(row.scores, start.get(row.window)) for row in by_method.get(method, ())]
+                shared = [(scores, at) for scores, at in pairs if at is not None]
+                if len(shared) > 1:
+                    found.setdefault(group, {})[method] = {
+                        key: paired_difference(
+                            [scores[key] for scores, _ in shared], [at[key] for _, at in shared]
+                        )
+                        for key in shared[0][0]
+                    }
+        return found
+
+    def _grouped(self) -> dict[str, dict[str, list[Row]]]:
+        """Return the rows by group, sorted by name, and method."""
+        grouped: dict[str, dict[str, list[Row]]] = {}
+        for row in self.rows:
+            grouped.setdefault(self.group_of(row), {}).setdefault(row.method, []).append(row)
+        return {
+            group: {m: grouped[group][m] for m in self.titles if m in grouped[group]}
+            for group in sorted(grouped)
+        }
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Scores and protocol, the contents of report.json."""
+        return {
+            "definitions": {
+                **self.definitions,
+                "spread": DEFINITIONS["spread"],
+                "frames": f"{self.protocol.first} to the last",
+                "differences": "from the first method on the same clips: mean and 95 % interval by "
+                "the paired bootstrap over clips",
+            },
+            "protocol": {
+                "description": self.protocol.describe(),
+                "size": self.protocol.size,
+                "pixels": sorted({f"{row.shape.width}x{row.shape.height}" for row in self.rows}),
+                "frames": [self.protocol.first, max(row.shape.frames for row in self.rows) - 1],
+                "resize": FIT,
+                "lpips_alex": lpips.protocol(),
+                "unavailable": list(self.unavailable),
+            },
+            "splits": self.summaries(),
+            "differences": self.differences(),
+            "published": {"source": self.source, "rows": self.published} if self.published else {},
+        }
+
+    def table(self, group: str) -> dict[str, Mapping[str, Mapping[str, float]]]:
+        """Return the rows of a group's table by title, published figures last."""
+        methods = self.summaries()[group]
+        rows = {
+            self.titles[name]: {key: summary[key] for key in self.shown if key in summary}
+            for name, summary in methods.items()
+        }
+        published = {
+            f"{name} (published)": {key: {"mean": value} for key, value in values.items()}
+            for name, values in self.published.get(group, {}).items()
+        }
+        return {**rows, **published}
+
+    def headings(self, group: str) -> dict[str, Column]:
+        """Return the columns of a group's table that have values."""
+        present = {key for row in self.table(group).values() for key in row}
+        return {key: self.columns[key] for key in self.shown if key in present}
+
+    def caption(self, group: str) -> str:
+        """Return the title of a group's table, with its number of clips."""
+        count = max(row["clips"] for row in self.summaries()[group].values())
+        return f"{self.groups.get(group, group)}, {count} clips"
+
+    def print(self) -> None:
+        """Print a table and the paired differences of each group, and the protocol."""
+        differences = self.differences()
+        for group in self.summaries():
+            headings = {key: (c.heading, c.form) for key, c in self.headings(group).items()}
+            title = f"{self.caption(group)}: mean ± spread"
+            print_table("", self.table(group), headings, title=title)
+            others = {self.titles[m]: values for m, values in differences.get(group, {}).items()}
+            if others:
+                reference = next(iter(self.titles.values()))
+                print_table("", others, headings, title=f"difference from {reference}, 95 %")
+        for line in self.notes():
+            print(line)
+
+    def notes(self) -> list[str]:
+        """Return protocol, definitions and sources in lines of text."""
+        protocol = self.report["protocol"]
+        first, last = protocol["frames"]
+        sizes = ", ".join(protocol["pixels"])
+        lines = [
+            f"frames {first} to {last} at the size of the {protocol['size']}: {sizes}",
+            f"protocol: {protocol['description']}",
+        ]
+        lines += [
+            f"{key}: {text}"
+            for key, text in self.definitions.items()
+            if set(key.split(", ")) & set(self.shown)
+        ]
+        if "lpips_alex" in self.shown and "lpips_alex" not in self.definitions:
+            lines.append(f"lpips_alex: {protocol['lpips_alex']}")
+        lines += [f"unavailable: {line}" for line in self.unavailable]
+        return lines + ([f"published: {self.source}"] if self.published else [])

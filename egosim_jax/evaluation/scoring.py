@@ -1,0 +1,254 @@
+"""Scores of clips by method: which frames and sizes are compared, and what is computed once.
+
+Scores are cached by content: the hash of a method's files and of the ground truth, the compared
+frames and size, and the measure. Running again after a clip, a method or a measure was added
+computes what is new.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from egosim_jax.batch import Window, read_results
+from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.evaluation.measures import VERSION, Measure, Pair
+from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
+from egosim_jax.io.atomic import append_line
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.untrusted import read_lines
+from egosim_jax.io.video import probe_video
+from egosim_jax.progress import track
+from egosim_jax.types import InputError
+
+CACHE = "scores_cache.jsonl"
+"""File of the cached scores in the folder of a report."""
+Scores = Mapping[str, float]
+"""Values of one clip by measure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """Frames and size at which clips are compared."""
+
+    size: Literal["output", "target"] = "output"
+    """Size of the comparison: of the first method's output, or of the ground truth."""
+    lengths: Literal["usual", "common"] = "usual"
+    """Frames that count: all of clips of the usual length, or those that all methods have."""
+    frame_0: bool = False
+    """True if frame 0 counts, although it is given to the model."""
+
+    @property
+    def first(self) -> int:
+        """First frame that counts."""
+        return 0 if self.frame_0 else 1
+
+    def describe(self) -> str:
+        """Return the protocol in words."""
+        frames = {
+            "usual": "all frames; a clip of another length than most is skipped",
+            "common": "the frames that all methods and the ground truth have",
+        }[self.lengths]
+        excluded = "frame 0 included" if self.frame_0 else "frame 0 excluded"
+        return f"frame by frame, {frames}, {excluded}; at the size of the {self.size}; {FIT}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Scores of one method on one clip."""
+
+    window: Window
+    """Clip and window that were compared."""
+    method: str
+    """Name of the method."""
+    shape: Shape
+    """Number of frames, with frame 0, and size of the comparison."""
+    source: str
+    """Size and length of the method's own video in words."""
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class ScoreCache:
+    """Scores by content hash, in a file of JSON lines."""
+
+    path: Path
+    """File to read and to append to."""
+
+    @cached_property
+    def _known(self) -> dict[str, dict[str, float]]:
+        if not self.path.is_file():
+            return {}
+        lines = [line for _, line in read_lines(self.path) if isinstance(line, dict)]
+        return {
+            line["key"]: {name: float("nan") if v is None else v for name, v in scores.items()}
+            for line in lines
+            if isinstance(line.get("key"), str) and isinstance(scores := line.get("scores"), dict)
+        }
+
+    def get(self, key: str) -> Scores | None:
+        """Return the scores of a key, or None."""
+        return self._known.get(key)
+
+    def put(self, key: str, scores: Scores) -> None:
+        """Add scores, on disk when this returns."""
+        self._known[key] = dict(scores)
+        plain = {name: None if np.isnan(value) else value for name, value in scores.items()}
+        append_line(self.path, {"key": key, "scores": plain})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scoring:
+    """Comparison of methods with the ground truth, clip by clip."""
+
+    methods: Sequence[Method]
+    """Rows of the table."""
+    measures: Sequence[Measure]
+    """Groups of columns."""
+    protocol: Protocol
+    cache: ScoreCache
+    skipped: list[str] = field(default_factory=list)
+    """Clips that were not compared, with the reasons."""
+
+    @property
+    def folders(self) -> list[Folder]:
+        """Folders whose clips must exist."""
+        return [m for m in self.methods if isinstance(m, Folder) and not m.optional]
+
+    def run(self, clips: Sequence[ClipFiles]) -> list[Row]:
+        """Compare all clips. Raises `InputError` if none can be compared."""
+        windows = self._windows(clips)
+        lengths = {folder.name: self._lengths(folder, windows) for folder in self.folders}
+        rows: list[Row] = []
+        for window in track(windows, "comparing", total=len(windows)):
+            known = {name: of[window] for name, of in lengths.items() if window in of}
+            if not known:
+                continue
+            try:
+                rows += self._compare(window, known)
+            except InputError as error:
+                self.skipped.append(f"{window.output_id}: {error}")
+        for line in self.skipped:
+            print(f"skipped: {line}", file=sys.stderr)
+        if not rows:
+            shown = ", ".join(str(folder.path) for folder in self.folders)
+            raise InputError(f"No clip in {shown} could be compared. (--generated)")
+        return rows
+
+    def _windows(self, clips: Sequence[ClipFiles]) -> list[Window]:
+        """Return the generated windows of some clips; note why others were not generated."""
+        rows = {files.video_id: files for files in clips}
+        windows: dict[str, Window] = {}
+        for folder in self.folders:
+            if not folder.path.is_dir():
+                raise InputError(f"There is no folder {folder.path}. (--generated)")
+            results = read_results(folder.path)
+            if results is None:
+                results = {name: {"source_id": name} for name in rows}
+            for output_id, line in results.items():
+                files, start = rows.get(str(line.get("source_id"))), line.get("start", 0)
+                if files is None:
+                    continue
+                if line.get("status") == "failed":
+                    self.skipped.append(f"{output_id}: its generation failed")
+                    continue
+                window = windows.setdefault(output_id, Window(files, start, output_id))
+                if (window.files, window.start) != (files, start):
+                    raise InputError(
+                        f"{output_id} is another window in {folder.path} than in the folders "
+                        "before: an id must name the same frames in all. (--generated)"
+                    )
+        return list(windows.values())
+
+    def _lengths(self, folder: Folder, windows: Sequence[Window]) -> dict[Window, Shape]:
+        """Return length and size of a folder's clips; note those that are not compared."""
+        lengths: dict[Window, Shape] = {}
+        for window in windows:
+            try:
+                video = probe_video(folder.file(window))
+                lengths[window] = Shape(video.frames, video.height, video.width)
+            except InputError as error:
+                self.skipped.append(f"{window.output_id}: {error}")
+        if self.protocol.lengths == "common":
+            return lengths
+        counts = Counter(shape.frames for shape in lengths.values())
+        usual = max(counts, key=lambda length: (counts[length], length), default=0)
+        if usual <= self.protocol.first and counts:
+            raise InputError("Clips of one frame cannot be compared: frame 0 is excluded.")
+        self.skipped.extend(
+            f"{window.output_id}: it has {shape.frames} frames, most clips {usual}."
+            for window, shape in lengths.items()
+            if shape.frames != usual
+        )
+        return {window: shape for window, shape in lengths.items() if shape.frames == usual}
+
+    def _compare(self, window: Window, known: Mapping[str, Shape]) -> list[Row]:
+        """Return the scores of every method on one window."""
+        path = window.files.target
+        if path is None:
+            raise InputError(f"{window.files.row} has no ground truth. (column video)")
+        truth = probe_video(path)
+        count = min(shape.frames for shape in known.values())
+        if self.protocol.lengths == "common":
+            count = min(count, truth.frames - window.start)
+        if count <= self.protocol.first:
+            raise InputError("There are no frames to compare.")
+        like = truth if self.protocol.size == "target" else next(iter(known.values()))
+        shape = Shape(count, like.height, like.width)
+        target = _Video(lambda: read_at(path, shape, window.start))
+        digest = sha256(path)
+        rows = []
+        for method in self.methods:
+            own = known.get(method.name)
+            absent = isinstance(method, Folder) and not method.file(window).exists()
+            if absent or (method in self.folders and own is None):
+                continue
+            source = f"{own.frames} x {own.width}x{own.height}" if own else "made here"
+            scores = self._scores(window, method, shape, target, digest)
+            rows.append(
+                Row(window=window, method=method.name, shape=shape, source=source, scores=scores)
+            )
+        return rows
+
+    def _scores(
+        self, window: Window, method: Method, shape: Shape, target: _Video, digest: str
+    ) -> Scores:
+        content = {
+            "version": VERSION,
+            "target": digest,
+            "start": window.start,
+            "shape": list(shape),
+            "first": self.protocol.first,
+            "method": type(method).__name__ if isinstance(method, Folder) else method,
+            "sources": [sha256(path) for path in method.sources(window)],
+        }
+        video = _Video(lambda: method.video(window, shape, target.frames))
+        scores: dict[str, float] = {}
+        for measure in self.measures:
+            key = fingerprint([content, type(measure).__name__, measure.settings()])
+            found = self.cache.get(key)
+            if found is None:
+                first = self.protocol.first
+                found = measure(Pair(video.frames[first:], target.frames[first:]))
+                self.cache.put(key, found)
+            scores |= found
+        return scores
+
+
+@dataclass(eq=False)
+class _Video:
+    """Video that is decoded when it is first used."""
+
+    read: Any
+
+    @cached_property
+    def frames(self) -> np.ndarray:
+        return self.read()

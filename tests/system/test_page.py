@@ -1,0 +1,74 @@
+"""The page of a table in a real browser; chromium is installed by .ci/run."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egosim_jax import testing
+from egosim_jax.cli.table import TableCommand
+from egosim_jax.io.video import read_video, write_video
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """Page of a table of one method and a baseline, with a hostile prompt."""
+    root = tmp_path_factory.mktemp("page")
+    metadata = testing.write_dataset(root)
+    header, *lines = metadata.read_text().splitlines()
+    prompt = "\"<script>document.body.innerHTML=''</script><b>bold</b>\""
+    columns = header.split(",")
+    rows = [dict(zip(columns, line.split(","), strict=True)) | {"prompt": prompt} for line in lines]
+    text = "\n".join(",".join([*row.values(), "egodex"]) for row in rows)
+    metadata.write_text(f"{header},dataset\n{text}\n")
+    for number in range(2):
+        video = read_video(root / f"clip{number}" / "video.mp4").frames
+        red = np.zeros_like(video)
+        red[..., 0] = 220
+        write_video(root / "red" / f"clip{number}.mp4", red, 16)
+    TableCommand(
+        name="egosim",
+        generated=(str(root / "red"),),
+        baselines=("still",),
+        metadata=metadata,
+        out=root / "out",
+    ).run()
+    return root / "out" / "index.html"
+
+
+def browse(page, *options):
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    command += [f"--user-data-dir={page.parent / 'profile'}", "--window-size=1400,1900"]
+    command += ["--virtual-time-budget=3000", *options, page.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+def test_the_browser_shows_the_tables_and_no_markup_of_a_prompt(page):
+    dom = browse(page, "--dump-dom")
+    assert "EgoSim (published)" in dom
+    assert "25.06" in dom
+    assert "&lt;b&gt;bold&lt;/b&gt;" in dom
+    assert "<script" not in dom
+    assert dom.count("<video") == 2
+
+
+def test_the_browser_plays_the_clips(page):
+    shot = page.parent / "page.png"
+    browse(page, f"--screenshot={shot}")
+    pixels = np.asarray(Image.open(shot).convert("RGB")).astype(int)
+    red = (pixels[..., 0] > 180) & (pixels[..., 1:].max(axis=-1) < 40)
+    # The red clip is the left third of each of the two videos.
+    columns = np.flatnonzero(red.sum(axis=0) > 50)
+    assert red.sum() > 20_000
+    assert columns.max() < 600
+
+
+def test_the_page_is_one_file_that_loads_nothing(page):
+    text = page.read_text()
+    assert "default-src 'none'" in text
+    assert "http://" not in text
+    assert "https://" not in text
+    assert len(text) < 300_000

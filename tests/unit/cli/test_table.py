@@ -1,0 +1,196 @@
+"""`egosim table`: any folders of clips in the papers' tables, their files and their cache."""
+
+import csv
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+from flax import nnx
+
+from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.cli.table import Name, TableCommand
+from egosim_jax.command import ExitCode
+from egosim_jax.evaluation import scoring
+from egosim_jax.evaluation.files import escape
+from egosim_jax.evaluation.tables import TABLES
+from egosim_jax.io.video import read_video, write_video
+from egosim_jax.metrics import lpips
+from egosim_jax.metrics.image import psnr
+from egosim_jax.types import InputError
+
+
+@pytest.fixture(autouse=True)
+def network(monkeypatch):
+    """Use a network of few channels for LPIPS."""
+    stage = (lpips.Convolution(features=4),)
+    alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
+    found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
+    monkeypatch.setattr(lpips, "load_if_installed", lambda name: found if name == "alex" else None)
+
+
+@pytest.fixture
+def metadata(make_clips):
+    """Metadata of four clips of two datasets."""
+    path = make_clips(4)
+    header, *lines = path.read_text().splitlines()
+    sets = ("egodex", "egodex", "egovid", "other")
+    lines = [f"{line},{name}" for line, name in zip(lines, sets, strict=True)]
+    path.write_text("\n".join([f"{header},dataset", *lines]) + "\n")
+    return path
+
+
+@pytest.fixture
+def folders(metadata, tmp_path):
+    """Folders of two methods, the second one's clips in a subfolder of their dataset."""
+    for number, dataset in enumerate(("egodex", "egodex", "egovid")):
+        target = target_of(metadata, f"clip{number}")
+        write_video(tmp_path / "near" / f"clip{number}.mp4", target // 2 + 60 + 3 * number, 16)
+        write_video(tmp_path / "far" / dataset / f"clip{number}.mp4", target // 4, 16)
+    return f"{tmp_path / 'near'}", f"Far={tmp_path / 'far'}"
+
+
+def target_of(metadata, name):
+    return read_video(metadata.parent / name / "video.mp4").frames
+
+
+def make(metadata, folders, out, **options):
+    options = {"name": "egosim", "page_clips": 0, **options}
+    return TableCommand(generated=folders, metadata=metadata, out=out, **options).run()
+
+
+def read_rows(out):
+    return list(csv.DictReader(io.StringIO((out / "scores.csv").read_text())))
+
+
+def test_a_table_has_its_groups_methods_and_published_figures(metadata, folders, tmp_path, capsys):
+    assert make(metadata, folders, tmp_path / "out") == ExitCode.DONE
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert {group: list(methods) for group, methods in report["splits"].items()} == {
+        group: ["near", "Far", "prior", "prior_fit", "still"] for group in ("egodex", "egovid")
+    }
+    assert report["published"]["rows"]["egodex"]["EgoSim"]["psnr"] == 25.056
+    printed = capsys.readouterr().out
+    assert "EgoDex, 2 clips" in printed
+    assert "EgoSim (published)" in printed
+    assert "LANCZOS" in printed
+    assert "frame 0 excluded" in printed
+
+
+def test_there_is_a_row_for_each_clip_and_method(metadata, folders, tmp_path):
+    make(metadata, folders, tmp_path / "out", baselines=("still",))
+    rows = {(row["video_id"], row["method"]): row for row in read_rows(tmp_path / "out")}
+    assert len(rows) == 3 * 3
+    row, target = rows["clip2", "Far"], target_of(metadata, "clip2")
+    video = read_video(tmp_path / "far" / "egovid" / "clip2.mp4").frames
+    assert float(row["psnr"]) == pytest.approx(psnr(video, target)[1:].mean())
+    assert (row["dataset"], row["first_frame"], row["frames_scored"]) == ("egovid", "1", "8")
+
+
+def test_methods_are_compared_on_the_frames_that_all_have(metadata, folders, tmp_path):
+    short = target_of(metadata, "clip0")[:6] // 4
+    write_video(tmp_path / "far" / "egodex" / "clip0.mp4", short, 16)
+    make(metadata, folders, tmp_path / "out", baselines=())
+    rows = [row for row in read_rows(tmp_path / "out") if row["video_id"] == "clip0"]
+    assert [row["frames_scored"] for row in rows] == ["5", "5"]
+    near = read_video(tmp_path / "near" / "clip0.mp4").frames
+    expected = psnr(near, target_of(metadata, "clip0"))[1:6].mean()
+    assert float(rows[0]["psnr"]) == pytest.approx(expected)
+
+
+def test_dwm_counts_frame_0_and_one_error_a_clip(metadata, folders, tmp_path, capsys):
+    text = metadata.read_text().replace("egodex", "real_static")
+    metadata.write_text(text)
+    (tmp_path / "far" / "egodex").rename(tmp_path / "far" / "real_static")
+    make(metadata, folders, tmp_path / "out", name="dwm_1", baselines=())
+    row = next(row for row in read_rows(tmp_path / "out") if row["video_id"] == "clip0")
+    video, target = (
+        read_video(path).frames.astype(float)
+        for path in (tmp_path / "near" / "clip0.mp4", metadata.parent / "clip0" / "video.mp4")
+    )
+    expected = 10 * np.log10(255**2 / np.square(video - target).mean())
+    assert float(row["psnr_clip"]) == pytest.approx(expected, abs=1e-4)
+    assert row["frames_scored"] == "9"
+    assert "unavailable: LPIPS" in capsys.readouterr().out  # VGG, which is not installed here
+
+
+def test_a_narrow_border_is_cut_off(metadata, folders, tmp_path):
+    target = target_of(metadata, "clip0")
+    framed = np.pad(target, ((0, 0), (0, 0), (2, 2), (0, 0)))
+    write_video(tmp_path / "near" / "clip0.mp4", framed, 16)
+    make(metadata, folders, tmp_path / "out", baselines=())
+    assert float(read_rows(tmp_path / "out")[0]["psnr"]) > 30  # resized, it has 19
+
+
+def test_a_second_run_computes_what_is_new(metadata, folders, tmp_path, monkeypatch):
+    make(metadata, folders, tmp_path / "out")
+    first = (tmp_path / "out" / "report.json").read_bytes()
+    computed = []
+    read = scoring.read_at
+    monkeypatch.setattr(scoring, "read_at", lambda *a: computed.append(a[0]) or read(*a))
+    make(metadata, folders, tmp_path / "out")
+    assert not computed
+    assert (tmp_path / "out" / "report.json").read_bytes() == first
+    write_video(tmp_path / "near" / "clip1.mp4", target_of(metadata, "clip1"), 16)
+    make(metadata, folders, tmp_path / "out")
+    assert [path.parent.name for path in computed] == ["clip1"]
+    assert (tmp_path / "out" / "report.json").read_bytes() != first
+
+
+def test_differences_are_paired_with_the_first_folder(metadata, folders, tmp_path):
+    make(metadata, folders, tmp_path / "out", baselines=())
+    rows = {(r["video_id"], r["method"]): float(r["psnr"]) for r in read_rows(tmp_path / "out")}
+    expected = [rows[f"clip{n}", "Far"] - rows[f"clip{n}", "near"] for n in range(2)]
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    found = report["differences"]["egodex"]["Far"]["psnr"]
+    assert found["mean"] == pytest.approx(np.mean(expected))
+    assert (found["low"], found["high"]) == pytest.approx((min(expected), max(expected)))
+    assert "egovid" not in report["differences"]  # of one clip
+
+
+def test_latex_has_a_table_for_each_group_and_is_escaped(metadata, folders, tmp_path):
+    make(metadata, folders, tmp_path / "out")
+    text = (tmp_path / "out" / "table.tex").read_text()
+    assert text.count(r"\begin{tabular}{lrrrrr}") == 2
+    assert r"$\pm$" in text
+    assert "±" not in text
+    assert escape("50 %_{a}") == r"50 \%\_\{a\}"
+
+
+def test_a_missing_clip_is_skipped_and_named(metadata, folders, tmp_path, capsys):
+    (tmp_path / "near" / "clip2.mp4").unlink()
+    assert make(metadata, folders, tmp_path / "out") == ExitCode.PARTIAL
+    assert f"skipped: clip2: {tmp_path / 'near' / 'clip2.mp4'}" in capsys.readouterr().err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert "near" not in report["splits"]["egovid"]
+
+
+@pytest.mark.parametrize(
+    ("folders", "message"),
+    [(("a/../x y",), "does not name a method"), (("A=none",), "There is no folder")],
+)
+def test_invalid_folders_are_refused(metadata, tmp_path, folders, message):
+    with pytest.raises(InputError, match=message):
+        make(metadata, folders, tmp_path / "out")
+
+
+def test_methods_of_one_name_are_refused(metadata, folders, tmp_path):
+    with pytest.raises(InputError, match="named near"):
+        make(metadata, (folders[0], folders[0]), tmp_path / "out")
+
+
+def test_metadata_of_other_datasets_are_refused(metadata, folders, tmp_path):
+    with pytest.raises(InputError, match="egodex, egovid"):
+        make(metadata, folders, tmp_path / "out", where="dataset=other")
+
+
+def test_the_command_knows_every_table():
+    assert set(TABLES) == set(Name.__args__)
+
+
+def test_evaluate_compares_several_folders(metadata, folders, tmp_path):
+    out = tmp_path / "out"
+    options = {"metadata": metadata, "out": out, "where": "dataset=egodex", "page_clips": 0}
+    assert Evaluate(generated=folders, **options).run() == ExitCode.DONE
+    assert {"near", "Far"} <= set(json.loads((out / "metrics.jsonl").read_text().splitlines()[0]))
