@@ -17,7 +17,14 @@ from jaxtyping import Float
 from egosim_jax.geometry import rotation_z
 from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Body, Part
-from egosim_jax.worlds.tabletop.hands import Side, closure_for, hand_meshes, joints_of, pinch
+from egosim_jax.worlds.tabletop.hands import (
+    Side,
+    closure_for,
+    elbow_of,
+    hand_meshes,
+    joints_of,
+    pinch,
+)
 from egosim_jax.worlds.tabletop.scene import Scene, moving_part
 
 Verb = Literal["carry", "lift", "turn", "stack", "open", "close"]
@@ -356,6 +363,4 @@ def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
 def hand_parts(hand: Hand, kind: Kind) -> tuple[Float[np.ndarray, "j 3"], tuple[Part, ...]]:
     """Return joints and meshes of a hand in the world; the forearm starts at the wearer's elbow."""
     joints, back = hand.grip.pose(kind, hand.side)
-    outward = 0.24 if hand.side == "right" else -0.24
-    elbow = np.array([0.5 * joints[0][0] + outward, -0.20, 0.5 * joints[0][2]])
-    return joints, hand_meshes(joints, elbow, kind, back)
+    return joints, hand_meshes(joints, elbow_of(joints, hand.side), kind, back)

@@ -242,14 +242,20 @@ def make_loose(shape: Shape, color: str, rng: np.random.Generator) -> Body:
         height = width
     if shape == "ring":
         width, height = float(rng.uniform(0.08, 0.10)), 0.03
-    size = (width, width, height)
-    vertices, triangles = split_edges(*_outline(shape, size))
     choices: tuple[Pattern, ...] = ("plain",)
     if shape == "box":
         choices = ("plain", "plain", "stripes", "checks")
     if shape in ("cylinder", "cup"):
         choices = ("plain", "stripes")
     pattern = choices[int(rng.integers(len(choices)))]
+    return build_loose(shape, color, (width, width, height), pattern)
+
+
+def build_loose(
+    shape: Shape, color: str, size: tuple[float, float, float], pattern: Pattern
+) -> Body:
+    """Return a loose body at the origin; `size` is its extent along x, y and z in meters."""
+    vertices, triangles = split_edges(*_outline(shape, size))
     second = darker(COLORS[color])
     paint = Paint(color=COLORS[color], second=second, pattern=pattern, scale_m=0.03)
     part = Part(

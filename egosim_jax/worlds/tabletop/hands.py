@@ -28,6 +28,8 @@ SPREAD = np.radians([8.0, 1.0, -6.0, -14.0])
 """Angle of each open finger towards the thumb, in radians."""
 THUMB_M = (np.array([-0.028, 0.026, -0.014]), (0.040, 0.031, 0.025))
 """First joint of the thumb, and the lengths of its three segments, in meters."""
+KNUCKLES = [5, 9, 13, 17]
+"""Keypoints of the four knuckles."""
 GRIPPER_M = (0.12, 0.10)
 """Length of a gripper's fingers, and distance of its open tips, in meters."""
 SKIN, SLEEVE, ENAMEL, RUBBER = (216, 150, 118), (72, 88, 112), (40, 150, 160), (52, 52, 56)
@@ -79,6 +81,34 @@ def pinch(joints: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], fl
     return (thumb + fingers) / 2, float(np.linalg.norm(thumb - fingers))
 
 
+def frame_of(joints_m: Float[np.ndarray, "j 3"], kind: Kind) -> Float[np.ndarray, "4 4"]:
+    """Return the pose in the world of a hand: axes of its local frame, origin at the pinch point.
+
+    The palm gives the axes of a human hand, and of a left hand x and z are reversed, so that all
+    are right-handed.
+    """
+    if kind == "robot":
+        along, across = (joints_m[1] + joints_m[2]) / 2 - joints_m[0], joints_m[2] - joints_m[1]
+        if np.linalg.norm(across) < 1e-6:  # closed: its fingers are taken to be horizontal
+            across = np.cross(along, [0.0, 0.0, 1.0])
+    else:
+        along, across = joints_m[KNUCKLES].mean(axis=0) - joints_m[0], joints_m[17] - joints_m[5]
+    along = along / max(float(np.linalg.norm(along)), 1e-9)
+    across = across - (across @ along) * along
+    across = across / max(float(np.linalg.norm(across)), 1e-9)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([across, along, np.cross(across, along)], axis=1)
+    pose[:3, 3] = pinch(joints_m)[0]
+    return pose
+
+
+def side_of(joints_m: Float[np.ndarray, "j 3"]) -> Side:
+    """Return the side of a human hand: fingers flex towards the palm, away from its back."""
+    axes = frame_of(joints_m, "human")[:3, :3]
+    bend = (joints_m[[4, 8, 12, 16, 20]] - joints_m[[1, *KNUCKLES]]).mean(axis=0)
+    return "right" if bend @ axes[:, 2] <= 0 else "left"
+
+
 def closure_for(kind: Kind, width_m: float) -> float:
     """Return the closure at which the fingertips are `width_m` apart, by bisection."""
     low, high = 0.0, 1.0 if kind == "robot" else 0.8
@@ -87,6 +117,18 @@ def closure_for(kind: Kind, width_m: float) -> float:
         gap = pinch(joints_of(kind, middle, "right"))[1]
         low, high = (middle, high) if gap > width_m else (low, middle)
     return (low + high) / 2
+
+
+def elbow_of(joints_m: Float[np.ndarray, "j 3"], side: Side) -> Float[np.ndarray, " 3"]:
+    """Return the position of the wearer's elbow in meters, by that of the wrist."""
+    outward = 0.24 if side == "right" else -0.24
+    return np.array([0.5 * joints_m[0][0] + outward, -0.20, 0.5 * joints_m[0][2]])
+
+
+def arm_of(joints_m: Float[np.ndarray, "j 3"], kind: Kind, side: Side) -> tuple[Part, ...]:
+    """Return the meshes of a hand and its forearm, which starts at the wearer's elbow."""
+    up = frame_of(joints_m, kind)[:3, 2]
+    return hand_meshes(joints_m, elbow_of(joints_m, side), kind, up if side == "right" else -up)
 
 
 def hand_meshes(
@@ -126,7 +168,7 @@ def hand_meshes(
         for a, b in SKELETONS["human"].bones
         if a
     ]
-    wrist, knuckles = joints_m[0], joints_m[[5, 9, 13, 17]]
+    wrist, knuckles = joints_m[0], joints_m[KNUCKLES]
     # The palm: thick capsules from the wrist to each knuckle and across them.
     inward = -0.004 * back
     pieces += [_limb(wrist + inward, knuckle + inward, 0.021, 0.0135) for knuckle in knuckles]

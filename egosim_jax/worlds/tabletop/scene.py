@@ -154,7 +154,7 @@ def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def make_scene(rng: np.random.Generator) -> Scene:
+def sample_scene(rng: np.random.Generator) -> Scene:
     """Sample a scene of three to six bodies of different colors, at most one articulated."""
     while len((scene := _scatter(rng)).bodies) < MIN_BODIES:
         pass  # no free place was found for enough bodies
@@ -188,7 +188,7 @@ def with_cloths(scene: Scene, rng: np.random.Generator, most: int) -> Scene:
 
 def _scatter(rng: np.random.Generator) -> Scene:
     """Place random bodies one after another; skip those without a free place."""
-    scene = Scene(bodies=(), room=_room(rng), openings={})
+    scene = Scene(bodies=(), room=make_room(rng), openings={})
     names = list(rng.permutation(list(COLORS)))
     count = int(rng.integers(MIN_BODIES, MAX_BODIES + 1))
     candidates: list[Body] = []
@@ -213,7 +213,7 @@ def _scatter(rng: np.random.Generator) -> Scene:
     return scene
 
 
-def _room(rng: np.random.Generator) -> tuple[Placed, ...]:
+def make_room(rng: np.random.Generator) -> tuple[Placed, ...]:
     """Return table, floor and three walls in random colors."""
     x, y, z = TABLE_SIZE_M
     wood = np.array(WOODS[rng.integers(len(WOODS))]) + rng.normal(0, 6, 3)

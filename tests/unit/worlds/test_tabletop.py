@@ -11,7 +11,7 @@ from egosim_jax.worlds.tabletop import actions, make_sequence, state_after, to_t
 from egosim_jax.worlds.tabletop.bodies import box, make_loose, split_edges
 from egosim_jax.worlds.tabletop.hands import closure_for, joints_of, pinch
 from egosim_jax.worlds.tabletop.raycast import Placed, RayCaster
-from egosim_jax.worlds.tabletop.scene import FIRST_BODY, TABLE, Scene, make_scene
+from egosim_jax.worlds.tabletop.scene import FIRST_BODY, TABLE, Scene, sample_scene
 
 SPEC = VideoSpec(frames=5, height=48, width=80)
 
@@ -191,7 +191,7 @@ def test_a_carried_state_has_its_objects_at_their_final_poses(clips):
 def test_black_bodies_are_never_chosen():
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        scene = make_scene(rng)
+        scene = sample_scene(rng)
         assert not scene.body(actions.choose(scene, rng).name).static
 
 
@@ -259,7 +259,7 @@ def act_on(verb, kind="human"):
     """Return the first action of that verb among the seeds, and its moments."""
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        scene = make_scene(rng)
+        scene = sample_scene(rng)
         intent = actions.choose(scene, rng)
         if intent.verb == verb:
             hand = actions.start_hand(scene, intent, kind, rng)
@@ -292,7 +292,7 @@ def test_a_body_under_another_is_neither_taken_nor_opened():
     checked = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        scene = make_scene(rng)
+        scene = sample_scene(rng)
         intent = actions.choose(scene, rng)
         if intent.verb != "stack":
             continue
@@ -321,7 +321,7 @@ def test_an_opened_body_can_be_closed():
 
 def test_bodies_do_not_intersect():
     for seed in range(20):
-        scene: Scene = make_scene(np.random.default_rng(seed))
+        scene: Scene = sample_scene(np.random.default_rng(seed))
         assert 3 <= len(scene.bodies) <= 6
         places = [body.world_from_body[:2, 3] for body in scene.bodies]
         widths = [body.size_m[0] / 2 for body in scene.bodies]

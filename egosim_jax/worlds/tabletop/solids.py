@@ -1,0 +1,114 @@
+"""Solids of the tabletop world: distance and normal at any point, for contacts.
+
+Each body is a union of a few solids in the frames of its parts: a loose body is one, furniture has
+a case, a moving part and its handle. The distance is negative inside. Boxes, cylinders and cones
+are intersections of half-spaces (a cylinder's side is one of them), whose largest distance is
+exact but at edges, where it is too small by up to a factor of sqrt(3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.worlds.tabletop.bodies import Body, Shape
+
+Form = Literal["box", "cylinder", "ball", "cone", "ring"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solid:
+    """A solid in the frame of a body's part; its origin is the center of its underside."""
+
+    form: Form
+    """Class of its shape."""
+    size_m: tuple[float, float, float]
+    """Extent along x, y and z in meters."""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Center of its underside in the frame of the part, in meters."""
+    part: int = 0
+    """Index of the part among those of the body; 0 is the one that moves."""
+    handle: bool = False
+    """True for what a hand grasps to open and close furniture."""
+
+    def at(
+        self, points_m: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Return distance in meters and outward unit normal of the surface nearest to points."""
+        local = points_m - np.asarray(self.origin_m)
+        x, y, z = self.size_m
+        if self.form == "ball":
+            return _from_center(local - [0, 0, x / 2], x / 2)
+        flat = np.hypot(local[:, 0], local[:, 1])
+        outward = local * [1, 1, 0] / np.maximum(flat, 1e-9)[:, None]
+        if self.form == "ring":
+            tube = z / 2
+            circle = outward * (x / 2 - tube) + [0, 0, tube]
+            return _from_center(local - circle, tube)
+        up = np.broadcast_to([0.0, 0.0, 1.0], local.shape)
+        if self.form == "cone":
+            slope = np.array([z, x / 2]) / np.hypot(z, x / 2)
+            side = flat * slope[0] + (local[:, 2] - z) * slope[1]
+            return _largest([(side, outward * slope[0] + up * slope[1]), (-local[:, 2], -up)])
+        faces = [(local[:, 2] - z, up), (-local[:, 2], -up)]
+        if self.form == "cylinder":
+            return _largest([(flat - x / 2, outward), *faces])
+        for axis, size in enumerate((x, y)):
+            way = np.zeros_like(local)
+            way[:, axis] = np.where(local[:, axis] < 0, -1.0, 1.0)
+            faces.append((np.abs(local[:, axis]) - size / 2, way))
+        return _largest(faces)
+
+
+def _from_center(
+    gaps_m: Float[np.ndarray, "n 3"], radius_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    length = np.linalg.norm(gaps_m, axis=1)
+    return length - radius_m, gaps_m / np.maximum(length, 1e-9)[:, None]
+
+
+def _largest(faces: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    distances = np.stack([distance for distance, _ in faces])
+    chosen, every = distances.argmax(axis=0), np.arange(distances.shape[1])
+    return distances[chosen, every], np.stack([normal for _, normal in faces])[chosen, every]
+
+
+FORMS: dict[Shape, Form] = {
+    "box": "box", "cylinder": "cylinder", "cup": "cylinder", "ball": "ball", "cone": "cone",
+    "ring": "ring",
+}  # fmt: skip
+"""Solid of each loose body; a cup is as solid as a cylinder."""
+
+
+def solids_of(body: Body) -> tuple[Solid, ...]:
+    """Return the solids of a body, in the frames of its parts."""
+    return _solids(body.shape, body.size_m)
+
+
+@cache
+def _solids(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, ...]:
+    x, y, z = size_m
+    if shape == "drawer":
+        front, handle = (x - 0.022, 0.008, z - 0.022), (0.04, 0.02, 0.012)
+        return (
+            Solid(form="box", size_m=front, origin_m=(0, -y / 2 - 0.002, 0.011)),
+            Solid(
+                form="box", size_m=handle, origin_m=(0, -y / 2 - 0.016, z / 2 - 0.006), handle=True
+            ),
+            Solid(form="box", size_m=size_m, part=1),
+        )
+    if shape == "lidded box":
+        lid = 0.012
+        return (
+            Solid(form="box", size_m=(x, y, lid), origin_m=(0, 0, z - lid)),
+            Solid(
+                form="box", size_m=(0.036, 0.014, lid - 0.003),
+                origin_m=(0, -y / 2 - 0.007, z - lid + 0.002), handle=True,
+            ),
+            Solid(form="box", size_m=(x, y, z - lid), part=1),
+        )  # fmt: skip
+    return (Solid(form=FORMS[shape], size_m=size_m),)

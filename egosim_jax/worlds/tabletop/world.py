@@ -1,0 +1,121 @@
+"""True tabletop world: executes any action, exactly and without randomness.
+
+    world = World(scene=make_scene(objects=[...]))
+    clip, world = world.execute(action)     # clip: frames, depth, ids, poses; world: afterwards
+
+A world is a value: executing an action returns a new one, and the same action in the same world
+gives the same clip. `docs/world.md` says what is modeled (`contact.py`, `support.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.types import Action, Cameras, Kind, SceneState
+from egosim_jax.worlds.tabletop.clips import Arm, TabletopClip, film, first_view, provenance
+from egosim_jax.worlds.tabletop.contact import Contact, Grasp, advance, start
+from egosim_jax.worlds.tabletop.hands import Side, arm_of, side_of
+from egosim_jax.worlds.tabletop.raycast import Picture
+from egosim_jax.worlds.tabletop.scene import Scene
+
+EXECUTED = "execute"
+"""Verb of clips of executed actions."""
+MOVED_M = 1e-4
+"""A body that moved less than this, in meters or radians, was not moved by an action."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """True tabletop world at one moment: the scene, and what the hands hold."""
+
+    scene: Scene
+    """Arrangement of all bodies."""
+    grasps: tuple[Grasp, ...] = ()
+    """Bodies in hands."""
+    seed: int = 0
+    """Seed that clips are named by; a scene made by hand has any."""
+    number: int = 0
+    """Number of actions executed so far."""
+
+    def move(self, action: Action) -> tuple[list[Scene], World]:
+        """Return the scene at every frame, without pictures, and the world afterwards.
+
+        A hand that holds a body keeps it if it starts near where it ended, and else lets it fall. A
+        hand is missing where its joints are NaN.
+        """
+        joints = np.asarray(action.joints_m, float)
+        contact = start(Contact(scene=self.scene, grasps=self.grasps), joints[0], action.kind)
+        scenes = [contact.scene]
+        for before, after in pairwise(joints):
+            contact = advance(contact, before, after, action.kind)
+            scenes.append(contact.scene)
+        after = replace(self, scene=contact.scene, grasps=contact.grasps, number=self.number + 1)
+        return scenes, after
+
+    def execute(self, action: Action) -> tuple[TabletopClip, World]:
+        """Return the clip of an action with its ground truth, and the world afterwards.
+
+        Raises `InputError` if a camera is inside an object.
+        """
+        scenes, after = self.move(action)
+        target = _most_moved(scenes)
+        sides = sides_of(action.joints_m, action.kind)
+        clip = film(
+            scenes,
+            arms_of(action.joints_m, action.kind, sides),
+            action.cameras,
+            sides=sides,
+            kind=action.kind,
+            seed=self.seed,
+            number=self.number,
+            verb=EXECUTED,
+            target=target,
+            caption=action.prompt,
+        )
+        return clip, after
+
+    def observe(self, cameras: Cameras) -> tuple[Picture, SceneState]:
+        """Return the first camera's picture without hands, and the points that it shows."""
+        first, state = first_view(self.scene, cameras)
+        return first, replace(state, step=self.number, provenance=provenance(self.seed))
+
+
+def arms_of(
+    joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, sides: tuple[Side, ...]
+) -> list[list[Arm | None]]:
+    """Return joints and meshes of every hand in every frame; None where a hand is missing."""
+    return [
+        [
+            (joints, arm_of(joints, kind, side)) if np.isfinite(joints).all() else None
+            for joints, side in zip(frame, sides, strict=True)
+        ]
+        for frame in joints_m
+    ]
+
+
+def sides_of(joints_m: Float[np.ndarray, "f n j 3"], kind: Kind) -> tuple[Side, ...]:
+    """Return the side of each hand where it first appears; that of a gripper is where it is."""
+    sides: list[Side] = []
+    for path in np.moveaxis(joints_m, 1, 0):
+        seen = path[np.isfinite(path).all(axis=(1, 2))]
+        if len(seen) and kind == "human":
+            sides.append(side_of(seen[0]))
+        else:
+            sides.append("left" if len(seen) and seen[0][0, 0] < 0 else "right")
+    return tuple(sides)
+
+
+def _most_moved(scenes: list[Scene]) -> str:
+    """Return the name of the body that moved most, or an empty one if none did."""
+    amounts = {}
+    for body in scenes[0].bodies:
+        path = np.stack([scene.first_part_pose(body.name) for scene in scenes])
+        amounts[body.name] = float(np.abs(path - path[0]).max())
+    name = max(amounts, key=lambda name: amounts[name])
+    return name if amounts[name] > MOVED_M else ""
