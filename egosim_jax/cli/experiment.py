@@ -13,6 +13,8 @@ from egosim_jax.experiments.config import (
     Continuous,
     Debug,
     Embodiment,
+    LookAway,
+    Policies,
     RealTiny,
     Tabletop,
     Update,
@@ -23,6 +25,8 @@ MODULES = {
     Continuous: "continuous",
     Update: "update",
     Embodiment: "embodiment",
+    LookAway: "look_away",
+    Policies: "policies",
     RealTiny: "real_tiny",
     Debug: "debug",
 }
@@ -38,6 +42,8 @@ class Experiment:
         | Annotated[Continuous, tyro.conf.subcommand("continuous")]
         | Annotated[Update, tyro.conf.subcommand("update")]
         | Annotated[Embodiment, tyro.conf.subcommand("embodiment")]
+        | Annotated[LookAway, tyro.conf.subcommand("look_away")]
+        | Annotated[Policies, tyro.conf.subcommand("policies")]
         | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
         | Annotated[Debug, tyro.conf.subcommand("debug")]
     )

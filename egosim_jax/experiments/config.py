@@ -73,6 +73,40 @@ class Update(ModelExperiment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LookAway(ModelExperiment):
+    """Move an object, look elsewhere, look back: is it where it was left?
+
+    In view, or out of view by the second hand; with the state updated by the oracle, by classical
+    perception, and not at all. Prints a table and the differences from no update, writes
+    report.json and contact_sheet.png. The same command resumes an interrupted experiment.
+    """
+
+    scenes: int = 16
+    """Number of scenes in which an object is carried."""
+    first_scene: int = 300
+    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policies(ModelExperiment):
+    """Rank policies with faults by success in the generated world, and compare with the true one.
+
+    Each policy carries an object to a goal in the same scenes. Prints success and agreement
+    (Pearson, Spearman, MMRV) with intervals, writes report.json, ranking.png and contact_sheet.png.
+    The same command resumes an interrupted experiment.
+    """
+
+    scenes: int = 24
+    """Number of scenes in which an object is carried."""
+    first_scene: int = 400
+    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+    perception: str = "classical"
+    """Perception pipeline that reads success from the generated clips, by name with its options."""
+    batch_size: int = 5
+    """Number of clips that are generated together."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Hyperparameters:
     """Hyper-parameters of one training; the learning rate has a warm-up and a cosine decay."""
 

@@ -34,6 +34,8 @@ REST_M = {"right": np.array([0.13, 0.12, 0.09]), "left": np.array([-0.13, 0.12, 
 """Position of the grasping point of a hand at rest, in meters."""
 CARRY_M = (0.10, 0.20)
 """Minimum and maximum distance that a body is carried, in meters."""
+CLOSE_SHARE = 0.04
+"""Share of a clip in which a hand closes."""
 NEAR_M = 0.26
 """Distance within which a hand prefers its next target, in meters."""
 
@@ -266,19 +268,30 @@ def _carry(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
     return pose
 
 
+def holding(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> tuple[float, float]:
+    """Return the times in [0, 1] at which the hand has grasped its target and releases it."""
+    held = [key.time for key in _keys(scene, hand, intent, kind) if key.held]
+    return held[0], held[-1]
+
+
+def opened(kind: Kind) -> float:
+    """Return the closure of a hand that reaches for a body."""
+    return closure_for(kind, 0.085) if kind == "robot" else 0.12
+
+
 def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
     """Return the keyframes of the acting hand."""
     start, grasp = hand.grip, _grasp(scene, intent, kind, hand.side)
-    opened = closure_for(kind, 0.085) if kind == "robot" else 0.12
+    wide = opened(kind)
     body = scene.body(intent.name)
-    above = _shift(grasp, [0, -0.02, 0.03], closure=opened)
+    above = _shift(grasp, [0, -0.02, 0.03], closure=wide)
     reach = 0.10 + 0.6 * min(0.4, float(np.linalg.norm(start.point_m - grasp.point_m)))
     begin, end = reach + 0.10, 0.76
     first = scene.openings.get(intent.name, 0.0)
     keys = [
         _Key(time=0.0, grip=start, opening=first),
         _Key(time=reach, grip=above, opening=first),
-        _Key(time=begin - 0.04, grip=_shift(grasp, [0, 0, 0], closure=opened), opening=first),
+        _Key(time=begin - CLOSE_SHARE, grip=_shift(grasp, [0, 0, 0], closure=wide), opening=first),
         _Key(time=begin, grip=grasp, held=True, opening=first),
     ]
     if body.articulated:
@@ -311,7 +324,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
             _Key(time=end, grip=final, held=True),
         ]
     last_opening = keys[-1].opening
-    away = _shift(final, [0, -0.015, 0.02], closure=opened)
+    away = _shift(final, [0, -0.015, 0.02], closure=wide)
     rest = _relaxed(_retreat(final.point_m, hand.side), hand.side, kind)
     keys += [
         _Key(time=end + 0.05, grip=away, opening=last_opening),

@@ -14,7 +14,16 @@ from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.reference import draw_hands, render
-from egosim_jax.types import JOINTS, Action, Cameras, GroundTruth, Kind, SceneState, Triplet
+from egosim_jax.types import (
+    JOINTS,
+    Action,
+    Cameras,
+    GroundTruth,
+    Kind,
+    SceneState,
+    Triplet,
+    near_view,
+)
 from egosim_jax.worlds.tabletop.bodies import Part
 from egosim_jax.worlds.tabletop.hands import Side
 from egosim_jax.worlds.tabletop.raycast import Picture, Placed, RayCaster
@@ -133,6 +142,13 @@ def film(
     )
 
 
+def film_scene(scene: Scene, cameras: Cameras, *, without: str | None = None) -> list[Picture]:
+    """Render a scene at rest along a camera path, without hands and without one of its bodies."""
+    hidden = None if without is None else scene.number(without)
+    caster = RayCaster([item for item in scene.placed() if item.number != hidden])
+    return [_render(caster, pose, cameras) for pose in cameras.world_from_camera]
+
+
 def provenance(seed: int) -> dict[str, str]:
     """Return the origin of a state of the tabletop world."""
     return {"world": "tabletop", "seed": str(seed)}
@@ -197,8 +213,13 @@ def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
 
 
 def to_action(clip: TabletopClip) -> Action:
-    """Return cameras, hand joints and prompt of the clip."""
-    return Action(cameras=clip.cameras, joints_m=clip.joints_m, kind=clip.kind, prompt=clip.caption)
+    """Return cameras, hand joints and prompt of the clip; hands that are never in view are missing.
+
+    They are known to the true world only.
+    """
+    seen = near_view(clip.cameras, clip.joints_m).any(axis=0)[:, None, None]
+    joints = clip.joints_m if seen.all() else np.where(seen, clip.joints_m, np.nan)
+    return Action(cameras=clip.cameras, joints_m=joints, kind=clip.kind, prompt=clip.caption)
 
 
 def to_episode(clips: Sequence[TabletopClip], *, fps: int) -> Episode:

@@ -43,7 +43,7 @@ PAD_M = 0.008
 FIRM_M = 0.006
 """A closing hand holds a body when both fingertips are this near, or get no nearer."""
 BETWEEN_M = 0.003
-"""A body is between fingertips if their middle is this deep in it, in meters."""
+"""A body is between fingertips if their middle is this much deeper in it, in meters."""
 OPEN_M = 0.002
 """A hand releases what it holds when its fingertips are this much wider than at their closest."""
 SLIP_M = 0.03
@@ -319,10 +319,10 @@ def _push(
             pressing = {key for key in pressing if key[0] != hand or key[2] != body.name}
             continue
         distance, normal, moving = surface_of(scene, body, joints_m)
-        depth = surface_of(scene, body, middle[None])[0][0]
+        *tips, depth = surface_of(scene, body, np.stack([*tips_of(joints_m), middle]))[0]
         for joint in np.flatnonzero(distance > LEAVE_M[0]) if depth > LEAVE_M[1] else ():
             pressing.discard((hand, int(joint), body.name))
-        between = depth < -BETWEEN_M or contact.holder(body.name) is not None
+        between = depth < min(tips) - BETWEEN_M or contact.holder(body.name) is not None
         supple = FINGERS if kind == "human" and gap > body.size_m[0] else ()
         for joint in np.flatnonzero(distance < 0):
             key = (hand, int(joint), body.name)

@@ -95,19 +95,22 @@ def _solids(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, ..
     if shape == "drawer":
         front, handle = (x - 0.022, 0.008, z - 0.022), (0.04, 0.02, 0.012)
         return (
-            Solid(form="box", size_m=front, origin_m=(0, -y / 2 - 0.002, 0.011)),
+            Solid(form="box", size_m=front, origin_m=(0.0, -y / 2 - 0.002, 0.011)),
             Solid(
-                form="box", size_m=handle, origin_m=(0, -y / 2 - 0.016, z / 2 - 0.006), handle=True
+                form="box",
+                size_m=handle,
+                origin_m=(0.0, -y / 2 - 0.016, z / 2 - 0.006),
+                handle=True,
             ),
             Solid(form="box", size_m=size_m, part=1),
         )
     if shape == "lidded box":
         lid = 0.012
         return (
-            Solid(form="box", size_m=(x, y, lid), origin_m=(0, 0, z - lid)),
+            Solid(form="box", size_m=(x, y, lid), origin_m=(0.0, 0.0, z - lid)),
             Solid(
                 form="box", size_m=(0.036, 0.014, lid - 0.003),
-                origin_m=(0, -y / 2 - 0.007, z - lid + 0.002), handle=True,
+                origin_m=(0.0, -y / 2 - 0.007, z - lid + 0.002), handle=True,
             ),
             Solid(form="box", size_m=(x, y, z - lid), part=1),
         )  # fmt: skip

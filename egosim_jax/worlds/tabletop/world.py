@@ -43,13 +43,16 @@ class World:
     number: int = 0
     """Number of actions executed so far."""
 
-    def move(self, action: Action) -> tuple[list[Scene], World]:
+    def move(
+        self, action: Action, *, joints_m: Float[np.ndarray, "f n j 3"] | None = None
+    ) -> tuple[list[Scene], World]:
         """Return the scene at every frame, without pictures, and the world afterwards.
 
         A hand that holds a body keeps it if it starts near where it ended, and else lets it fall. A
-        hand is missing where its joints are NaN.
+        hand is missing where its joints are NaN. `joints_m` replaces the joints of the action, for
+        hands that are out of view, which an action refuses.
         """
-        joints = np.asarray(action.joints_m, float)
+        joints = np.asarray(action.joints_m if joints_m is None else joints_m, float)
         contact = start(Contact(scene=self.scene, grasps=self.grasps), joints[0], action.kind)
         scenes = [contact.scene]
         for before, after in pairwise(joints):
@@ -58,24 +61,26 @@ class World:
         after = replace(self, scene=contact.scene, grasps=contact.grasps, number=self.number + 1)
         return scenes, after
 
-    def execute(self, action: Action) -> tuple[TabletopClip, World]:
+    def execute(
+        self, action: Action, *, joints_m: Float[np.ndarray, "f n j 3"] | None = None
+    ) -> tuple[TabletopClip, World]:
         """Return the clip of an action with its ground truth, and the world afterwards.
 
-        Raises `InputError` if a camera is inside an object.
+        `joints_m` is that of `move`. Raises `InputError` if a camera is inside an object.
         """
-        scenes, after = self.move(action)
-        target = _most_moved(scenes)
-        sides = sides_of(action.joints_m, action.kind)
+        scenes, after = self.move(action, joints_m=joints_m)
+        joints = action.joints_m if joints_m is None else joints_m
+        sides = sides_of(joints, action.kind)
         clip = film(
             scenes,
-            arms_of(action.joints_m, action.kind, sides),
+            arms_of(joints, action.kind, sides),
             action.cameras,
             sides=sides,
             kind=action.kind,
             seed=self.seed,
             number=self.number,
             verb=EXECUTED,
-            target=target,
+            target=_most_moved(scenes),
             caption=action.prompt,
         )
         return clip, after

@@ -286,11 +286,3 @@ def test_a_hand_has_its_own_frame_and_side():
             axes = frame_of(joints, "human")[:3, :3]
             np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(axes) == pytest.approx(1)
-
-
-def test_a_joint_that_is_not_finite_makes_its_hand_missing(cameras):
-    joints = drive(cameras, *PICK).joints_m.copy()
-    joints[:, 0, 1] = np.nan
-    scenes, world = world_of(BOX).move(act(cameras, joints))
-    assert not world.grasps
-    np.testing.assert_array_equal(scenes[-1].body("red box").world_from_body[:3, 3], [0, 0.25, 0])

@@ -1,0 +1,258 @@
+"""`egosim experiment look_away`: is a change still there after looking elsewhere?
+
+Three clips in each scene. Seen: a hand carries an object, the wearer turns away, and turns back.
+Unseen: the wearer turns away, the second hand carries the object out of view, the wearer turns
+back. The pipeline gets no hand that is out of view; only the true world executes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import count, islice
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.experiments.config import LookAway
+from egosim_jax.experiments.continuous import METHODS
+from egosim_jax.experiments.model import open_experiment
+from egosim_jax.generator import Generator
+from egosim_jax.geometry import invert, rotation_z, transform
+from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.metrics import region
+from egosim_jax.metrics.report import paired_difference, print_table, summarize
+from egosim_jax.metrics.update import ON_SURFACE_M, distance_to_mesh
+from egosim_jax.perception import registry
+from egosim_jax.progress import track
+from egosim_jax.rollout import Rollout, load_clip
+from egosim_jax.simulator import Simulator
+from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec, check_counts
+from egosim_jax.worlds.tabletop import Script, TabletopClip, World, make_scripts, to_episode
+from egosim_jax.worlds.tabletop import actions as scripted
+from egosim_jax.worlds.tabletop.clips import film_scene
+from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+
+CASES = ("seen", "unseen")
+"""Moves in view, and moves while the wearer looks elsewhere."""
+AWAY_DEGREES = 45.0
+"""Angle by which the wearer turns away, to the side where the object is not."""
+OUTSIDE_DEGREES = 35.0
+"""Smallest horizontal angle to the view's axis of an object that is out of view."""
+FRAMES_BACK = 4
+"""Last frames of the last clip, which are scored."""
+NEAR_PERCENT = 5.0
+"""Farthest a kept object may be from its true place in the picture, in percent of the width."""
+SHEET_SCENES = 3
+"""Scenes of each case on the contact sheet."""
+MEASURES = {
+    "kept": ("object where it was left %", "{:.0f}"),
+    "region_psnr": ("region PSNR dB", "{:.2f}"),
+    "object_error": ("object error %", "{:.1f}"),
+    "state_accuracy": ("state accuracy %", "{:.0f}"),
+}
+DEFINITIONS = {
+    "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the picture's width of its true "
+    f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
+    "object_error": "distance of the centroid of the object, segmented by color, from that of its "
+    "ground-truth ids, in percent of the width, mean over those frames",
+    "region_psnr": "dB over the pixels of those frames where the object is or was before the move",
+    "state_accuracy": "share of the object's points in the last state within 1 cm of its true "
+    "surface; 0 if there are none",
+    "seen, unseen": "the object is carried in view, or while the wearer looks elsewhere",
+    "differences": "from no update, on the same scenes; mean and 95 % interval",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Story:
+    """Three true clips of one scene, and what the last one is scored by."""
+
+    seed: int
+    """Seed of the scene."""
+    clips: tuple[TabletopClip, ...]
+    """Clips with their ground truth."""
+    target: str
+    """Name of the carried object."""
+    before: Bool[np.ndarray, "f h w"]
+    """Pixels of the last frames in which the object would be seen where it was at first."""
+    background: UInt8[np.ndarray, "f h w 3"]
+    """Last frames without hands and object."""
+
+    def score(self, frames: UInt8[np.ndarray, "f h w 3"], state: SceneState) -> dict[str, float]:
+        """Return every measure of a video of the last clip, and of the state after it."""
+        clip, last = self.clips[-1], slice(-FRAMES_BACK, None)
+        number = clip.body_ids[self.target]
+        here = clip.ids[last] == number
+        movers = {n: c for n, c in clip.paints.items() if n == number or n >= FIRST_HAND}
+        found = region.label(frames[last], self.background, movers) == number
+        error = 100 * float(region.centroid_errors(found, here).mean()) / frames.shape[2]
+        part = clip.parts[self.target]
+        surface = transform(clip.world_from_body[self.target][-1], part.vertices_m), part.triangles
+        points = state.points_m[state.object_ids == number]
+        near = distance_to_mesh(points, surface) <= ON_SURFACE_M if len(points) else np.zeros(1)
+        return {
+            "kept": 100.0 * (error <= NEAR_PERCENT),
+            "region_psnr": region.region_psnr(frames[last], clip.frames[last], here | self.before),
+            "object_error": error,
+            "state_accuracy": 100 * float(near.mean()),
+        }
+
+
+def run(settings: LookAway) -> None:
+    """Simulate every story with each update of the state and compare what is seen at the end."""
+    check_counts({"--scenes": settings.scenes})
+    generator = open_experiment(settings)
+    spec = generator.config.video
+    seeds = list(islice(_seeds(settings, spec), settings.scenes))
+    jobs = [(case, seed) for case in CASES for seed in seeds]
+    scores: dict[str, list[dict[str, float]]] = {}
+    for case, seed in track(jobs, "scenes", total=len(jobs)):
+        story = None
+        for method in METHODS:
+            folder = settings.out / case / method.replace(", ", "_").replace(" ", "_") / str(seed)
+            if not (folder / "scores.json").exists():
+                story = story or make_story(seed, spec, case)
+                write_json(folder / "scores.json", _simulate(story, generator, method, folder))
+            scores.setdefault(f"{case}: {method}", []).append(read_json(folder / "scores.json"))
+    _report(settings.out, seeds, scores)
+    _draw(settings.out, seeds[:SHEET_SCENES], spec)
+
+
+def _report(out: Path, seeds: list[int], scores: Mapping[str, list[dict[str, float]]]) -> None:
+    table = {row: summarize(found, MEASURES) for row, found in scores.items()}
+    differences = {
+        f"{case}: {method}": {
+            measure: paired_difference(
+                [score[measure] for score in scores[f"{case}: {method}"]],
+                [score[measure] for score in scores[f"{case}: no update"]],
+            )
+            for measure in MEASURES
+        }
+        for case in CASES
+        for method in METHODS
+        if METHODS[method]
+    }
+    report = {"definitions": DEFINITIONS, "seeds": seeds, "table": table, "scores": scores}
+    write_json(out / "report.json", {**report, "differences": differences})
+    print_table("", table, MEASURES, title="after looking back: mean ± spread over scenes")
+    title = "difference from no update, with its 95 % interval"
+    print_table("", differences, MEASURES, title=title)
+
+
+def _simulate(story: Story, generator: Generator, method: str, folder: Path) -> dict[str, float]:
+    """Return the scores of one story, simulated in its folder."""
+    episode, name = to_episode(story.clips, fps=generator.config.video.fps), METHODS[method]
+    simulator = Simulator(
+        generator=generator,
+        perception=registry.parse(name).build(episode.observations()) if name else None,
+        fps=episode.fps,
+    )
+    steps = Rollout(simulator, folder).run(
+        episode.state, episode.actions, seed=story.seed, first_frame=episode.first_frame
+    )
+    *_, last = steps
+    return story.score(last.clip.frames, last.state)
+
+
+def _seeds(settings: LookAway, spec: VideoSpec) -> Iterator[int]:
+    """Yield the seeds of scenes in which an object is carried that can be out of view."""
+    for seed in count(settings.first_scene):
+        script = next(make_scripts(seed, spec=spec))
+        if script.intent.verb == "carry" and _away(script) is not None:
+            yield seed
+
+
+def _away(script: Script) -> float | None:
+    """Return the angle in radians that takes the object out of view; None if there is none."""
+    places = np.stack(
+        [moment.scene.body(script.intent.name).world_from_body[:3, 3] for moment in script.moments]
+    )
+    for sign in (1.0, -1.0):
+        turned = _turn(script.cameras, 0, sign * np.radians(AWAY_DEGREES), len(places))
+        local = transform(invert(turned.world_from_camera[-1]), places)
+        angles = np.degrees(np.arctan2(np.abs(local[:, 0]), local[:, 2]))
+        if angles.min() > OUTSIDE_DEGREES:
+            return sign * np.radians(AWAY_DEGREES)
+    return None
+
+
+def _turn(cameras: Cameras, first: float, last: float, frames: int) -> Cameras:
+    """Return cameras that turn about the vertical from one angle to another, in radians."""
+    start = cameras.world_from_camera[0]
+    poses = np.repeat(start[None], frames, axis=0)
+    for pose, share in zip(poses, np.linspace(0, 1, frames), strict=True):
+        angle = first + scripted.smooth(float(share)) * (last - first)
+        pose[:3, :3] = rotation_z(angle) @ start[:3, :3]
+    return replace(cameras, world_from_camera=poses)
+
+
+def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
+    """Return the true clips of a scene whose object is carried in view (`seen`) or out of view."""
+    script = next(make_scripts(seed, spec=spec))
+    angle, frames = _away(script), spec.frames
+    if angle is None:
+        raise ValueError(f"the object of scene {seed} cannot be out of view")
+    joints, prompt = script.action.joints_m[:, :1], script.caption
+    still = "The wearer looks around."
+    if case == "seen":
+        view = replace(script.cameras, world_from_camera=script.cameras.world_from_camera[-1:])
+        hands = [joints, *[np.repeat(joints[-1:], frames, axis=0)] * 2]
+        cameras = [script.cameras, _turn(view, 0, angle, frames), _turn(view, angle, 0, frames)]
+        prompts = [prompt, still, still]
+    else:
+        view = script.cameras
+        side = script.moments[0].hands[0].side
+        waiting = scripted.waiting_hand(side, np.random.default_rng(seed))
+        rest, _ = waiting.grip.pose(script.kind, waiting.side)
+        first = np.repeat(rest[None, None], frames, axis=0)
+        missing = np.full_like(joints, np.nan)
+        hands = [np.concatenate([first, other], axis=1) for other in (missing, joints, missing)]
+        cameras = [
+            _turn(view, 0, angle, frames), _turn(view, angle, angle, frames),
+            _turn(view, angle, 0, frames),
+        ]  # fmt: skip
+        prompts = [still] * 3
+    world, clips = World(scene=script.scene, seed=seed), []
+    for path, joint, text in zip(cameras, hands, prompts, strict=True):
+        clip, world = world.execute(
+            _action(path, joint.shape[1], script.kind, text), joints_m=joint
+        )
+        clips.append(clip)
+    target, last = script.intent.name, cameras[-1]
+    back = replace(last, world_from_camera=last.world_from_camera[-FRAMES_BACK:])
+    number = script.scene.number(target)
+    return Story(
+        seed=seed,
+        clips=tuple(clips),
+        target=target,
+        before=np.stack([picture.ids == number for picture in film_scene(script.scene, back)]),
+        background=np.stack([p.colors for p in film_scene(world.scene, back, without=target)]),
+    )
+
+
+def _action(cameras: Cameras, hands: int, kind: Kind, prompt: str) -> Action:
+    """Return an action whose hands are missing: the true world gets them separately."""
+    joints = np.full((len(cameras.world_from_camera), hands, 21, 3), np.nan)
+    return Action(cameras=cameras, joints_m=joints, kind=kind, prompt=prompt)
+
+
+def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:
+    """Draw the last clip of some scenes: ground truth, and each method."""
+    shown = []
+    for case in CASES:
+        for seed in seeds:
+            story = make_story(seed, spec, case)
+            videos = {"ground truth, first clip": story.clips[0].frames}
+            videos["ground truth"] = story.clips[-1].frames
+            for method in METHODS:
+                folder = out / case / method.replace(", ", "_").replace(" ", "_") / str(seed)
+                videos[method] = load_clip(folder / "clip_3" / "frames.npz", spec.fps).frames
+            title = f"{case}, scene {seed}, last clip: {', '.join(videos)}"
+            shown.append(SheetClip(title, list(videos.values())))
+    moments = [0, spec.frames // 4, spec.frames // 2, 3 * spec.frames // 4, spec.frames - 1]
+    draw_sheet(shown, out / "contact_sheet.png", moments=moments)
+    print(out / "contact_sheet.png")

@@ -1,0 +1,49 @@
+"""The experiments on the true tabletop world, in their smallest size; a rerun computes nothing."""
+
+import json
+
+import pytest
+
+from egosim_jax.cli.__main__ import main
+from egosim_jax.worlds.tabletop.policies import POLICIES
+
+pytestmark = pytest.mark.slow
+
+
+def test_looking_away_reports_each_case_and_method_and_resumes(weights, tmp_path, capsys):
+    out = tmp_path / "out"
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
+    command = ["experiment", "look_away", *fixed, "--scenes", "1"]
+    assert main(command) == 0
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    methods = {"update, oracle", "update, classical", "no update"}
+    assert report["table"].keys() == {f"{c}: {m}" for c in ("seen", "unseen") for m in methods}
+    assert report["table"]["seen: update, oracle"]["state_accuracy"]["mean"] > 80
+    assert report["table"]["seen: no update"]["state_accuracy"]["mean"] < 20
+    assert report["table"]["unseen: update, classical"]["state_accuracy"]["mean"] < 20
+    assert (out / "contact_sheet.png").exists()
+    assert "after looking back" in capsys.readouterr().out
+    kept = (out / "report.json").read_bytes()
+    seed = report["seeds"][0]
+    (out / "seen" / "no_update" / str(seed) / "scores.json").unlink()
+    assert main(command) == 0
+    assert (out / "report.json").read_bytes() == kept
+
+
+def test_policies_are_ranked_and_the_ranking_resumes(weights, tmp_path, capsys):
+    out = tmp_path / "out"
+    fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
+    command = ["experiment", "policies", *fixed, "--scenes", "2"]
+    assert main(command) == 0
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    assert list(report["table"]) == [policy.name for policy in POLICIES]
+    assert report["table"]["exact"]["true"]["mean"] == 100
+    assert report["table"]["never closes"]["true"]["mean"] == 0
+    assert report["agreement"].keys() == {"pearson", "spearman", "mmrv"}
+    assert (out / "ranking.png").exists()
+    assert (out / "contact_sheet.png").exists()
+    assert "MMRV" in capsys.readouterr().out
+    kept = (out / "report.json").read_bytes()
+    next((out / "scenes").glob("*.json")).unlink()
+    assert main(command) == 0
+    assert (out / "report.json").read_bytes() == kept
