@@ -1,18 +1,24 @@
-"""Rung, verdict and figures of the camera ladder on eight real clips, and the gate's two halves.
+"""Rung, verdict and figures of the camera ladder on eight real clips, and the gate tried by halves.
 
-    python -m tests.benchmarks.bench_cameras FOLDER [--clips NAME ...] [--threads 1]
+    python -m tests.benchmarks.bench_cameras FOLDER [--clips NAME ...] [--threads 1] [--out DIR]
+    python -m tests.benchmarks.bench_cameras FOLDER --verdicts DIR/verdicts.json
 
 FOLDER has dwm_triplets, real_clips and raw_clips. The hands of the published hand videos, widened
 and prolonged to the lower border, are masked. Each clip has the rungs that are right for it; any
-other one is printed as WRONG, and so is a focal length that is off by a tenth of the device's. At
-the end, the gate's figures of accepted and of refused reconstructions for each half of the clips:
-a threshold that is between them in the first half is tried on the second.
+other one is printed as WRONG, and so is a focal length that is off by a tenth of the device's.
+
+At the end thresholds are set on half of the clips and tried on the other half. A reconstruction is
+right if its clip has a right one and its focal length is the device's. The threshold of each figure
+is `--margin` times the worst of the right ones in the half; those of the view are not set by data.
+The second command does this with verdicts of an earlier run.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +28,8 @@ import tyro
 
 from egosim_jax.io.video import read_video
 from egosim_jax.perception.cameras import CameraLadder, ColmapConfig
-from egosim_jax.perception.estimates import CameraEstimate, Rung, Verdict
+from egosim_jax.perception.cameras.gate import GateConfig, refusals
+from egosim_jax.perception.estimates import CameraEstimate, Rung
 
 
 @dataclass(frozen=True)
@@ -56,12 +63,33 @@ CLIPS = {
     "lift_tumbler": Clip("raw_clips/lift_tumbler.mp4", None, ("static",), 1),
 }
 
+LIMITS = {
+    "max_depth_spread": ("depth_spread", True),
+    "max_radial": ("radial", True),
+    "max_step": ("step", True),
+    "min_angle_deg": ("angle_deg", False),
+    "min_registered": ("registered", False),
+    "min_shared": ("shared", False),
+}
+"""Figure of each threshold, and True if that is the largest value, False if the smallest."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A reconstruction of a clip by one rung."""
+
+    figures: Mapping[str, float]
+    right: bool
+    calibrated: bool
+
 
 def main(
     folder: tyro.conf.Positional[Path],
     clips: tuple[str, ...] = tuple(CLIPS),
     threads: int = -1,
     out: Annotated[Path | None, tyro.conf.arg(help="Folder for an npz of each estimate.")] = None,
+    margin: float = 2.0,
+    verdicts: Annotated[Path | None, tyro.conf.arg(help="Figures of an earlier run.")] = None,
 ) -> None:
     """Estimate the cameras of each clip and compare the verdicts with what is right.
 
@@ -69,8 +97,12 @@ def main(
         folder: With the real clips.
         clips: Names of those to run.
         threads: Of COLMAP; 1 makes it reproducible.
+        margin: Of thresholds that are set on half of the clips.
     """
-    wrong, tried = 0, []
+    if verdicts is not None:
+        print("\n".join(try_halves(json.loads(verdicts.read_text()), margin)))
+        return
+    wrong, tried = 0, {}
     for name in clips:
         clip = CLIPS[name]
         frames, moving = load(folder, clip)
@@ -85,26 +117,68 @@ def main(
             f"{seconds:.0f} s\n  {found.verdict.reason}"
         )
         print("  " + json.dumps({n: float(f"{v:.4g}") for n, v in found.verdict.figures.items()}))
-        tried.append((clip.half, found.verdict))
+        tried[name] = dict(found.verdict.figures)
         if out is not None:
             save(out / f"{name}.npz", found)
+            (out / "verdicts.json").write_text(json.dumps(tried))
     print(f"{len(clips) - wrong} of {len(clips)} verdicts right")
-    print("\n".join(margins(tried)))
+    print("\n".join(try_halves(tried, margin)))
 
 
-def margins(tried: list[tuple[int, Verdict]]) -> list[str]:
-    """Return a line for each figure of the gate: its values where accepted and where refused."""
+def attempts(verdicts: Mapping[str, Mapping[str, float]], half: int) -> list[Attempt]:
+    """Return the reconstructions of the clips of a half, with their figures."""
+    found = []
+    for name, figures in verdicts.items():
+        clip = CLIPS[name]
+        for rung in SFM if clip.half == half else ():
+            own = {
+                figure.removeprefix(f"{rung}_"): value
+                for figure, value in figures.items()
+                if figure.startswith(f"{rung}_")
+            }
+            if own:
+                right = rung in clip.right and _near(own["focal_px"], clip.focal_px)
+                found.append(Attempt(own, right, clip.device and rung != "incremental"))
+    return found
+
+
+def fit(tried: Sequence[Attempt], margin: float) -> GateConfig:
+    """Return the gate whose thresholds are a margin away from the worst right reconstruction."""
+    limits = {}
+    for limit, (figure, largest) in LIMITS.items():
+        values = [abs(one.figures[figure]) for one in tried if one.right]
+        limits[limit] = max(values) * margin if largest else min(values) / margin
+    return GateConfig(**{**limits, "min_shared": math.ceil(limits["min_shared"])})
+
+
+def try_halves(verdicts: Mapping[str, Mapping[str, float]], margin: float) -> list[str]:
+    """Return lines on thresholds that are set on one half and tried on the other."""
+    halves = {half: attempts(verdicts, half) for half in (1, 2)}
     lines = []
-    for half in (1, 2):
-        for figure in ("registered", "depth_spread", "radial", "angle_deg", "step", "view_deg"):
-            values: dict[bool, list[float]] = {True: [], False: []}
-            for _, verdict in (one for one in tried if one[0] == half):
-                for rung in SFM:
-                    if (value := verdict.figures.get(f"{rung}_{figure}")) is not None:
-                        values[rung == verdict.rung].append(value)
-            good, bad = (" ".join(f"{v:.3g}" for v in sorted(values[k])) for k in (True, False))
-            lines.append(f"half {half} {figure}: accepted {good or '-'}; refused {bad or '-'}")
-    return lines
+    for own, other in ((1, 2), (2, 1)):
+        gate = fit(halves[own], margin)
+        shown = ", ".join(f"{limit} {getattr(gate, limit):.3g}" for limit in LIMITS)
+        lines += [
+            f"set on half {own}: {shown}",
+            f"  tried on half {other}: {_judge(halves[other], gate)}",
+        ]
+    both = [*halves[1], *halves[2]]
+    return [*lines, f"the gate's own thresholds on both: {_judge(both, GateConfig())}"]
+
+
+def _judge(tried: Sequence[Attempt], gate: GateConfig) -> str:
+    accepted = [not refusals(one.figures, gate, calibrated=one.calibrated) for one in tried]
+    counts = [
+        (sum(a for one, a in zip(tried, accepted, strict=True) if one.right == right),
+         sum(one.right == right for one in tried))
+        for right in (True, False)
+    ]  # fmt: skip
+    (right, rights), (wrong, wrongs) = counts
+    return f"{right} of {rights} right ones accepted, {wrong} of {wrongs} wrong ones accepted"
+
+
+def _near(focal_px: float, known_px: float | None) -> bool:
+    return known_px is None or abs(focal_px / known_px - 1) < 0.1
 
 
 def load(folder: Path, clip: Clip) -> tuple[np.ndarray, np.ndarray]:
@@ -128,10 +202,7 @@ def is_right(found: CameraEstimate, clip: Clip) -> bool:
     rung = found.verdict.rung
     if rung not in clip.right:
         return False
-    if rung not in SFM or clip.focal_px is None:
-        return True
-    focal = found.verdict.figures[f"{rung}_focal_px"]
-    return abs(focal / clip.focal_px - 1) < 0.1
+    return rung not in SFM or _near(found.verdict.figures[f"{rung}_focal_px"], clip.focal_px)
 
 
 def save(path: Path, found: CameraEstimate) -> None:

@@ -60,17 +60,23 @@ class LandmarkHands:
         """Return the hands of a video."""
         check_video("The video", frames)
         smaller, scale = _shrunk(frames, self.max_side)
-        tracks = self._track(smaller)
+        tracks = self.tracks(self.candidates(smaller), len(frames))
         return replace(tracks, joints_px=(tracks.joints_px + 0.5) / scale - 0.5)
 
-    def _track(self, frames: np.ndarray) -> HandTracks:
+    def candidates(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Candidates:
+        """Return the possible hands of all frames, with those in gloves where there are no others.
+
+        Frames are searched at the size they have.
+        """
         found = self._candidates(frames)
-        path = self._choose(found, len(frames))
-        empty = np.all(path < 0, axis=1)
-        if self.gloves and empty.any():
+        if self.gloves and (empty := np.all(self._choose(found, len(frames)) < 0, axis=1)).any():
             gloved = self._candidates(paint_skin(frames), wanted=empty)
             found = found.join(gloved.take(gloved.presence >= self.min_gloved))
-            path = self._choose(found, len(frames))
+        return found
+
+    def tracks(self, found: Candidates, frames: int) -> HandTracks:
+        """Return the tracks among the candidates of a number of frames."""
+        path = self._choose(found, frames)
         return _as_tracks(found, path, max_gap=self.max_gap, max_motion=self.tracking.max_motion)
 
     @cached_property
