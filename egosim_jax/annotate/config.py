@@ -34,6 +34,7 @@ from egosim_jax.rendering import RendererName
 from egosim_jax.types import InputError, check_seed
 
 Side = Literal["auto", "left", "right"]
+DType = Literal["float32", "bfloat16", "float16"]
 _DEPTH = {
     "sweep": "perception.depth:SweptDepth",
     "depth-anything": "perception.networks.depth_anything:DepthAnything",
@@ -101,8 +102,10 @@ class AnnotateConfig:
     """Silhouettes of hands, arms and objects."""
     detector: Path | None = None
     """Folder of Grounding DINO, which finds what a tracker follows."""
-    device: str = "cpu"
-    """Device of the networks: cpu, cuda or cuda:N."""
+    device: str = "auto"
+    """Device of the networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
+    dtype: DType = "float32"
+    """Floating-point type of the networks."""
     phrases: tuple[str, ...] = ()
     """Objects to segment, where no network names them."""
     focal_px: float | None = None
@@ -168,19 +171,20 @@ class AnnotateConfig:
         from egosim_jax.perception.hands import LandmarkHands
 
         ladder: dict[str, Any] = {} if self.rung is None else {"rung": self.rung}
+        where: dict[str, Any] = {"device": self.device, "dtype": self.dtype}
         segmenter = captioner = None
         name, folder = _find(_MASKS, self.masks, "--masks")
         if folder is not None:
             folders = [folder] if self.detector is None else [self.detector, folder]
-            segmenter = cast(Segmenter, _import(_MASKS[name])(*folders, device=self.device))
+            segmenter = cast(Segmenter, _import(_MASKS[name])(*folders, **where))
         if self._captioner:
             name, folder = _find(_CAPTIONS, self.caption or "", "--caption")
-            captioner = cast(Captioner, _import(_CAPTIONS[name])(folder, device=self.device))
+            captioner = cast(Captioner, _import(_CAPTIONS[name])(folder, **where))
         name, folder = _find(_DEPTH, self.depth, "--depth")
         if name == "files":  # frames without a map are estimated
             name, folder = "sweep", None
         kind = _import(_DEPTH[name])
-        depth = kind() if folder is None else kind(folder, device=self.device)
+        depth = kind() if folder is None else kind(folder, **where)
         return Estimators(
             hands=LandmarkHands(
                 weights=self.hand_weights, offline=self.offline, networks=self._hand_networks()

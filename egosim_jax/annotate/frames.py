@@ -2,7 +2,7 @@
 
 - Rate: that of the video. Above 60 fps every second, third, ... frame is taken, so that 60 are not
   exceeded. Another rate takes the frame nearest in time, as EgoSim does. Frames are taken to be
-  equally spaced.
+  equally spaced; a variable frame rate is refused (`sources`).
 - Size: that of the video, reduced to at most 832 pixels on its longer side and cropped at the
   borders to multiples of 16. Another size crops what its aspect ratio does not hold; one that would
   lose more than 40 % of the picture, as landscape from portrait, is refused.

@@ -15,6 +15,8 @@ from egosim_jax.types import InputError
 
 DEPTH_SUFFIXES = {".png": 0.001, ".npy": 1.0}
 """Suffixes of depth maps, and the unit of each in meters."""
+MAX_UNEVENNESS_S = 0.1
+"""Largest distance in seconds of a frame's time from equal spacing at a constant frame rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +74,13 @@ def open_source(source: Source, depth_files: Path | None = None) -> Recording:
             raise InputError(
                 f"{quote_path(source.path)} is HDR (PQ or HLG): only standard dynamic range is "
                 "read. Convert it with a tone curve, for instance FFmpeg's zscale and tonemap."
+            )
+        if info.unevenness_s > MAX_UNEVENNESS_S:
+            raise InputError(
+                f"{quote_path(source.path)} has a variable frame rate: its frames are up to "
+                f"{info.unevenness_s:.2f} s from equal spacing, and at most {MAX_UNEVENNESS_S:g} s "
+                "is taken as constant. Convert it, for instance with `ffmpeg -i IN -fps_mode cfr "
+                f"-r {float(info.fps):.0f} OUT`."
             )
         recording = Recording(
             recording_id=source.name,

@@ -159,7 +159,7 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
 def find_cameras(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
     """Add `estimate`: what the recording knows, or what the ladder accepts; else refuse."""
     from egosim_jax.perception.cameras import CameraLadder
-    from egosim_jax.perception.cameras.triangulate import triangulate
+    from egosim_jax.perception.depth.triangulate import triangulate_frames
 
     given = _given_cameras(record)
     if given is not None:
@@ -168,7 +168,10 @@ def find_cameras(record: Record, parts: Estimators, config: AnnotateConfig) -> R
             cameras=given,
             metric=record.recording.metric,
             verdict=verdict,
-            points=_given_points(record) or triangulate(record.frames, record.moving, given),
+            points=_given_points(record)
+            or triangulate_frames(
+                record.frames, record.moving, given, depth_frames(record, config)
+            ),
         )
         return record.add("cameras", _camera_notes(estimate, "recording"), estimate=estimate)
     focal, source, estimator = record.device_focal_px, "estimated", parts.cameras
@@ -206,9 +209,7 @@ def undistort_clip(record: Record, parts: Estimators, config: AnnotateConfig) ->
 
 def find_depth(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
     """Add `depth` of the first frame, and of key frames for a fused scene."""
-    wanted = [0]
-    if config.state == "fused":
-        wanted = sorted({int(k) for k in np.linspace(0, len(record.frames) - 1, KEY_FRAMES)})
+    wanted = depth_frames(record, config)
     maps = [_given_depth(record, frame) for frame in wanted]
     if all(depth is not None for depth in maps):
         known = np.stack([depth for depth in maps if depth is not None])
@@ -223,6 +224,13 @@ def find_depth(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
     confident = float(depth.confident.mean())
     notes = {"source": config.depth, "reason": depth.reason, "confident": confident}
     return record.add("depth", notes, depth=depth)
+
+
+def depth_frames(record: Record, config: AnnotateConfig) -> list[int]:
+    """Return the frames whose depth is needed: the first, or key frames for a fused scene."""
+    if config.state == "first":
+        return [0]
+    return sorted({int(k) for k in np.linspace(0, len(record.frames) - 1, KEY_FRAMES)})
 
 
 def visible(hands: HandTracks) -> Bool[np.ndarray, "f 2"]:

@@ -73,8 +73,10 @@ class Annotate:
     Trackers are grounded-sam3=FOLDER, grounded-sam2=FOLDER and grounded-edgetam=FOLDER."""
     detector: Path | None = None
     """Folder of Grounding DINO, which finds what a tracker follows."""
-    device: str = "cpu"
-    """Device of the networks: cpu, cuda or cuda:N."""
+    device: str = "auto"
+    """Device of the networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
+    dtype: Literal["float32", "bfloat16", "float16"] = "float32"
+    """Floating-point type of the networks, but for Depth Anything 3, which chooses its own."""
     phrases: tuple[str, ...] = ()
     """Objects to segment, by name."""
     focal: float | None = None
@@ -189,6 +191,7 @@ class Annotate:
             masks=self.masks,
             detector=self.detector,
             device=self.device,
+            dtype=self.dtype,
             phrases=self.phrases,
             focal_px=self.focal,
             rung=self.rung,

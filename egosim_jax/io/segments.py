@@ -47,7 +47,8 @@ class _Listing:
 def probe_long_video(path: Path) -> VideoInfo:
     """Count the frames of a video of any length and read its size and rate.
 
-    Only the first frame is decoded. Raises `InputError` if it is not readable or damaged.
+    Only the first frame is decoded; whether all are equally spaced is known from their packets.
+    Raises `InputError` if it is not readable or damaged.
     """
     name = quote_path(path)
     with open_file(path) as file:
@@ -56,8 +57,15 @@ def probe_long_video(path: Path) -> VideoInfo:
             picture = next(_pictures(container, name, listing.keys[0][1]))
             height, width = upright(picture, np.empty((picture.height, picture.width))).shape
             stream = container.streams.video[0]
-            fps, hdr = frame_rate(stream, name), is_hdr(stream)
-    return VideoInfo(frames=len(listing.times), height=height, width=width, fps=fps, hdr=hdr)
+            fps, hdr, unit = frame_rate(stream, name), is_hdr(stream), stream.time_base
+    return VideoInfo(
+        frames=len(listing.times),
+        height=height,
+        width=width,
+        fps=fps,
+        hdr=hdr,
+        unevenness_s=_unevenness(listing.times) * float(unit or 0),
+    )
 
 
 def read_segment(
@@ -128,6 +136,12 @@ def _list(file: File, name: str) -> _Listing:
     if not times or not keys or len(set(times)) != len(times):
         raise DamagedError(f"{name} has no frames, no key frame, or two frames at one time.")
     return _Listing(times=sorted(times), keys=sorted(keys))
+
+
+def _unevenness(times: list[int]) -> float:
+    """Return the largest distance of frames from equal spacing between the first and last one."""
+    even = np.linspace(times[0], times[-1], len(times))
+    return float(np.abs(np.array(times) - even).max())
 
 
 def _pictures(container: InputContainer, name: str, dts: int) -> Iterator[VideoFrame]:

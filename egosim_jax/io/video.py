@@ -106,6 +106,8 @@ class VideoInfo:
     fps: Fraction
     hdr: bool = False
     """True if brightness is coded for HDR, by PQ or HLG: converted to 8 bits, it looks pale."""
+    unevenness_s: float = 0.0
+    """Largest distance in seconds of a frame from equal spacing; 0 if it was not measured."""
 
 
 def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from egosim_jax.data.readers import lenses
 from egosim_jax.perception.estimates import CameraEstimate, Lens
 from egosim_jax.types import InputError
 
@@ -43,8 +44,9 @@ def undistort(
             f"cameras of {cameras.width} x {cameras.height}: the sizes must be the same."
         )
     rows, columns = np.mgrid[: cameras.height, : cameras.width].astype(np.float64)
-    rays = _rays(np.stack([columns, rows], axis=-1), cameras.intrinsics_px)
-    recorded = _recorded(rays, lens, cameras.intrinsics_px).astype(np.float32)
+    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
+    rays = pixels @ np.linalg.inv(cameras.intrinsics_px).T
+    recorded = _model(lens, cameras.intrinsics_px).project(rays).astype(np.float32)
     columns, rows = recorded[..., 0].copy(), recorded[..., 1].copy()
     picture = frames.dtype == np.uint8 and frames.ndim == 4
     method = cv2.INTER_LINEAR if picture else cv2.INTER_NEAREST
@@ -68,23 +70,19 @@ def to_pinhole(
     pixels_px: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "*b 2"]:
     """Return recorded pixels as a pinhole camera with the same center sees them."""
-    center = intrinsics_px[:2, 2]
-    distorted = (pixels_px - center) / lens.focal_px
-    straight = distorted
-    for _ in range(30):
-        squared = (straight**2).sum(axis=-1, keepdims=True)
-        straight = distorted / (1 + lens.radial * squared)
-    return straight * intrinsics_px[0, 0] + center
+    rays = _model(lens, intrinsics_px).unproject(pixels_px.reshape(-1, 2))
+    return rays.reshape(pixels_px.shape) * intrinsics_px[0, 0] + intrinsics_px[:2, 2]
 
 
-def _rays(
-    pixels_px: Float[np.ndarray, "*b 2"], intrinsics_px: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "*b 2"]:
-    return (pixels_px - intrinsics_px[:2, 2]) / intrinsics_px[0, 0]
-
-
-def _recorded(
-    rays: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "*b 2"]:
-    squared = (rays**2).sum(axis=-1, keepdims=True)
-    return lens.focal_px * (1 + lens.radial * squared) * rays + intrinsics_px[:2, 2]
+def _model(lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]) -> lenses.Lens:
+    """Return the lens of the recorded frames, whose center is that of the pinhole camera."""
+    recorded = intrinsics_px.astype(float).copy()
+    recorded[[0, 1], [0, 1]] = lens.focal_px
+    height, width = (round(2 * center + 1) for center in intrinsics_px[[1, 0], 2])
+    return lenses.Lens(
+        model="brown",
+        coefficients=(lens.radial, 0.0, 0.0, 0.0, 0.0),
+        intrinsics_px=recorded,
+        height=height,
+        width=width,
+    )

@@ -8,6 +8,7 @@ frames, weighted by 1 / depth in a second pass, which makes it the error in the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,6 +140,27 @@ class Triangulation:
         cosine = np.einsum("fnc,nc->fn", rays, rays[frame])
         smallest = np.where(seen, cosine, 1).min(axis=0)
         return np.degrees(np.arccos(np.clip(smallest, -1, 1)))
+
+
+def triangulate_frames(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    moving: Bool[np.ndarray, "f h w"],
+    cameras: Cameras,
+    wanted: Sequence[int],
+) -> SparsePoints | None:
+    """Return the points of the corners of some frames; None if no corner shows parallax."""
+    parts = [Triangulation()(frames, moving, cameras, frame) for frame in wanted]
+    first = np.cumsum([0, *(len(part.points_m) for part in parts)])
+    if not first[-1]:
+        return None
+    numbers = [part.indices + start for part, start in zip(parts, first[:-1], strict=True)]
+    return SparsePoints(
+        points_m=np.concatenate([part.points_m for part in parts]),
+        error_px=np.concatenate([part.error_px for part in parts]),
+        frames=np.concatenate([part.frames for part in parts]),
+        indices=np.concatenate(numbers).astype(np.int32),
+        pixels_px=np.concatenate([part.pixels_px for part in parts]),
+    )
 
 
 def _flow(

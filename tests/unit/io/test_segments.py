@@ -50,6 +50,13 @@ def test_frames_are_counted_where_the_rate_varies(tmp_path):
     )
 
 
+def test_an_uneven_rate_is_measured(tmp_path):
+    assert probe_long_video(write(tmp_path / "even.mp4")).unevenness_s < 1e-3
+    times = [20 * index + (300 if index >= 20 else 0) for index in range(40)]  # a pause of 0.5 s
+    info = probe_long_video(write(tmp_path / "pause.mp4", times=times))
+    assert info.unevenness_s == pytest.approx(0.25, abs=0.02)
+
+
 def test_a_video_longer_than_what_is_decoded_at_once_is_probed_and_read(tmp_path, monkeypatch):
     path = write(tmp_path / "video.mp4")
     monkeypatch.setattr("egosim_jax.io.video.MAX_PIXELS", 20 * 64 * 64)

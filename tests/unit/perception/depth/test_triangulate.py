@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.depth import SweptDepth
-from egosim_jax.perception.depth.triangulate import Triangulation
+from egosim_jax.perception.depth.triangulate import Triangulation, triangulate_frames
 from egosim_jax.perception.estimates import CameraEstimate, Verdict
 from egosim_jax.types import Cameras
 
@@ -42,6 +42,16 @@ def test_corners_are_at_their_depth(frames, cameras, frame):
     assert not moving[points.frames, row, column].any()
 
 
+def test_points_of_several_frames_are_joined(frames, cameras):
+    moving = np.zeros(frames.shape[:3], bool)
+    one, other = (Triangulation()(frames, moving, cameras, frame) for frame in (0, 4))
+    both = triangulate_frames(frames, moving, cameras, [0, 4])
+    assert len(both.points_m) == len(one.points_m) + len(other.points_m)
+    last = both.indices >= len(one.points_m)
+    seen = both.points_m[both.indices[last]]
+    assert np.array_equal(seen, other.points_m[other.indices])
+
+
 def test_a_camera_that_does_not_move_triangulates_nothing(frames, cameras):
     still = np.repeat(frames[:1], FRAMES, axis=0)
     moving = np.zeros(frames.shape[:3], bool)
@@ -51,6 +61,9 @@ def test_a_camera_that_does_not_move_triangulates_nothing(frames, cameras):
         still, moving, Cameras(**{**vars(cameras), "world_from_camera": poses}), 0
     )
     assert not len(found.points_m)
+    there = np.repeat(np.eye(4)[None], FRAMES, axis=0)
+    fixed = Cameras(**{**vars(cameras), "world_from_camera": there})
+    assert triangulate_frames(still, moving, fixed, [0]) is None
 
 
 def test_cameras_without_points_have_depth(frames, cameras):
