@@ -40,6 +40,8 @@ class Tabletop(ModelExperiment):
     """Number of clips that are generated together."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    worst: int | None = None
+    """Scenes of each kind on a sheet of the worst ones, with what each lacks; None: no sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)

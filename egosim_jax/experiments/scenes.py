@@ -25,6 +25,7 @@ MEASURES = {
     "region_psnr": ("region PSNR dB", "{:.2f}"),
     "hand_iou": ("hand IoU", "{:.3f}"),
     "object_error": ("object error %", "{:.2f}"),
+    "object_lost": ("object lost %", "{:.1f}"),
 }
 DEFINITIONS = {
     "psnr, ssim": "as in evaluate, frames 1 to the last",
@@ -35,6 +36,7 @@ DEFINITIONS = {
     "ground-truth ids; mean over frames",
     "object_error": "distance of the centroid of the manipulated object, segmented by color, from "
     "its ground truth, in percent of the width; mean over the frames in which it is visible",
+    "object_lost": "frames without a pixel of its color, in percent of those that show it",
 }
 SHEET_SCENES = 4
 """Scenes on a contact sheet."""
@@ -76,13 +78,17 @@ class HeldOutClip:
             "region_psnr": region.region_psnr(video[1:], target, hands | body),
             "hand_iou": region.silhouette_iou(region.open_mask(seen >= FIRST_HAND), hands),
             "object_error": 100 * float(np.mean(errors)) / ids.shape[2] if len(errors) else np.nan,
+            "object_lost": 100 * region.lost_share(seen == number, body),
         }
 
-    def on_sheet(self, videos: Mapping[str, np.ndarray]) -> SheetClip:
-        """Return conditions, videos by name, and ground truth for a contact sheet."""
+    def on_sheet(self, videos: Mapping[str, np.ndarray], *, note: str = "") -> SheetClip:
+        """Return conditions, videos by name, and ground truth for a contact sheet.
+
+        The title is a note on the clip, or the names of its rows.
+        """
         names = ", ".join(("prior", "hands", *videos, "ground truth"))
         return SheetClip(
-            f"{self.triplet.video_id}: {self.clip.caption}   ({names})",
+            f"{self.triplet.video_id}: {self.clip.caption}   {note or f'({names})'}",
             [self.triplet.prior, self.triplet.hands, *videos.values(), self.clip.frames],
         )
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-from egosim_jax.data.sheet import SheetClip, draw_sheet
+import numpy as np
+
+from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.experiments.config import Tabletop
+from egosim_jax.experiments.failures import worst
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
@@ -23,9 +27,12 @@ from egosim_jax.generator import Generator
 from egosim_jax.io.run import write_json
 from egosim_jax.metrics.report import paired_difference, print_table, summarize
 from egosim_jax.progress import track
-from egosim_jax.types import Kind, check_counts
+from egosim_jax.types import Kind, VideoSpec, check_counts
 
 Table = dict[str, dict[str, dict[str, float]]]
+Scores = list[dict[str, float]]
+CEILING = "ground truth through the autoencoder"
+"""Name of the row of the clips that are encoded and decoded."""
 METHODS: tuple[tuple[str, DroppedCondition | None], ...] = (
     ("full", None),
     ("without prior", "prior"),
@@ -43,6 +50,17 @@ DIFFERENCES = {
 }
 
 
+class Found(NamedTuple):
+    """Findings of an experiment on the scenes of one kind of hands."""
+
+    table: Table
+    """Measures of the methods."""
+    differences: Table
+    """Differences of the methods from the first."""
+    worst: list[dict[str, Any]]
+    """Scenes of the sheet of the worst, with what each lacks."""
+
+
 def run(settings: Tabletop) -> None:
     """Make the scenes, generate, compare, draw."""
     check_counts(
@@ -50,6 +68,7 @@ def run(settings: Tabletop) -> None:
             "--scenes": settings.scenes,
             "--seeds": settings.seeds,
             "--batch-size": settings.batch_size,
+            "--worst": settings.worst,
         }
     )
     generator = open_experiment(settings)
@@ -57,54 +76,69 @@ def run(settings: Tabletop) -> None:
     found = {kind: _compare(settings, kind, generator) for kind in kinds}
     report = {
         "definitions": {**DEFINITIONS, **SPREAD, **DIFFERENCES},
-        "tables": {kind: table for kind, (table, _) in found.items()},
-        "differences": {kind: differences for kind, (_, differences) in found.items()},
+        "tables": {kind: one.table for kind, one in found.items()},
+        "differences": {kind: one.differences for kind, one in found.items()},
+        "worst": {kind: one.worst for kind, one in found.items()},
     }
     write_json(settings.out / "report.json", report)
-    for kind, (table, differences) in found.items():
+    for kind, (table, differences, _) in found.items():
         title = f"{kind}: mean ± spread over scenes (± over seeds)"
         print_table("", table, MEASURES, title=title)
         title = f"{kind}: what dropping a condition changes, with its 95 % interval"
         print_table("", differences, MEASURES, title=title)
 
 
-def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> tuple[Table, Table]:
-    """Score every method on the scenes of one kind of hands, and draw their contact sheet.
-
-    Returns the table of the methods, and that of the differences from the first.
-    """
-    spec, size = generator.config.video, settings.batch_size
+def _make_scenes(settings: Tabletop, kind: Kind, spec: VideoSpec) -> list[HeldOutClip]:
     seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
-    scenes = [
+    return [
         HeldOutClip.make(seed, spec, kind, black_cloths=settings.black_cloths)
         for seed in track(seeds, f"making {kind} scenes", total=settings.scenes)
     ]
+
+
+def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Found:
+    """Score every method on the scenes of one kind of hands, and draw their contact sheets."""
+    spec, size = generator.config.video, settings.batch_size
+    scenes = _make_scenes(settings, kind, spec)
     table: Table = {}
-    by_scene: dict[str, list[dict[str, float]]] = {}
-    shown: list[SheetClip] = []
+    by_scene: dict[str, Scores] = {}
+    generated: list[np.ndarray] = []
+    first: Scores = []
     for name, dropped in METHODS:
         runs = []
         for seed in track(range(settings.seeds), f"{kind}, {name}", total=settings.seeds):
             videos = list(generate(generator, scenes, batch_size=size, seed=seed, without=dropped))
             runs.append(evaluate(scenes, videos))
             if dropped is None and seed == 0:
-                shown = [
-                    scene.on_sheet({"generated": video})
-                    for scene, video in zip(scenes, videos, strict=True)
-                ]
+                generated, first = videos, runs[0]
         table[name], by_scene[name] = summarize_runs(runs), over_seeds(runs)
+    coded = list(reconstruct(generator, scenes, batch_size=size))
     others = {
         **baselines(scenes),
-        "ground truth through the autoencoder": list(
-            reconstruct(generator, scenes, batch_size=size)
-        ),
+        CEILING: coded,
         "ground truth": [scene.clip.frames for scene in scenes],
     }
-    for name, videos in others.items():
-        table[name] = summarize_runs([evaluate(scenes, videos)])
+    scores = {name: evaluate(scenes, videos) for name, videos in others.items()}
+    table |= {name: summarize_runs([one]) for name, one in scores.items()}
+    shown = [
+        scene.on_sheet({"generated": video})
+        for scene, video in zip(scenes[:SHEET_SCENES], generated, strict=False)
+    ]
     sheet = settings.out / f"contact_sheet_{kind}.png"
-    draw_sheet(shown[:SHEET_SCENES], sheet, moments=SHEET_MOMENTS)
-    return table, differences_from("full", by_scene)
+    draw_sheet(shown, sheet, moments=SHEET_MOMENTS)
+    notes: list[dict[str, Any]] = []
+    if settings.worst is not None:
+        videos = {"generated": generated, "through the autoencoder": coded}
+        found = worst(first, scores[CEILING], settings.worst)
+        notes = [{"scene": scenes[n].clip.seed, "lacks": lacking} for n, lacking in found.items()]
+        rows = [
+            scenes[n].on_sheet(
+                {name: of[n] for name, of in videos.items()}, note="; ".join(lacking)
+            )
+            for n, lacking in found.items()
+        ]
+        draw_sheet(rows, settings.out / f"worst_{kind}.png", moments=SHEET_MOMENTS)
+    return Found(table, differences_from("full", by_scene), notes)
 
 
 def differences_from(

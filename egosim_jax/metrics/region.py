@@ -19,7 +19,7 @@ from egosim_jax.metrics.image import decibels
 SHADES = (0.45, 1.15)
 """Range of light on a surface."""
 MIN_VISIBLE_PX = 20
-"""Fewest visible pixels of an object in a frame whose centroid is compared."""
+"""Fewest visible pixels of an object in a frame in which it is searched."""
 CENTROID_RADIUS = 0.12
 """Radius around an object's median pixel within which pixels count, as a fraction of the width."""
 
@@ -83,12 +83,23 @@ def centroid_errors(
     image width away.
     """
     width = target.shape[2]
+    shown = _visible(target)
     errors = []
-    for here, there in zip(found, target, strict=True):
-        if there.sum() >= MIN_VISIBLE_PX:
-            gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
-            errors.append(np.hypot(*gap))
+    for here, there in zip(found[shown], target[shown], strict=True):
+        gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
+        errors.append(np.hypot(*gap))
     return np.array(errors)
+
+
+def lost_share(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
+    """Return the share of the frames that show a target in which nothing was found; else NaN."""
+    shown = _visible(target)
+    return float((~found[shown].any(axis=(1, 2))).mean()) if shown.any() else float("nan")
+
+
+def _visible(silhouettes: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, " f"]:
+    """Return the frames in which enough pixels are visible."""
+    return silhouettes.sum(axis=(1, 2)) >= MIN_VISIBLE_PX
 
 
 def _centroid(silhouette: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:

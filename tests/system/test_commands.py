@@ -221,7 +221,7 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
     monkeypatch.setattr(lpips, "load_if_installed", lambda name: None)  # slow in the tests' code
     out = tmp_path / "out"
     fixed = ["--steps", "2", "--config", "debug", "--weights", str(weights), "--out", str(out)]
-    counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2"]
+    counts = ["--scenes", "2", "--seeds", "2", "--batch-size", "2", "--worst", "1"]
     assert main(["experiment", "tabletop", *fixed, *counts]) == 0
     assert json.loads((out / "config.json").read_text("utf-8"))["model"]["steps"] == 2
     report = json.loads((out / "report.json").read_text("utf-8"))
@@ -240,6 +240,11 @@ def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
     assert human["prior copied"]["region_psnr"]["mean"] < 30
     assert (out / "contact_sheet_human.png").exists()
     assert (out / "contact_sheet_robot.png").exists()
+    (worst,) = report["worst"]["human"]
+    assert worst["scene"] in (100, 101)
+    assert any("hand IoU 0." in text for text in worst["lacks"])
+    with Image.open(out / "worst_human.png") as sheet:
+        assert sheet.size == (6 * 96, 16 + 5 * 64)
     assert "without hands" in capsys.readouterr().out
 
 

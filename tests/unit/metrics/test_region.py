@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from egosim_jax.metrics.region import centroid_errors, label, open_mask, region_psnr, silhouette_iou
+from egosim_jax.metrics.region import (
+    centroid_errors,
+    label,
+    lost_share,
+    open_mask,
+    region_psnr,
+    silhouette_iou,
+)
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
@@ -75,6 +82,13 @@ def test_the_distance_of_centroids_leaves_stray_pixels_out():
     found = discs((13, 14), (10, 10), (40, 90), (10, 10))
     found[0] |= discs((28, 44), radius=1)[0]
     np.testing.assert_allclose(centroid_errors(found, truth), [5, 0, 48])
+
+
+def test_an_object_is_lost_in_the_frames_that_show_it_where_nothing_was_found():
+    truth = discs((10, 10), (10, 10), (10, 10), (40, 90))
+    found = discs((13, 14), (40, 90), (10, 10), (10, 10))
+    assert lost_share(found, truth) == pytest.approx(1 / 3)
+    assert np.isnan(lost_share(found, np.zeros_like(truth)))
 
 
 @pytest.mark.parametrize(("kind", "least"), [("human", 0.85), ("robot", 0.75)])
