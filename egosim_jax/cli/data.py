@@ -12,6 +12,7 @@ import tyro
 
 from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.imports import Import
+from egosim_jax.cli.triplets import Align, ToDwm
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
 from egosim_jax.types import WAN_GRID, VideoGrid, VideoSpec, check_counts
@@ -35,7 +36,7 @@ class Pack:
     """
 
     metadata: Path
-    """CSV or JSONL in EgoSim's columns.
+    """CSV or JSONL in EgoSim's columns; or a list of DWM, .txt.
 
     They are video, ego_prior_video, hand_keypoint_video, first_frame, prompt and video_id."""
     out: Path
@@ -330,6 +331,8 @@ class Data:
         | Annotated[Look, tyro.conf.subcommand("look")]
         | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
+        | Annotated[Align, tyro.conf.subcommand("align")]
+        | Annotated[ToDwm, tyro.conf.subcommand("to-dwm")]
     )
 
     def run(self) -> int:

@@ -32,7 +32,7 @@ class Generate:
     config: str
     """Name of the model."""
     metadata: Path | None = None
-    """CSV or JSONL in EgoSim's columns; without it, a scene of the tabletop world from the seed.
+    """CSV or JSONL in EgoSim's columns, or a list of DWM; without it, scenes of the tabletop world.
 
     The columns are ego_prior_video, hand_keypoint_video, first_frame, prompt, video_id, and video
     if the ground truth is known. The scene is written to OUT/scenes."""
@@ -113,7 +113,15 @@ class Generate:
         if windows is None:
             seeds = range(self.seed, self.seed + (self.limit or 1))
             kind = "robot" if self.robot else "human"
-            scenes = write_scenes(job.out / "scenes", seeds, spec=job.model.video, kind=kind)
+            static = job.model.layout.mask_packing == "observed"
+            scenes = write_scenes(
+                job.out / "scenes",
+                seeds,
+                spec=job.model.video,
+                kind=kind,
+                prior="static" if static else "state",
+                hands="mesh" if static else "skeleton",
+            )
             windows = self._windows(scenes)
         outcome = job.generate(windows)
         if outcome.rejected == len(windows):

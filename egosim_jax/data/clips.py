@@ -27,8 +27,9 @@ from egosim_jax.data.metadata import MASK_NAME, SAFE_IDS, ClipFiles, csv_rows, i
 from egosim_jax.data.transforms import fit_length, resize_image, resize_mask
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text
+from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.video import (
+    MAX_IMAGE_BYTES,
     Damage,
     Decoding,
     VideoInfo,
@@ -203,7 +204,9 @@ def _fit_mask(frame: UInt8[np.ndarray, "h w 3"], *, height: int, width: int) -> 
 
 def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
     """Return the videos to read; the lenient policy omits a missing mask or target."""
-    videos = {"prior": files.prior, "hands": files.hands, "mask": files.mask}
+    videos = {"prior": files.prior, "hands": files.hands}
+    if files.mask is not None:
+        videos["mask"] = files.mask
     if files.target is not None:
         videos["target"] = files.target
     if policy == "lenient":
@@ -251,3 +254,12 @@ def _read_first_frame(path: Path, decoding: Decoding = "accurate") -> UInt8[np.n
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return read_video(path, stop=1, decoding=decoding).frames[0]
     return read_image(path)
+
+
+def encoded_first_frame(path: Path) -> bytes:
+    """Return an image file, or the first frame of a video as PNG."""
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        return read_bytes(path, limit=MAX_IMAGE_BYTES)
+    buffer = io.BytesIO()
+    Image.fromarray(_read_first_frame(path)).save(buffer, "PNG")
+    return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Metadata of clips: a table in EgoSim's columns, as CSV or as JSON lines.
+"""Metadata of clips: a table in EgoSim's columns, as CSV or as JSON lines, or a list of DWM.
 
     column               holds                                          default without the column
     video                the recorded video (ground truth)              no ground truth
@@ -63,8 +63,8 @@ class ClipFiles:
     """Caption of the clip."""
     prior: Path
     """Video of the rendered scene."""
-    mask: Path
-    """Video of the mask: white where the prior shows nothing."""
+    mask: Path | None
+    """Video of the mask: white where the prior shows nothing; None: it shows everything."""
     hands: Path
     """Video of the hand skeletons."""
     first_frame: Path
@@ -80,11 +80,16 @@ class ClipFiles:
 def read_metadata(path: Path) -> list[ClipFiles]:
     """Read every row of a metadata file (`.csv`, or `.jsonl` with one object per line).
 
-    Raises one `InputError` that lists the problems: missing columns, empty cells (which the
-    official loader reads as the text "nan"), cells beyond the header, unsafe and duplicate ids.
+    A `.txt` is a list of DWM (`data/dwm.py`). Raises one `InputError` that lists the problems:
+    missing columns, empty cells (which the official loader reads as the text "nan"), cells beyond
+    the header, unsafe and duplicate ids.
     """
+    if path.suffix == ".txt":
+        from egosim_jax.data.dwm import read_list
+
+        return read_list(path)
     clips: list[ClipFiles] = []
-    problems = _Problems()
+    problems = Problems()
     first_seen: dict[str, int] = {}
     for line, row in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
         found = list(_row_problems(row, first_seen))
@@ -154,13 +159,14 @@ def _some(values: Sequence[str]) -> str:
     return shown + (f" and {len(values) - 20:,} more" if len(values) > 20 else "")
 
 
-class _Problems:
-    """The first problems of a possibly long list, and their number."""
+class Problems:
+    """First problems of a possibly long list, and their number."""
 
     def __init__(self, most: int = 10):
         self._most, self._shown, self._count = most, list[str](), 0
 
     def add(self, problems: Iterable[str]) -> None:
+        """Count problems, and keep them if they are among the first."""
         for problem in problems:
             self._count += 1
             if self._count <= self._most:

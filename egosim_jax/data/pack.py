@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.data.clips import check_clip, load_triplet
+from egosim_jax.data.clips import check_clip, encoded_first_frame, load_triplet
 from egosim_jax.data.metadata import ClipFiles, check_presence
 from egosim_jax.data.records import Record
-from egosim_jax.data.shards import ShardWriter
+from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.data.transforms import decode_record, video_shape
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import listing, read_bytes
 from egosim_jax.io.video import Decoding
@@ -78,18 +79,16 @@ def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID) -> Record:
     problems = check_clip(files, None, grid=grid)
     if problems:
         raise InputError(listing(problems))
-    paths = {
-        "prior": files.prior,
-        "hands": files.hands,
-        "mask": files.mask,
-        "first_frame": files.first_frame,
-    }
+    paths = {"prior": files.prior, "hands": files.hands}
+    if files.mask is not None:
+        paths["mask"] = files.mask
     if files.target is not None:
         paths["target"] = files.target
     arrays = {
         name: np.frombuffer(read_bytes(path, limit=MAX_FILE), np.uint8)
         for name, path in paths.items()
     }
+    arrays["first_frame"] = np.frombuffer(encoded_first_frame(files.first_frame), np.uint8)
     return Record(arrays=arrays, metadata=clip_metadata(files))
 
 
@@ -114,3 +113,25 @@ def triplet_record(triplet: Triplet) -> Record:
     if triplet.target is not None:
         arrays["target"] = triplet.target
     return Record(arrays=arrays, metadata=clip_metadata(triplet))
+
+
+def read_triplets(source: ShardReader) -> Iterator[Triplet]:
+    """Yield the clips of shards of frames or videos at their own length and size.
+
+    Raises `InputError` for shards of latents or without targets.
+    """
+    manifest = source.manifest
+    if manifest.kind == "latents" or "target" not in manifest.arrays:
+        raise InputError(
+            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}: it must be "
+            "videos or frames with their target. (--shards)"
+        )
+    for number, record in enumerate(source):
+        try:
+            frames, height, width = video_shape(record.arrays)
+            spec = VideoSpec(frames=frames, height=height, width=width)
+            arrays: dict[str, Any] = decode_record(record.arrays, spec)
+        except InputError as error:
+            raise InputError(f"{source.name(number)}: {error}") from error
+        names = {name: str(record.metadata.get(name, "")) for name in ("video_id", "prompt")}
+        yield Triplet(**names, **arrays, extra=record.metadata.get("extra", {}))

@@ -90,10 +90,18 @@ class RandomCrop(grain.transforms.RandomMap):
 
 def record_length(arrays: Mapping[str, np.ndarray]) -> int:
     """Return the number of frames of a record's prior, encoded or decoded."""
+    return video_shape(arrays)[0]
+
+
+def video_shape(arrays: Mapping[str, np.ndarray]) -> tuple[int, int, int]:
+    """Return frames, height and width of a record's prior, encoded or decoded."""
     prior = arrays.get("prior")
     if prior is None:
         raise InputError("The record is not a clip: prior is missing.")
-    return len(prior) if prior.ndim > 1 else probe_encoded(prior.tobytes(), name="prior").frames
+    if prior.ndim > 1:
+        return prior.shape[0], prior.shape[1], prior.shape[2]
+    info = probe_encoded(prior.tobytes(), name="prior")
+    return info.frames, info.height, info.width
 
 
 def decode_record(
@@ -105,11 +113,12 @@ def decode_record(
 ) -> dict[str, np.ndarray]:
     """Return frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
 
-    Raises `InputError` naming the video that cannot be decoded or is too short.
+    Without a mask everything is observed. Raises `InputError` naming the video that cannot be
+    decoded or is too short.
     """
     stop = start + spec.frames
     decoded: dict[str, np.ndarray] = {}
-    absent = [name for name in ("prior", "hands", "mask", "first_frame") if name not in arrays]
+    absent = [name for name in ("prior", "hands", "first_frame") if name not in arrays]
     if absent:
         raise InputError(f"The record is not a clip: missing {', '.join(absent)}.")
     for name in (*COLORS, "mask"):
@@ -123,6 +132,8 @@ def decode_record(
             decoded[name] = resize_mask(mask, spec.height, spec.width)
         else:
             decoded[name] = resize_video(frames, spec.height, spec.width)
+    if "mask" not in decoded:
+        decoded["mask"] = np.zeros((spec.frames, spec.height, spec.width), np.uint8)
     image = arrays["first_frame"]
     image = decode_image(image.tobytes(), name="first_frame") if image.ndim == 1 else image
     decoded["first_frame"] = resize_image(image, spec.height, spec.width)

@@ -125,12 +125,7 @@ def put(
     canvas: Canvas,
     tile: Int[Array, " k"],
     depth: Float32[Array, "k p p"],
-    colors: UInt8[
-        Array,
-        (
-            k  # p #p 3
-        ),
-    ],
+    colors: UInt8[Array, "k q r 3"],
 ) -> Canvas:
     """Draw each shape into its tile; of equally near ones the first is seen."""
     before, picture = canvas

@@ -1,0 +1,130 @@
+"""DWM's folders and lists: what is written is read, and what is wrong is named."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.data.clips import check_clip, load_triplet
+from egosim_jax.data.dwm import write_folders
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.pack import pack, read_triplets
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.transforms import decode_record
+from egosim_jax.io.video import write_video
+from egosim_jax.types import InputError, Triplet, VideoSpec
+
+SPEC = VideoSpec(frames=5, height=32, width=48)
+
+
+def make_triplet(name, seed=0):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:32, :48]
+    prior, hands, target = (
+        np.stack([(3 * x + 2 * y + shift + 4 * f)[..., None] % 200 + [0, 20, 40] for f in range(5)])
+        for shift in rng.integers(0, 60, 3)
+    )
+    return Triplet(
+        video_id=name,
+        prompt="The hand opens the drawer.",
+        prior=prior.astype(np.uint8),
+        mask=np.zeros((5, 32, 48), np.uint8),
+        hands=hands.astype(np.uint8),
+        first_frame=prior[0].astype(np.uint8),
+        target=target.astype(np.uint8),
+    )
+
+
+@pytest.fixture
+def root(tmp_path):
+    triplets = [make_triplet("home/open/00000"), make_triplet("home/carry/00000", 1)]
+    write_folders(tmp_path, triplets, name="train", fps=8)
+    return tmp_path
+
+
+def near(video, other):
+    return np.abs(video.astype(int) - other).mean() < 8
+
+
+def test_a_written_list_is_read(root):
+    path = root / "dataset_files" / "train.txt"
+    assert path.read_text("utf-8").splitlines() == [
+        "home/open/videos/00000.mp4",
+        "home/carry/videos/00000.mp4",
+    ]
+    clips = read_metadata(path)
+    assert [clip.video_id for clip in clips] == [
+        "home_open_videos_00000",
+        "home_carry_videos_00000",
+    ]
+    assert not check_clip(clips[1], SPEC)
+    triplet, given = load_triplet(clips[1], SPEC), make_triplet("home/carry/00000", 1)
+    assert triplet.prompt == given.prompt
+    assert not triplet.mask.any()
+    for name in ("prior", "hands", "target", "first_frame"):
+        assert near(getattr(triplet, name), getattr(given, name))
+    assert not near(triplet.prior, given.target)
+
+
+def test_a_list_may_be_in_the_root(root):
+    text = (root / "dataset_files" / "train.txt").read_text("utf-8")
+    (root / "own.txt").write_text(f"\n{text}\n", "utf-8")
+    assert len(read_metadata(root / "own.txt")) == 2
+
+
+def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
+    folder = root / "home" / "open"
+    (folder / "prompts_rewrite" / "00000.txt").unlink()
+    (folder / "prompts" / "00000.txt").write_text("I open\nthe drawer. \n", "utf-8")
+    assert read_metadata(root / "dataset_files" / "train.txt")[0].prompt == "I open the drawer."
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("home/open/videos/00000.mp4\n../x/videos/1.mp4", "without '..'"),
+        ("home/open/videos/00000.mp4\nhome/open/videos/00000.mp4", "another line"),
+        ("home/open/videos/00000.mp4\nhome/open/00000.mp4", "in a folder videos"),
+        ("home/open/videos/00000.mp4\nhome/open/videos/7.mp4", "prompts_rewrite/7.txt"),
+        ("home/else/videos/00000.mp4", "--metadata"),
+        ("\n\n", "lists 0 clips"),
+    ],
+)
+def test_wrong_lists_are_refused(root, lines, message):
+    path = root / "dataset_files" / "wrong.txt"
+    path.write_text(lines, "utf-8")
+    with pytest.raises(InputError, match=message):
+        read_metadata(path)
+
+
+def test_videos_that_disagree_are_named(root):
+    clip = read_metadata(root / "dataset_files" / "train.txt")[0]
+    write_video(clip.hands, make_triplet("a").hands[:4], 8)
+    (problem,) = check_clip(clip, SPEC)
+    assert "frame counts disagree: prior 5, hands 4, target 5" in problem
+    write_video(clip.hands, make_triplet("a").hands[:, :16], 8)
+    assert "sizes disagree" in check_clip(clip, SPEC)[0]
+
+
+def test_videos_are_packed_without_a_mask_and_written_again(root, tmp_path):
+    clips = read_metadata(root / "dataset_files" / "train.txt")
+    shards = tmp_path / "shards"
+    assert list(pack(clips, out=shards, spec=None, provenance={})) == [None, None]
+    reader = ShardReader(shards)
+    assert "mask" not in reader.manifest.arrays
+    decoded = decode_record(reader[0].arrays, SPEC)
+    assert not decoded["mask"].any()
+    assert (decoded["first_frame"] == decoded["prior"][0]).all()
+    path = write_folders(tmp_path / "again", read_triplets(reader), name="again", fps=8)
+    first, again = (load_triplet(read_metadata(p)[0], SPEC) for p in (clips_list(root), path))
+    assert near(first.target, again.target)
+    assert again.prompt == first.prompt
+
+
+def clips_list(root):
+    return root / "dataset_files" / "train.txt"
+
+
+def test_triplets_without_a_recorded_video_are_refused(tmp_path):
+    from dataclasses import replace
+
+    with pytest.raises(InputError, match="must have a target"):
+        write_folders(tmp_path, [replace(make_triplet("a"), target=None)], name="x", fps=8)
