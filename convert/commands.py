@@ -28,6 +28,8 @@ from egosim_jax.progress import track, track_bytes
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.models import NetworkConfig
+    from egosim_jax.models.lora import Change
     from egosim_jax.networks import ModelConfig
 
 Dtype = Literal["float32", "bfloat16", "float16"]
@@ -213,6 +215,10 @@ class Lora:
     """Strength of the LoRA in a merge."""
     base: Path | None = None
     """Weights folder that it was trained on, whose hash is written to the file's header."""
+    layout: Literal["dwm"] | None = None
+    """Layout to write instead of one file: `dwm`, a folder as DWM publishes.
+
+    A LoRA in the names of PEFT or, on Wan, of VideoX-Fun, and next to it the patch projection."""
 
     def run(self) -> int:
         """Read the LoRA, check it, write."""
@@ -240,6 +246,8 @@ class Lora:
         origin = [self.source]
         if self.source.is_dir():
             origin = sorted(file for file in self.source.iterdir() if file.is_file())
+        if self.layout == "dwm":
+            return self._write_checkpoint(changes, config, origin)
         if self.merge is None:
             metadata = exported_metadata(changes)
             for known in (*base, *filter(None, [metadata_of(self.source).get(BASE)])):
@@ -259,6 +267,31 @@ class Lora:
         with lock_folder(self.out):
             _write(self.out / file.name, weights, origin=[file, *origin], metadata=metadata)
             link_others(self.out, self.merge)
+        return command.ExitCode.DONE
+
+    def _write_checkpoint(
+        self, changes: Mapping[str, Change], config: NetworkConfig, origin: Sequence[Path]
+    ) -> int:
+        """Write the folder of a checkpoint of DWM."""
+        from egosim_jax.convert.checkpoint import checkpoint
+        from egosim_jax.io.mapped import read_safetensors
+
+        if self.merge is not None:
+            raise InputError(
+                "--merge and --layout dwm exclude each other: a checkpoint is not merged. Omit one "
+                "of them."
+            )
+        base = None if self.base is None else read_safetensors(self.base / "dit.safetensors")
+        with lock_folder(self.out):
+            for stem, tensors in checkpoint(changes, config, base).items():
+                weights = [
+                    Weight(
+                        name=name, shape=array.shape, dtype=array.dtype, pieces=(lambda a=array: a,)
+                    )
+                    for name, array in tensors.items()
+                ]
+                target = self.out / f"{stem}.safetensors"
+                _write(target, weights, origin=origin, metadata={"format": "pt"})
         return command.ExitCode.DONE
 
 

@@ -166,7 +166,7 @@ def _values(
     source: Source, config: NetworkConfig, want: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Change]:
     """Return the weights in full of a file by path."""
-    known = _locations(config, want, PREFIXES)
+    known = _locations(config, PREFIXES)
     changes: dict[str, Change] = {}
     problems = []
     for key, tensor in source.tensors.items():
@@ -241,7 +241,7 @@ def _translated(
     """Convert a file in a foreign naming; shapes are checked before values are read."""
     namings = table_of(config).namings.values()
     prefixes = (*PREFIXES, *(naming.lora_prefix for naming in namings if naming.lora_prefix))
-    known = _locations(config, want, prefixes)
+    known = _locations(config, prefixes)
     low_rank: dict[Location, dict[str, Tensor]] = {}
     full: dict[Location, Tensor] = {}
     problems, text = [], 0
@@ -359,7 +359,7 @@ def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, 
         )
     tensors, prefix = {}, naming.lora_prefix
     suffixes = {kind: suffix for suffix, kind in FULL.items()}
-    known = _by_name(naming.rules(config), weight_shapes(config))
+    known = locations_by_name(config, naming.rules(config))
     for key, location in known.items():
         name, _, kind = key.rpartition(".")
         layer = ... if location.layer is None else location.layer
@@ -382,18 +382,18 @@ def exported_metadata(changes: Mapping[str, Change]) -> dict[str, str]:
     return {"format": "pt"} | ({"rank": rank, "alpha": rank} if ranks else {})
 
 
-def _locations(
-    config: NetworkConfig, want: Mapping[str, tuple[int, ...]], prefixes: Sequence[str]
-) -> dict[str, Location]:
+def _locations(config: NetworkConfig, prefixes: Sequence[str]) -> dict[str, Location]:
     """Return the weights by their plain names in all namings; earlier ones take precedence."""
     known: dict[str, Location] = {}
     for naming in table_of(config).namings.values():
-        named = _by_name(naming.rules(config), want)
+        named = locations_by_name(config, naming.rules(config))
         known = {_plain(name, prefixes): location for name, location in named.items()} | known
     return known
 
 
-def _by_name(rules: Sequence[Rule], want: Mapping[str, tuple[int, ...]]) -> dict[str, Location]:
+def locations_by_name(config: NetworkConfig, rules: Sequence[Rule]) -> dict[str, Location]:
+    """Return the weights of a network by their names in a naming."""
+    want = weight_shapes(config)
     return {
         rule.source.replace("*", str(layer)): Location(rule.target, layer, rule)
         for rule in rules

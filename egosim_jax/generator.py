@@ -97,7 +97,7 @@ class Inputs:
                 image_size=config.image.image_size,
                 image_range=config.image_range,
             ),
-            image=config.zero_image(len(triplets)),
+            image=config.given_image(triplets),
             seeds=None if seeds is None or config.encoding_noise is None else _uint32(seeds),
         )
 
@@ -172,6 +172,10 @@ def denoise(
 
     `keys`, one for each item, draw the noise that a stochastic solver adds.
     """
+    if config.strength is not None and condition.prior is not None:
+        first = jnp.asarray(config.process.times(config.visited)[0], jnp.float32)
+        noise = config.process.add_noise(condition.prior, noise, first)
+        condition = condition.drop("prior")
     channels = config.layout.condition_channels(condition, noise)
 
     def branch(text: Array) -> DenoiseFn:
@@ -187,7 +191,7 @@ def denoise(
         noise,
         process=config.process,
         solver=config.solver,
-        steps=config.steps,
+        steps=config.visited,
         keys=keys,
     )
 

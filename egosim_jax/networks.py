@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -36,7 +36,7 @@ from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.types import InputError, VideoGrid, VideoSpec, check_counts
+from egosim_jax.types import InputError, Triplet, VideoGrid, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
 """Role of a network in a model, which is also the stem of its file of weights."""
@@ -62,9 +62,9 @@ class ModelConfig:
     image: ImageEncoderConfig | None = field(default_factory=CLIPVisionConfig)
     """Config of the image encoder; None for models without the image branch."""
     zero_image_tokens: int | None = None
-    """Number of zeros that the denoiser gets for image tokens, without an encoder (DWM on Wan).
+    """Number of image tokens that the denoiser gets without an encoder: zeros (DWM on Wan).
 
-    They are tokens of the image encoder's width, in training as at generation."""
+    So in training as at generation; a triplet may have others (`tokens`)."""
     layout: ChannelLayout = field(default_factory=ChannelLayout)
     """Input channels of the denoiser."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
@@ -88,6 +88,10 @@ class ModelConfig:
 
     Guidance pushes away from it, and a prompt that is dropped in training is replaced by it.
     """
+    strength: float | None = None
+    """Share of the steps that are taken, from the prior with that much noise (SDEdit).
+
+    The prior is then no condition. None: all steps, from noise alone."""
     steps: int | tuple[int | float, ...] = 50
     """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
 
@@ -122,7 +126,7 @@ class ModelConfig:
                 "they must be square. (dit.patch)"
             )
         # Raises if the solver does not fit the process, or the steps.
-        self.solver.coefficients(self.process, self.process.times(self.steps))
+        self.solver.coefficients(self.process, self.process.times(self.visited))
         self.grid.check(self.video)
         frames, patch = self.latent_shape[0], dit.patch[0]
         if frames % patch:
@@ -146,9 +150,37 @@ class ModelConfig:
         return []
 
     @property
+    def visited(self) -> int | tuple[int | float, ...]:
+        """Number of denoising steps or, with a strength, the timesteps that are visited.
+
+        Raises `InputError` for a strength outside (0, 1] or of a model without a prior.
+        """
+        if self.strength is None:
+            return self.steps
+        if not 0 < self.strength <= 1 or "prior" not in self.layout:
+            raise InputError(
+                f"{self.name} cannot start from its prior with strength {self.strength}: that must "
+                "be above 0 and at most 1, and the model must have a prior. (--strength)"
+            )
+        levels = self.process.timesteps(self.process.times(self.steps)[:-1])
+        skipped = len(levels) - max(1, int(self.strength * len(levels)))
+        kind = int if isinstance(self.process, VariancePreserving) else float
+        return tuple(kind(level) for level in levels[skipped:])
+
+    @property
     def image_tokens(self) -> int:
         """Number of image tokens that the denoiser gets."""
         return self.zero_image_tokens or (0 if self.image is None else self.image.tokens)
+
+    def given_image(self, triplets: Sequence[Triplet]) -> Float[np.ndarray, "b m e"] | None:
+        """Return the image tokens of clips in a model without an encoder; None for others."""
+        zeros = self.zero_image(len(triplets))
+        if zeros is None:
+            return None
+        for row, triplet in zip(zeros, triplets, strict=True):
+            if triplet.tokens is not None:
+                row[:] = triplet.tokens
+        return zeros
 
     def zero_image(self, batch: int) -> Float[np.ndarray, "b m e"] | None:
         """Return the image tokens of a model whose tokens are zeros; None for others."""

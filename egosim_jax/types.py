@@ -240,6 +240,8 @@ class Triplet:
     """The recorded video."""
     extra: Mapping[str, str] = field(default_factory=dict)
     """Further metadata columns, carried to the results."""
+    tokens: Float32[np.ndarray, "m e"] | None = None
+    """Tokens for the denoiser's image branch where it has no encoder; None: zeros."""
 
 
 @no_type_check

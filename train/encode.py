@@ -73,6 +73,8 @@ class Encoding:
         arrays = {"mask": inputs.mask, **self._encode(inputs, targets_of(triplets))}
         if self.config.encoders == "joint":
             arrays |= _encoder_inputs(inputs)
+        if any(triplet.tokens is not None for triplet in triplets):
+            arrays["image"] = inputs.image
         present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
         return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
 

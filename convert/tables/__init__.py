@@ -99,6 +99,37 @@ class Reference:
         return header | self.arguments(config)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CheckpointNaming:
+    """Names of the low-rank tensors in the checkpoints of a training that only keeps a LoRA."""
+
+    naming: str
+    """Naming of the network's layers."""
+    stem: str
+    """File name without its extension."""
+    prefix: str = ""
+    """Prefix of the names of layers."""
+    separator: str = "."
+    """Separator of the parts of a layer's name."""
+    down: str = "lora_A.weight"
+    """Suffix of the down projection."""
+    up: str = "lora_B.weight"
+    """Suffix of the up projection."""
+    alpha: bool = False
+    """Write alpha, which is the rank, for each layer."""
+
+    def tensors(self, layer: str, down: np.ndarray, up: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the tensors of a layer by name, for projections `[in, r]` and `[r, out]`."""
+        name = f"{self.prefix}{layer.replace('.', self.separator)}"
+        found = {
+            f"{name}.{self.down}": np.ascontiguousarray(down.T),
+            f"{name}.{self.up}": np.ascontiguousarray(up.T),
+        }
+        return found | (
+            {f"{name}.alpha": np.array(down.shape[-1], np.float32)} if self.alpha else {}
+        )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Table:
     """Conversions of one kind of network from and to other projects' checkpoints."""
@@ -113,6 +144,8 @@ class Table:
     """Input channels of the base models that `--widen` converts from."""
     input_layer: str = "patch"
     """Path of the layer that reads the input channels, the first axis of its kernel."""
+    checkpoint: CheckpointNaming | None = None
+    """Names of the low-rank tensors in checkpoints of DWM; None for networks without."""
     pipeline: Callable[[ModelConfig], dict[str, dict[str, Any]]] | None = None
     """JSON files by path of a diffusers pipeline around this denoiser, without its networks."""
 

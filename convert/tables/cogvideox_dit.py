@@ -10,7 +10,14 @@ from einops import rearrange
 
 from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT
 from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
-from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
+from egosim_jax.convert.tables import (
+    SHORT_LAYERS,
+    CheckpointNaming,
+    Comparison,
+    Naming,
+    Reference,
+    Table,
+)
 from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
 from egosim_jax.types import InputError
@@ -165,6 +172,7 @@ TABLE = Table(
         outputs=outputs,
     ),
     base=COGVIDEOX_INPAINT,
+    checkpoint=CheckpointNaming(naming="diffusers", stem="pytorch_lora_weights"),
     pipeline=pipeline,
 )
 """Conversions of CogVideoX's transformer; its base models are CogVideoX-Fun's InP models."""

@@ -22,6 +22,7 @@ from egosim_jax.cli.experiment import Experiment
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.models import Models
 from egosim_jax.cli.preflight import Preflight
+from egosim_jax.cli.rank import Rank
 from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.table import TableCommand
@@ -36,6 +37,7 @@ Commands = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[TableCommand, tyro.conf.subcommand("table")]
+    | Annotated[Rank, tyro.conf.subcommand("rank")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Models, tyro.conf.subcommand("models")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]

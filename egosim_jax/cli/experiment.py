@@ -10,11 +10,13 @@ import tyro
 
 from egosim_jax.command import ExitCode
 from egosim_jax.experiments.config import (
+    DWM,
     Continuous,
     Debug,
     Embodiment,
     LookAway,
     Policies,
+    Rank,
     RealTiny,
     Tabletop,
     Update,
@@ -27,6 +29,8 @@ MODULES = {
     Embodiment: "embodiment",
     LookAway: "look_away",
     Policies: "policies",
+    DWM: "dwm",
+    Rank: "rank",
     RealTiny: "real_tiny",
     Debug: "debug",
 }
@@ -44,6 +48,8 @@ class Experiment:
         | Annotated[Embodiment, tyro.conf.subcommand("embodiment")]
         | Annotated[LookAway, tyro.conf.subcommand("look_away")]
         | Annotated[Policies, tyro.conf.subcommand("policies")]
+        | Annotated[DWM, tyro.conf.subcommand("dwm")]
+        | Annotated[Rank, tyro.conf.subcommand("rank")]
         | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
         | Annotated[Debug, tyro.conf.subcommand("debug")]
     )

@@ -60,6 +60,10 @@ class Generate:
     """Named sampling of the model, such as `released` or `paper` of DWM; None: the default one.
 
     It may set steps, solver, guidance and prompt; --steps and --solver change it."""
+    strength: float | None = None
+    """Share of the steps to take, from the prior with that much noise (SDEdit), such as 0.75.
+
+    The prior is then no condition."""
     solver: Solver | None = None
     """Sampler, instead of the model's.
 
@@ -156,7 +160,7 @@ class Generate:
         config = configs.get(self.config)
         config = config if self.sampling is None else configs.sampled(config, self.sampling)
         config = config if self._weights is None else config.at(self._weights)
-        config = replace(config, steps=self.steps or config.steps)
+        config = replace(config, steps=self.steps or config.steps, strength=self.strength)
         if self.solver is not None:
             solvers = {
                 "euler": Euler(),

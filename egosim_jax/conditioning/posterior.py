@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.models import VideoCodec
 from egosim_jax.types import InputError
 
 STD = "_std"
@@ -26,10 +25,16 @@ BLACK = -1.0
 
 
 @runtime_checkable
-class NormalizedCodec(VideoCodec, Protocol):
+class NormalizedCodec(Protocol):
     """Video codec whose normalization can be applied to drawn latents."""
 
-    def normalize(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
+    def moments(
+        self, video: Float[Array, "b f h w 3"]
+    ) -> tuple[Float[Array, "b f2 h2 w2 z"], Float[Array, "b f2 h2 w2 z"]]:
+        """Return mean and log variance of the latents, before normalization."""
+        ...
+
+    def normalize(self, mean: Float[Array, "b f h w z"]) -> Float[Array, "b f h w z"]:
         """Normalize latents, by an affine function of each channel."""
         ...
 

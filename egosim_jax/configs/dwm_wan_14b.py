@@ -25,6 +25,8 @@ from egosim_jax.types import VideoSpec
 class DWMWanDiTConfig(WanDiTConfig):
     """Wan's transformer, of which DWM adapts every linear layer and trains the patch embedding."""
 
+    table: ClassVar[str] = "egosim_jax.convert.tables.dwm_wan_dit"
+    """Module of the conversion table."""
     lora_targets: ClassVar[tuple[str, ...]] = ("*",)
     """Patterns of the linear layers that a LoRA adapts: all 488 of the 14B model."""
     also_train: ClassVar[tuple[str, ...]] = ("patch.*",)

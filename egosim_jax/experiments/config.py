@@ -170,6 +170,75 @@ class Embodiment:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Rank(ModelExperiment):
+    """Rank candidate actions by a picture of the goal, and compare with what they truly reach.
+
+    Each goal is the last frame of one of several actions in a held-out scene. Prints how often the
+    ranking by generated videos finds that action, and the rank correlation with the ranking by true
+    videos; also for the ground truth through the autoencoder. Writes report.json.
+    """
+
+    goals: int = 24
+    """Number of goals, each in another scene."""
+    candidates: int = 4
+    """Actions for each goal."""
+    first_scene: int = 400
+    """Seed of the first scene."""
+    seeds: int = 2
+    """Repetitions of each clip with different noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DWM:
+    """Train DWM and its ablations in miniature on static twins of tabletop clips, and compare.
+
+    Trains an autoencoder, a base that paints masked places, a base that continues a first frame,
+    and from these DWM, a model without hands and the ablations. Prints a table for moving cameras
+    and one for fixed ones, with the paper's figures; writes report.json and contact sheets. The
+    same command resumes an interrupted experiment.
+    """
+
+    out: Path
+    """Folder of the run; each training has a subfolder."""
+    config: str = "dwm_tabletop"
+    """Name of the model."""
+    only: tuple[str, ...] = ()
+    """Train and compare only these models, along with the bases; by default all."""
+    moving_scenes: int = 400
+    """Scenes with a moving camera to train on, one clip of each."""
+    fixed_scenes: int = 160
+    """Scenes with a fixed camera to train on, one clip of each."""
+    held_out: int = 24
+    """Scenes with a moving camera to generate, and as many with a fixed one."""
+    first_scene: int = 20000
+    """Seed of the first scene."""
+    autoencoder: Hyperparameters = Hyperparameters(
+        steps=1500, learning_rate=1e-3, warmup=200, batch_size=2
+    )
+    """Training of the autoencoder, on crops."""
+    base: Hyperparameters = Hyperparameters(
+        steps=1600, learning_rate=2e-3, warmup=100, batch_size=8
+    )
+    """Training of each base model, from random weights."""
+    adaptation: Hyperparameters = Hyperparameters(
+        steps=700, learning_rate=2e-3, warmup=50, batch_size=8
+    )
+    """Training of each model from its base."""
+    rank: int | None = 48
+    """Rank of the LoRA by which a base is adapted; None: all weights are trained."""
+    text_dropout: float = 0.1
+    """Probability with which a prompt is dropped in training."""
+    seeds: int = 2
+    """Repetitions of each clip with different noise."""
+    steps: int = 10
+    """Denoising steps of the generated clips."""
+    strength: float = 0.75
+    """Strength of SDEdit: share of the steps that it takes, from the noised static video."""
+    batch_size: int = 8
+    """Clips encoded, and generated, together."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RealTiny:
     """Train `real_tiny` on the train split, generate both splits, compare, and draw a sheet."""
 

@@ -13,9 +13,11 @@ from egosim_jax.data.sheet import SheetClip
 from egosim_jax.generator import Generator, batches
 from egosim_jax.metrics import lpips, region
 from egosim_jax.metrics.report import score
+from egosim_jax.networks import ModelConfig
 from egosim_jax.types import Kind, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
 
 DroppedCondition = Literal["prior", "mask", "hands"]
 MEASURES = {
@@ -57,12 +59,27 @@ class HeldOutClip:
 
     @classmethod
     def make(
-        cls, seed: int, spec: VideoSpec, kind: Kind, *, black_cloths: int | None = None
+        cls,
+        seed: int,
+        spec: VideoSpec,
+        kind: Kind,
+        *,
+        black_cloths: int | None = None,
+        fixed_camera: bool = False,
+        prior: PriorName = "state",
+        hands: HandsName = "skeleton",
     ) -> HeldOutClip:
         """Make the first clip of a seed."""
-        scene = partial(make_sequence, seed, spec=spec, kind=kind, black_cloths=black_cloths)
+        scene = partial(
+            make_sequence,
+            seed,
+            spec=spec,
+            kind=kind,
+            black_cloths=black_cloths,
+            fixed_camera=fixed_camera,
+        )
         clip, bare = next(scene()), next(scene(bare=True))
-        return cls(clip, to_triplet(clip), bare.frames)
+        return cls(clip, with_conditions(clip, to_triplet(clip), prior, hands), bare.frames)
 
     def evaluate(self, video: np.ndarray) -> dict[str, float]:
         """Return every measure of a video of this clip."""
@@ -91,6 +108,13 @@ class HeldOutClip:
             f"{self.triplet.video_id}: {self.clip.caption}   {note or f'({names})'}",
             [self.triplet.prior, self.triplet.hands, *videos.values(), self.clip.frames],
         )
+
+
+def conditions_of(config: ModelConfig) -> tuple[PriorName, HandsName]:
+    """Return the renderings of scene and hands that a model is conditioned on."""
+    if config.layout.mask_packing == "observed":
+        return "static", "mesh"
+    return "state", "skeleton"
 
 
 def evaluate(scenes: Sequence[HeldOutClip], videos: Sequence[np.ndarray]) -> list[dict[str, float]]:

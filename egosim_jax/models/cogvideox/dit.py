@@ -17,7 +17,7 @@ the config's `dtype`. (Yang et al. 2024, CogVideoX; section 4.1 of DWM for the i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -84,14 +84,26 @@ class Modulation(nnx.Module):
         )
         self.n = n
 
-    def vectors(self, time: Float[Array, "b e"]) -> Float[Array, "n b 1 d"]:
-        """Return the vectors, in float32."""
+    def vectors(self, time: Any) -> Float[Array, "n b m d"]:
+        """Return the vectors from the time embedding `b e`, one for all tokens, in float32."""
         y = self.linear(jax.nn.silu(time)).astype(jnp.float32)
         return rearrange(y, "b (n d) -> n b 1 d", n=self.n)
 
 
 def modulate(
-    x: Float[Array, "b n d"], shift: Float[Array, "b _ d"], scale: Float[Array, "b _ d"]
+    x: Float[Array, "b n d"],
+    shift: Float[
+        Array,
+        (
+            b  # n d
+        ),
+    ],
+    scale: Float[
+        Array,
+        (
+            b  # n d
+        ),
+    ],
 ) -> Float[Array, "b n d"]:
     """Scale and shift normalized tokens."""
     return x * (1 + scale) + shift
@@ -155,11 +167,14 @@ class Block(nnx.Module):
     def __call__(
         self,
         x: Float[Array, "b n d"],
-        time: Float[Array, "b e"],
+        time: Any,
         rotation: Float[Array, "n k 2"],
         is_text: Float[Array, "1 n 1"],
     ) -> Float[Array, "b n d"]:
-        """Update the residual stream; sums are taken in float32 and kept in x's dtype."""
+        """Update the residual stream; sums are taken in float32 and kept in x's dtype.
+
+        `time` is what the modulations see, the time embedding `b e`.
+        """
         for modulation, layer in (
             (self.modulation_a, lambda y: self.attn(y, rotation)),
             (self.modulation_m, self.mlp),
@@ -189,6 +204,9 @@ class TimeEmbedding(nnx.Module):
 class CogVideoXDiT(nnx.Module):
     """Video diffusion transformer: prediction for noisy latents, given condition and text."""
 
+    block: ClassVar[type[Block]] = Block
+    """Class of the transformer blocks."""
+
     def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
         self.config = config
         dtype = config.dtype
@@ -203,7 +221,7 @@ class CogVideoXDiT(nnx.Module):
         axes = (None, "embed")
         self.text = Linear(config.text_dim, config.dim, axes=axes, dtype=dtype, rngs=rngs)
         self.time = TimeEmbedding(config, rngs=rngs)
-        self.blocks = stack(lambda rngs: Block(config, rngs=rngs), config.layers, rngs=rngs)
+        self.blocks = stack(lambda rngs: self.block(config, rngs=rngs), config.layers, rngs=rngs)
         self.norm = LayerNorm(config.dim, eps=config.eps)
         self.modulation = Modulation(config, 2, rngs=rngs)
         out = config.out_channels * PATCH**2
@@ -240,10 +258,11 @@ class CogVideoXDiT(nnx.Module):
         """Return the prediction, in float32, for noisy latents at timesteps in [0, 1000]."""
         _, _, h, w, _ = noisy.shape
         time, texts = self.time(t), context.text.shape[1]
+        modulators = self.modulators(time, context)
         is_text = (jnp.arange(len(context.rotation)) < texts).astype(jnp.float32)[None, :, None]
 
         def step(block: Block, x: jax.Array, _: None) -> tuple[jax.Array, None]:
-            x = block(remat.name_input(x), time, context.rotation, is_text)
+            x = block(remat.name_input(x), modulators, context.rotation, is_text)
             return constrain(x, TOKENS), None
 
         video = self.patch.noisy(noisy) + context.patches
@@ -260,6 +279,10 @@ class CogVideoXDiT(nnx.Module):
             i=PATCH,
             j=PATCH,
         )
+
+    def modulators(self, time: Float[Array, "b e"], context: CogVideoXContext) -> Any:
+        """Return what the modulations of the blocks see."""
+        return time
 
     def __call__(
         self,

@@ -97,14 +97,26 @@ def make_sequence(
     kind: Kind = "human",
     bare: bool = False,
     black_cloths: int | None = None,
+    fixed_camera: bool = False,
+    action: int = 0,
 ) -> Iterator[TabletopClip]:
     """Yield the clips of a seed, each `spec.frames` long; a robot has one gripper.
 
     Equal seeds give equal clips at equal sizes, and the same events at any size. `bare` renders the
     same clips without hands and manipulated body, which gives their background. `black_cloths` is
-    the most that lie on the table; they change nothing else.
+    the most that lie on the table; they change nothing else. A `fixed_camera` stays where it is in
+    the first frame. Each number of the `action` gives other events in the same scene, under the
+    same cameras.
     """
-    scripts = make_scripts(seed, spec=spec, clips=clips, kind=kind, black_cloths=black_cloths)
+    scripts = make_scripts(
+        seed,
+        spec=spec,
+        clips=clips,
+        kind=kind,
+        black_cloths=black_cloths,
+        fixed_camera=fixed_camera,
+        action=action,
+    )
     for number, script in enumerate(scripts):
         yield film(
             [moment.scene for moment in script.moments],
@@ -128,9 +140,13 @@ def make_scripts(
     clips: int = 1,
     kind: Kind = "human",
     black_cloths: int | None = None,
+    fixed_camera: bool = False,
+    action: int = 0,
 ) -> Iterator[Script]:
     """Yield the scripts of the clips of `make_sequence`."""
     rng, scene, eye, sway = _begin(seed, kind, black_cloths)
+    if action:
+        rng = np.random.default_rng([seed, 0 if kind == "human" else 1, 2, action])
     hands: tuple[Hand, ...] = ()
     for number in range(clips):
         intent = actions.choose(scene, rng, hand=hands[0] if hands else None)
@@ -139,7 +155,8 @@ def make_scripts(
             if kind == "human" and rng.random() < 0.35:
                 hands = (*hands, actions.waiting_hand(hands[0].side, rng))
         moments = actions.act(scene, hands, intent, kind, frames=spec.frames)
-        cameras = _cameras(number + np.linspace(0, 1, spec.frames), eye, sway, spec)
+        times = number + np.linspace(0, 1, spec.frames)
+        cameras = _cameras(0 * times if fixed_camera else times, eye, sway, spec)
         who = f"The {hands[0].side} hand" if kind == "human" else "The gripper"
         yield Script(
             intent=intent,

@@ -43,6 +43,8 @@ class DatasetConfig:
     """Rendering of the scene: points of the state, or `static`, ray cast as it was at the start."""
     hands: HandsName = "skeleton"
     """Rendering of the hands: skeletons, shaded meshes, or the meshes' binary mask."""
+    fixed_camera: bool | None = None
+    """True: the camera stays where it is in the first frame."""
 
     def kind_of(self, seed: int) -> Kind:
         """Return the kind of hands of a scene."""
@@ -130,6 +132,7 @@ def _make(config: DatasetConfig, seed: int, parts: Path, states: States) -> None
         clips=config.clips,
         kind=config.kind_of(seed),
         black_cloths=config.black_cloths,
+        fixed_camera=bool(config.fixed_camera),
     )
     clips = list(sequence)
     for clip, state in zip(clips, states(clips), strict=True):

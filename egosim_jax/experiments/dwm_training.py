@@ -1,0 +1,281 @@
+"""Clips, latents and trainings of `egosim experiment dwm`, each of which is made unless it exists.
+
+    clips -> autoencoder -> latents -> base models -> DWM and its ablations
+
+A base model that paints masked places learns from clips whose own pixels are hidden: everything
+after the first frame, or a box. A base model of images sees the first frame, then black.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.convert.widen import Widening
+from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.data.pack import clip_metadata
+from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.experiments.config import DWM, Hyperparameters
+from egosim_jax.experiments.dwm_variants import (
+    BASES,
+    VARIANTS,
+    Base,
+    Camera,
+    Hands,
+    Variant,
+    poses_of,
+    with_layout,
+)
+from egosim_jax.experiments.embodiment import train_config
+from egosim_jax.generator import batches
+from egosim_jax.io import weights
+from egosim_jax.io.mapped import read_safetensors
+from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.progress import track
+from egosim_jax.rendering.mesh import hand_mask
+from egosim_jax.train import loop
+from egosim_jax.train.encode import Encoding
+from egosim_jax.train.fine_tuning import write_trained
+from egosim_jax.train.tasks.autoencoding import Autoencoding, latent_statistics
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.types import Triplet
+from egosim_jax.worlds.tabletop import TabletopClip, make_sequence
+from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
+
+Split = Camera | str
+CROP = (48, 64)
+"""Rows and columns of the crops that the autoencoder is trained on."""
+SPLITS = 10_000
+"""Seeds between the first scenes of two splits."""
+FIRST_FRAME_SHARE = 0.6
+"""Share of the clips of the painting base of which only the first frame is shown."""
+NO_PRIOR = 0.2
+"""Share of its samples in which nothing is shown, so that it generates from text alone."""
+
+
+class Training:
+    """Trainings of the experiment and the data that they read."""
+
+    def __init__(self, settings: DWM):
+        self.settings, self.out = settings, settings.out
+        self.config = replace(configs.get(settings.config), steps=settings.steps)
+        counts = {
+            "held_out": settings.held_out,
+            "moving": settings.moving_scenes,
+            "fixed": settings.fixed_scenes,
+        }
+        self.seeds = {
+            split: range(start := settings.first_scene + number * SPLITS, start + count)
+            for number, (split, count) in enumerate(counts.items())
+        }
+
+    def base_model(self, base: Base) -> ModelConfig:
+        """Return the config of a base model."""
+        return with_layout(self.config, BASES[base], base)
+
+    def frames(self, split: str) -> Path:
+        """Make the clips of a split with their static twins and hand meshes."""
+        out = self.out / "frames" / split
+        plan = DatasetConfig(
+            seeds=tuple(self.seeds[split]),
+            clips=1,
+            spec=self.config.video,
+            kind="human",
+            prior="static",
+            hands="mesh",
+            fixed_camera=split == "fixed" or None,
+        )
+        workers = os.cpu_count() or 1
+        scenes = make_shards(plan, out=out, workers=workers, grid=self.config.grid)
+        for _ in track(scenes, f"making {split}", total=len(plan.seeds)):
+            pass
+        return out
+
+    def autoencoder(self) -> Path:
+        """Train the autoencoder; return its weights folder."""
+        out, path = self.out / "autoencoder", self.out / "autoencoder/weights/vae.safetensors"
+        if not path.exists():
+            frames = self.frames("moving")
+            task = Autoencoding(vae=self.config.vae, video=self.config.video, crop=CROP)
+            vae = loop.train(
+                task,
+                train_config(self.settings.autoencoder),
+                data=frames,
+                validation=self.frames("held_out"),
+                out=out,
+            )
+            videos = (record.arrays["target"] for record in ShardReader(frames))
+            vae.standardize(*latent_statistics(vae, videos))
+            weights.save(path, vae)
+        return path.parent
+
+    def latents(self, kind: Base | Hands, splits: Sequence[str]) -> Path:
+        """Encode the clips of splits as a kind of training needs them; return the shards."""
+        out = self.out / "latents" / "_".join((kind, *splits))
+        if (out / MANIFEST).exists():
+            return out
+        model = self._encoded_as(kind)
+        sources = [ShardReader(self.frames(split)) for split in splits]
+        folder = self.autoencoder()
+        encode = Encoding(model, Networks.load(model, folder, only=model.cached_networks))
+        provenance = {
+            "kind": kind,
+            "sources": [source.manifest.fingerprint for source in sources],
+            "encoders": weights.hashes(folder, only=model.cached_networks),
+        }
+        clips = [
+            changed(clip, kind, self.clip(split, seed) if kind == "poses" else None)
+            for split, source in zip(splits, sources, strict=True)
+            for seed, clip in zip(self.seeds[split], _clips(source), strict=True)
+        ]
+        size = self.settings.batch_size
+        parts = track(
+            list(batches(clips, size)), f"encoding {out.name}", total=-(-len(clips) // size)
+        )
+        with ShardWriter(
+            out, kind="latents", spec=model.video, grid=model.grid, provenance=provenance
+        ) as writer:
+            for batch in parts:
+                filled = [*batch, *[batch[-1]] * (size - len(batch))]
+                for clip, arrays in zip(batch, encode(filled), strict=False):
+                    writer.add(arrays, clip_metadata(clip))
+        return out
+
+    def clip(self, split: str, seed: int) -> TabletopClip:
+        """Return the events of a clip, in tiny frames."""
+        spec = replace(self.config.video, height=16, width=16)
+        return next(make_sequence(seed, spec=spec, fixed_camera=split == "fixed"))
+
+    def _encoded_as(self, kind: Base | Hands) -> ModelConfig:
+        """Return a model that reads the latents of a kind."""
+        if kind in BASES:
+            return self.base_model(kind)
+        return VARIANTS["adaln_frame"].model(self.config, kind) if kind == "poses" else self.config
+
+    def base(self, base: Base) -> Path:
+        """Train a base model from random weights; return its weights folder."""
+        nothing = NO_PRIOR if base == "inpaint" else 0.0
+        return self.train(
+            f"base_{base}",
+            Denoising(
+                model=self.base_model(base),
+                dropout=ConditionDropout(prior=nothing, text=self.settings.text_dropout),
+            ),
+            self.settings.base,
+            data=self.latents(base, ("moving", "fixed")),
+            validation=self.latents(base, ("held_out",)),
+        )
+
+    def start(self, name: str, variant: Variant) -> Path:
+        """Write a base with the input channels of a variant; return its weights folder."""
+        folder, base = self.out / name / "start", self.base(variant.base)
+        if not (folder / "vae.safetensors").exists():
+            model = variant.model(self.config, name)
+            networks = Networks.random(model, seed=0)
+            widen(
+                networks,
+                base,
+                Widening(base=BASES[variant.base], layout=variant.layout, input_layer="patch"),
+            )
+            weights.save(folder / "dit.safetensors", networks.dit)
+            weights.link_others(folder, base)
+        return folder
+
+    def variant(self, name: str, variant: Variant) -> tuple[Path, Path | None]:
+        """Train a model of the comparison; return its weights folder and its LoRA, if any."""
+        start, rank = self.start(name, variant), self.settings.rank
+        if not variant.trained:
+            return start, None
+        rank = rank if variant.adapter else None
+        done = self.train(
+            name,
+            Denoising(
+                model=variant.model(self.config, name),
+                dropout=ConditionDropout(text=self.settings.text_dropout),
+                rank=rank,
+            ),
+            self.settings.adaptation,
+            data=self.latents(variant.hands, variant.data),
+            validation=self.latents(variant.hands, ("held_out",)),
+            start=start,
+        )
+        return (done, None) if rank is None else (start, done)
+
+    def train(
+        self,
+        name: str,
+        task: Denoising,
+        stage: Hyperparameters,
+        *,
+        data: Path,
+        validation: Path,
+        start: Path | None = None,
+    ) -> Path:
+        """Train a denoiser; return its weights folder, or the file of its LoRA."""
+        out, model = self.out / name, task.model
+        done = out / ("weights" if task.rank is None else "lora.safetensors")
+        # The networks that were not trained, as the autoencoder, are linked last.
+        if done.is_file() or (done / "vae.safetensors").exists():
+            return done
+        trained = loop.train(
+            task, train_config(stage), data=data, validation=validation, out=out, weights=start
+        )
+        origin = start or self.autoencoder()
+        return write_trained(trained, out, model=model, start=origin, rank=task.rank)
+
+
+def widen(networks: Networks, base: Path, widening: Widening) -> None:
+    """Fill a denoiser with the weights of a base that has some of its input channels.
+
+    The other channels do not count until they are trained; layers that the base lacks stay random.
+    """
+    known = read_safetensors(base / "dit.safetensors")
+    state = nnx.state(networks.dit, nnx.Param)
+    for path, leaf in nnx.to_flat_state(state):
+        name = ".".join(map(str, path))
+        if name == f"{widening.input_layer}.kernel":
+            kernel = np.zeros(leaf.shape, np.float32)
+            kernel[widening.rows] = known[name].array()
+            leaf.set_value(jnp.asarray(kernel))
+        elif name in known:
+            leaf.set_value(jnp.asarray(known[name].array()))
+    nnx.update(networks.dit, state)
+
+
+def _clips(source: ShardReader) -> Iterator[Triplet]:
+    for record in source:
+        names = {name: str(record.metadata[name]) for name in ("video_id", "prompt")}
+        yield Triplet(**names, **record.arrays)
+
+
+def changed(clip: Triplet, kind: Base | Hands, events: TabletopClip | None = None) -> Triplet:
+    """Return a clip with the prior, mask and hands that a kind of training sees.
+
+    `events` are those of the clip, for its poses.
+    """
+    target = clip.target
+    if events is not None:
+        return replace(clip, tokens=poses_of(events))
+    if kind == "mask":
+        return replace(clip, hands=hand_mask(clip.hands))
+    if kind == "mesh" or target is None:
+        return clip
+    # Deterministic in the clip: the same clip is masked alike in every run.
+    rng = np.random.default_rng(list(clip.video_id.encode()))
+    hidden = np.zeros(target.shape[:3], bool)
+    if kind == "image" or rng.random() < FIRST_FRAME_SHARE:
+        hidden[1:] = True
+    else:
+        size = (rng.uniform(0.25, 0.75, 2) * target.shape[1:3]).astype(int)
+        top, left = (rng.integers(0, np.array(target.shape[1:3]) - size + 1)).tolist()
+        hidden[1:, top : top + size[0], left : left + size[1]] = True
+    prior = np.where(hidden[..., None], np.uint8(0), target)
+    return replace(clip, prior=prior, mask=np.where(hidden, np.uint8(255), np.uint8(0)))

@@ -1,0 +1,130 @@
+"""`egosim experiment rank`: candidate actions by the goal that they reach in generated videos."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import islice
+
+import numpy as np
+
+from egosim_jax.experiments.config import Rank
+from egosim_jax.experiments.model import open_experiment
+from egosim_jax.experiments.scenes import conditions_of
+from egosim_jax.generator import Generator
+from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.metrics.ranking import spearman
+from egosim_jax.metrics.report import paired_difference, print_table
+from egosim_jax.progress import track
+from egosim_jax.ranking import by_picture
+from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
+from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
+from egosim_jax.worlds.tabletop.twins import with_conditions
+
+MEASURES = {"top1": ("top-1 %", "{:.1f}"), "spearman": ("Spearman", "{:.3f}")}
+DEFINITIONS = {
+    "score": "-LPIPS of AlexNet between the last frame of a video and that of the goal's action; "
+    "mean over seeds",
+    "top1": "share of goals whose action has the highest score, in percent; 95 % interval of "
+    "Clopper and Pearson",
+    "spearman": "rank correlation of the scores of a goal's candidates with those of their true "
+    "videos; mean over goals, 95 % interval by Student's t",
+}
+MOST_TRIES = 200
+"""Actions of a scene that are tried, of which different ones are kept."""
+METHODS = {"generated": "generated videos", "autoencoder": "ground truth through the autoencoder"}
+
+
+def run(settings: Rank) -> None:
+    """Generate the candidates of every goal, rank them, compare with the ground truth."""
+    check_counts({"--goals": settings.goals, "--seeds": settings.seeds})
+    if settings.candidates < 2:
+        raise InputError(
+            f"A goal with {settings.candidates} candidate cannot be ranked: it needs at least 2. "
+            "(--candidates)"
+        )
+    generator = open_experiment(settings)
+    seeds = range(settings.first_scene, settings.first_scene + settings.goals)
+    goals = [
+        _goal(settings, generator, seed) for seed in track(seeds, "goals", total=settings.goals)
+    ]
+    table = {name: _summary(goals, name) for name in METHODS}
+    chance = 100 / settings.candidates
+    report = {"definitions": DEFINITIONS, "chance": chance, "table": table, "goals": goals}
+    write_json(settings.out / "report.json", report)
+    rows = {METHODS[name]: row for name, row in table.items()}
+    print_table(
+        "ranking by", rows, MEASURES, title=f"{settings.goals} goals, chance {chance:.0f} %"
+    )
+
+
+def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
+    """Return the scores of a goal's candidates by method, cached in a file."""
+    path = settings.out / "goals" / f"{seed}.json"
+    if path.exists():
+        return read_json(path)
+    clips = candidates(seed, generator.config.video, settings.candidates)
+    best = seed % len(clips)
+    triplets = [_triplet(clip, generator) for clip in clips]
+    score = by_picture(clips[best].frames[-1])
+    generated = [
+        [score(clip.frames) for clip in generator.generate(triplets, [n + repeat for n in noise])]
+        for noise, repeat in (
+            (range(len(clips)), 1000 * seed + 100 * r) for r in range(settings.seeds)
+        )
+    ]
+    found = {
+        "seed": seed,
+        "best": best,
+        "captions": [clip.caption for clip in clips],
+        "target": [score(clip.frames) for clip in clips],
+        "generated": np.mean(generated, axis=0).tolist(),
+        "autoencoder": [score(clip.frames) for clip in generator.reconstruct(triplets)],
+    }
+    write_json(path, found)
+    return found
+
+
+def _triplet(clip: TabletopClip, generator: Generator) -> Triplet:
+    return with_conditions(clip, to_triplet(clip), *conditions_of(generator.config))
+
+
+def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
+    """Return clips of different actions in one scene, from the same cameras.
+
+    Raises `InputError` if the scene does not have so many.
+    """
+    small = VideoSpec(frames=spec.frames, height=16, width=16, fps=spec.fps)
+
+    def different() -> Iterator[int]:
+        seen: set[str] = set()
+        for action in range(MOST_TRIES):
+            caption = next(make_sequence(seed, spec=small, action=action)).caption
+            if caption not in seen:
+                seen.add(caption)
+                yield action
+
+    found = list(islice(different(), number))
+    if len(found) < number:
+        raise InputError(
+            f"Scene {seed} has {len(found)} different actions, not {number}: ask for fewer. "
+            "(--candidates)"
+        )
+    return [next(make_sequence(seed, spec=spec, action=action)) for action in found]
+
+
+def _summary(goals: Sequence[dict], method: str) -> dict[str, dict[str, float]]:
+    """Return top-1 and Spearman of a method with their intervals."""
+    from scipy.stats import binomtest
+
+    hits = sum(int(np.argmax(goal[method])) == goal["best"] for goal in goals)
+    interval = binomtest(hits, len(goals)).proportion_ci()
+    correlations = [spearman(*map(np.asarray, (goal[method], goal["target"]))) for goal in goals]
+    return {
+        "top1": {
+            "mean": 100 * hits / len(goals),
+            "low": 100 * float(interval.low),
+            "high": 100 * float(interval.high),
+        },
+        "spearman": paired_difference(correlations, np.zeros(len(goals)).tolist()),
+    }

@@ -1,0 +1,154 @@
+"""DWM's checkpoints: read, and written back bit for bit."""
+
+from dataclasses import replace
+from math import prod
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from egosim_jax import configs
+from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
+from egosim_jax.convert.checkpoint import checkpoint
+from egosim_jax.convert.lora import read_lora
+from egosim_jax.convert.tables import weight_shapes
+from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
+from egosim_jax.models.lora import Delta
+from egosim_jax.types import InputError
+
+RANK, LAYERS = 4, 2
+COGVIDEOX = CogVideoXDiTConfig(
+    in_channels=49, dim=32, heads=2, layers=LAYERS, text_dim=16, time_dim=16, base_rows=2,
+    base_columns=3,
+)  # fmt: skip
+WAN = DWMWanDiTConfig(dim=48, ffn_dim=96, heads=2, layers=LAYERS, text_dim=64, image_dim=32)
+
+
+def wan_layers(dim=48, ffn=96, text=64, image=32, freq=256, layers=LAYERS, out=64):
+    """Width and output of every linear layer of Wan's transformer, by VideoX-Fun's names."""
+    attention = ("self_attn.q", "self_attn.k", "self_attn.v", "self_attn.o")
+    attention += tuple(f"cross_attn.{name}" for name in ("q", "k", "v", "o", "k_img", "v_img"))
+    found = {}
+    for block in range(layers):
+        found |= {f"blocks.{block}.{name}": (dim, dim) for name in attention}
+        found |= {f"blocks.{block}.ffn.0": (dim, ffn), f"blocks.{block}.ffn.2": (ffn, dim)}
+    return found | {
+        "text_embedding.0": (text, dim), "text_embedding.2": (dim, dim),
+        "time_embedding.0": (freq, dim), "time_embedding.2": (dim, dim),
+        "time_projection.1": (dim, 6 * dim), "img_emb.proj.1": (image, image),
+        "img_emb.proj.3": (image, dim), "head.head": (dim, out),
+    }  # fmt: skip
+
+
+def released(family, folder):
+    """The two files as DWM's trainings write them; return their tensors by stem."""
+    rng = np.random.default_rng(0)
+    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    low = {}
+    if family == "cogvideox":
+        for block in range(LAYERS):
+            for name in ("to_q", "to_k", "to_v", "to_out.0"):
+                layer = f"transformer_blocks.{block}.attn1.{name}"
+                low[f"{layer}.lora_A.weight"] = draw(RANK, 32)
+                low[f"{layer}.lora_B.weight"] = draw(32, RANK)
+        files = {
+            "pytorch_lora_weights": low,
+            "non_lora_weights": {
+                "patch_embed.proj.weight": draw(32, 49, 2, 2), "patch_embed.proj.bias": draw(32),
+            },
+        }  # fmt: skip
+    else:
+        for name, (wide, out) in wan_layers().items():
+            layer = f"lora_unet__{name.replace('.', '_')}"
+            low[f"{layer}.lora_down.weight"] = draw(RANK, wide)
+            low[f"{layer}.lora_up.weight"] = draw(out, RANK)
+            low[f"{layer}.alpha"] = np.array(RANK, np.float32)
+        files = {
+            "lora_diffusion_pytorch_model": low,
+            "non_lora_weights": {
+                "patch_embedding.weight": draw(48, 52, 1, 2, 2), "patch_embedding.bias": draw(48),
+            },
+        }  # fmt: skip
+    folder.mkdir()
+    for stem, tensors in files.items():
+        save_file(tensors, folder / f"{stem}.safetensors")
+    return files
+
+
+@pytest.mark.parametrize(("family", "config"), [("cogvideox", COGVIDEOX), ("wan", WAN)])
+def test_a_checkpoint_is_written_back_bit_for_bit(family, config, tmp_path):
+    want = released(family, tmp_path / "checkpoint")
+    have = checkpoint(read_lora(tmp_path / "checkpoint", config), config, None)
+    assert have.keys() == want.keys()
+    for stem, tensors in want.items():
+        assert have[stem].keys() == tensors.keys()
+        for name, tensor in tensors.items():
+            assert have[stem][name].dtype == tensor.dtype
+            np.testing.assert_array_equal(have[stem][name], tensor, err_msg=name)
+
+
+def test_the_command_writes_the_folder(tmp_path, monkeypatch):
+    from egosim_jax.convert.__main__ import main
+
+    want = released("cogvideox", tmp_path / "checkpoint")
+    model = configs.get("dwm_cogvideox_5b")
+    tiny = replace(
+        model, dit=COGVIDEOX, text=replace(model.text, dim=16, ffn_dim=32, heads=2, head_dim=8)
+    )
+    monkeypatch.setattr(configs, "get", lambda name: tiny)
+    monkeypatch.setattr(configs, "names", lambda: ["dwm_cogvideox_5b"])
+    command = f"lora {tmp_path / 'checkpoint'} --config dwm_cogvideox_5b --layout dwm"
+    assert main([*command.split(), "--out", str(tmp_path / "again")]) == 0
+    for stem, tensors in want.items():
+        have = load_file(tmp_path / "again" / f"{stem}.safetensors")
+        assert have.keys() == tensors.keys()
+        assert all(np.array_equal(have[name], tensors[name]) for name in tensors)
+
+
+@pytest.mark.parametrize(
+    ("name", "modules", "weights", "patch"),
+    [
+        ("dwm_cogvideox_5b", 168, 66_060_288, (49, 2, 2, 3072)),
+        ("dwm_wan_14b", 488, 364_580_864, (52, 2, 2, 5120)),
+    ],
+)
+def test_a_full_size_checkpoint_has_the_layers_of_the_release(name, modules, weights, patch):
+    """Its low-rank tensors of rank 1, of which rank 64 has 64 times as many weights."""
+    config = configs.get(name).dit
+    shapes = weight_shapes(config)
+    changes = {}
+    for path, shape in shapes.items():
+        *stack, wide, out = shape if path.endswith(".kernel") else (0, 0)
+        patterns = ("blocks.attn.",) if name == "dwm_cogvideox_5b" else ("",)
+        if path.endswith(".kernel") and path.startswith(patterns) and path != "patch.kernel":
+            down, up = (
+                np.zeros((*stack, wide, 1), np.float16),
+                np.zeros((*stack, 1, out), np.float16),
+            )
+            changes[path.removesuffix(".kernel")] = Delta(down=down, up=up)
+    (tensors,) = checkpoint(changes, config, None).values()
+    pairs = [tensor for key, tensor in tensors.items() if not key.endswith("alpha")]
+    assert len(pairs) == 2 * modules
+    assert 64 * sum(prod(tensor.shape) for tensor in pairs) == weights
+    if name == "dwm_wan_14b":
+        sizes = wan_layers(5120, 13824, 4096, 1280, 256, 40)
+        names = {f"lora_unet__{layer.replace('.', '_')}.lora_down.weight" for layer in sizes}
+        assert names == {key for key in tensors if key.endswith("down.weight")}
+    assert shapes["patch.kernel"] == patch
+
+
+def test_a_difference_needs_the_weights_it_is_from():
+    changes = {"patch.bias": np.ones(32, np.float32)}
+    with pytest.raises(InputError, match=r"give those weights\. \(--base\)"):
+        checkpoint(changes, COGVIDEOX, None)
+
+
+def test_weights_in_the_blocks_have_no_name_in_a_checkpoint():
+    changes = {"blocks.attn.q.bias": np.ones((LAYERS, 32), np.float32)}
+    with pytest.raises(InputError, match="only outside the blocks"):
+        checkpoint(changes, COGVIDEOX, {})
+
+
+def test_other_models_have_no_such_checkpoints():
+    with pytest.raises(InputError, match=r"only the models dwm_\*"):
+        checkpoint({}, configs.get("debug").dit, None)
