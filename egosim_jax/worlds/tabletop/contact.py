@@ -38,12 +38,12 @@ from egosim_jax.worlds.tabletop.support import (
     support_below,
 )
 
-PAD_M = 0.008
-"""Fingertips touch a surface within this distance, the radius of a finger."""
+PAD_M = 0.012
+"""Fingertips touch a surface within this distance: the radius of a finger, and its compliance."""
 FIRM_M = 0.006
-"""A closing hand holds a body when both fingertips are this near, or get no nearer."""
-BETWEEN_M = 0.003
-"""A body is between fingertips if their middle is this much deeper in it, in meters."""
+"""A closing hand holds a body when both fingertips are this near, or touch it and get no nearer."""
+BETWEEN_M = (0.001, 0.003)
+"""A body is between fingertips if their middle is so deep in it, or so much deeper than they."""
 OPEN_M = 0.002
 """A hand releases what it holds when its fingertips are this much wider than at their closest."""
 SLIP_M = 0.03
@@ -270,13 +270,13 @@ def _grasp(
     contact = replace(contact, closing=others | {hand} if closing else others)
     if not (closing or closed) or any(grasp.hand == hand for grasp in contact.grasps):
         return contact
-    deepest, chosen = -BETWEEN_M, None
+    deepest, chosen = -BETWEEN_M[0], None
     for body in contact.scene.bodies:
-        before, depth = _contact(contact.scene, body, last_m)
-        here, _ = _contact(contact.scene, body, here_m)
+        before, deep = _contact(contact.scene, body, last_m)
+        here, depth = _contact(contact.scene, body, here_m)
         firm = here <= FIRM_M or (before <= PAD_M and here >= before)
-        if firm and depth < deepest:
-            deepest, chosen = depth, body.name
+        if firm and min(deep, depth) < deepest:
+            deepest, chosen = min(deep, depth), body.name
     if chosen is None:
         return contact
     world_from_part = contact.scene.first_part_pose(chosen)
@@ -322,7 +322,7 @@ def _push(
         *tips, depth = surface_of(scene, body, np.stack([*tips_of(joints_m), middle]))[0]
         for joint in np.flatnonzero(distance > LEAVE_M[0]) if depth > LEAVE_M[1] else ():
             pressing.discard((hand, int(joint), body.name))
-        between = depth < min(tips) - BETWEEN_M or contact.holder(body.name) is not None
+        between = depth < min(tips) - BETWEEN_M[1] or contact.holder(body.name) is not None
         supple = FINGERS if kind == "human" and gap > body.size_m[0] else ()
         for joint in np.flatnonzero(distance < 0):
             key = (hand, int(joint), body.name)

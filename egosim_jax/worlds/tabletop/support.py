@@ -81,7 +81,7 @@ def footprints(scene: Scene, body: Body) -> list[Footprint]:
         if moving:  # the tray, of which the front is the solid
             y = body.size_m[1]
             solid = Solid(form="box", size_m=(solid.size_m[0], y, solid.size_m[2]),
-                          origin_m=(0, -0.006, solid.origin_m[2]))  # fmt: skip
+                          origin_m=(0.0, -0.006, solid.origin_m[2]))  # fmt: skip
         found.append(_box_footprint(solid, pose))
     return found
 
