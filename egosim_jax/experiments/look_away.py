@@ -69,7 +69,7 @@ DEFINITIONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Story:
-    """Three true clips of one scene, and what the last one is scored by."""
+    """Three clips of one scene with their ground truth, and what the last one is scored by."""
 
     seed: int
     """Seed of the scene."""
@@ -191,7 +191,7 @@ def _turn(cameras: Cameras, first: float, last: float, frames: int) -> Cameras:
 
 
 def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
-    """Return the true clips of a scene whose object is carried in view (`seen`) or out of view."""
+    """Return the clips of a scene whose object is carried in view (`seen`) or out of view."""
     script = next(make_scripts(seed, spec=spec))
     angle, frames = _away(script), spec.frames
     if angle is None:

@@ -122,8 +122,8 @@ class Object:
             raise InputError(f"The {self.name} cannot be opened: remove opening.")
         if not self.loose and (self.turn_degrees or self.width_m or self.height_m or self.on):
             raise InputError(
-                f"The {self.name} stands straight on the table in its size: remove turn_degrees, "
-                "width_m, height_m and on."
+                f"The {self.name} has a fixed size and direction, and is on the table: remove "
+                "turn_degrees, width_m, height_m and on."
             )
         if self.place_m is not None:
             self._check_place()
@@ -196,8 +196,8 @@ def _below(scene: Scene, item: Object) -> np.ndarray:
     names = [body.name for body in scene.bodies]
     if item.on not in names:
         raise InputError(
-            f"The {item.name} stands on {quote(item.on)}, which is not before it: on must be one "
-            f"of {', '.join(names) or 'the objects before'}."
+            f"The {item.name} is on {quote(item.on)}, which is not before it: on must be one of "
+            f"{', '.join(names) or 'the objects before'}."
         )
     return scene.body(item.on).world_from_body[:2, 3]
 

@@ -1,4 +1,4 @@
-"""Where bodies rest: supports, stable orientations, and bodies that push each other aside.
+"""Bodies at rest: supports, stable orientations, and bodies that push each other aside.
 
 Everything is quasi-static: a body that nothing holds is at rest on the highest surface under its
 center, in the stable orientation nearest to its own, and a fall takes no time. Bodies overlap where
@@ -35,7 +35,7 @@ UPRIGHT = 0.999
 ROUNDS = 8
 """Most rounds in which bodies push each other aside."""
 RANKS = {"furniture": 3, "held": 2, "pushed": 1}
-"""Ranks of bodies when they meet: the lower one moves; 0 for those that only stand there."""
+"""Ranks of bodies when they meet: the lower one moves; 0 for those at rest."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ OBJECTS = [
 ]
 
 
-def test_bodies_stand_where_they_were_put():
+def test_bodies_are_where_they_were_put():
     scene = make_scene(OBJECTS)
     assert [body.name for body in scene.bodies] == [
         "red box", "blue cup", "green chest", "white ball",
@@ -52,7 +52,7 @@ def test_a_scene_is_read_as_it_was_written(tmp_path):
         ({"width_m": 0.5}, "width_m of the red box is 0.5: it must be a number from 0.02"),
         ({"width_m": True}, "width_m of the red box is True"),
         ({"opening": 0.5}, "cannot be opened"),
-        ({"shape": "drawer", "turn_degrees": 5}, "stands straight on the table"),
+        ({"shape": "drawer", "turn_degrees": 5}, "has a fixed size"),
     ],
 )
 def test_an_object_that_cannot_be_is_refused(change, message):

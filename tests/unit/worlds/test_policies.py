@@ -51,5 +51,5 @@ def test_a_goal_that_is_off_moves_the_body_there(scripts):
     assert found[0] == pytest.approx(0.02 * np.linalg.norm(errors), abs=0.01)
 
 
-def test_policies_have_names_of_their_own():
+def test_policies_have_different_names():
     assert len({policy.name for policy in POLICIES}) == len(POLICIES) >= 8
