@@ -1,0 +1,21 @@
+"""Train by a recipe, from Python: all four networks of `debug`, and a clip of the result."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import egosim_jax as egosim
+from egosim_jax.train.recipes import RECIPES
+from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+
+out = Path("runs/examples/train_from_python")
+about, recipe = RECIPES["debug"]
+print(about)
+short = replace(
+    recipe, out=out, vae=replace(recipe.vae, steps=10), denoiser=replace(recipe.denoiser, steps=10)
+)
+short.run()  # the same call resumes an interrupted training
+
+generator = egosim.Generator.load("debug", out / "weights")
+(scene,) = make_sequence(7, spec=generator.config.video, clips=1)
+(clip,) = generator.generate([to_triplet(scene)], seeds=[0])
+egosim.write_video(out / "clip.mp4", clip.frames, fps=clip.fps)
