@@ -16,7 +16,7 @@ from egosim_jax.env.backends import GeneratedWorld
 from egosim_jax.rendering import reference
 from egosim_jax.types import VideoSpec
 
-VIDEO = VideoSpec(frames=5, height=24, width=40, fps=8)
+VIDEO = VideoSpec(frames=5, height=32, width=48, fps=8)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from egosim_jax.cli.annotate import Annotate
+from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
 from egosim_jax.cli.triplets import Align, ToDwm
 from egosim_jax.command import ExitCode
@@ -325,6 +326,7 @@ class Data:
     command: (
         Annotated[Annotate, tyro.conf.subcommand("annotate")]
         | Annotated[Import, tyro.conf.subcommand("import")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Make, tyro.conf.subcommand("make")]
         | Annotated[Pack, tyro.conf.subcommand("pack")]
         | Annotated[Encode, tyro.conf.subcommand("encode")]

@@ -2,7 +2,7 @@
 
     session.json              settings
     starts/N/                 start after committed step N, where a reset or load chose one
-    steps/N/request.json      row, prompt and hash of a step's request
+    steps/N/request.json      row of each frame, prompt and hash of a step's request
     steps/N/action.npz        cameras and joints
     steps/N/rollout/          journal, clip and state (rollout.py)
     steps/N/info.json         what is known of the step; it is committed when this is there
@@ -16,14 +16,14 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import Backend
@@ -85,7 +85,8 @@ class Session:
     def create(cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start) -> Session:
         """Write the folder of a new session and open it."""
         start.save(folder / "starts" / "0")
-        write_json(folder / SETTINGS, {"actions": vars_of(actions), "seed": start.seed})
+        settings = {"actions": vars_of(actions), "video": backend.video, "seed": start.seed}
+        write_json(folder / SETTINGS, settings)
         return cls(folder, backend)
 
     def _step(self, number: int) -> Path:
@@ -106,7 +107,7 @@ class Session:
         base = max(int(p.name) for p in (self.folder / "starts").iterdir() if p.name.isdigit())
         past: tuple[Action, ...] = ()
         if self.backend.needs_past:
-            past = tuple(self._action(n) for n in range(base + 1, self.committed + 1))
+            past = tuple(self.action(n) for n in range(base + 1, self.committed + 1))
         result, start = self.repeat(self.committed), Start.load(self.folder / "starts" / str(base))
         now = replace(
             start,
@@ -136,7 +137,8 @@ class Session:
         names = {str(key): name for key, name in state.names.items()}
         return {"chunk": number, "state_sha256": snapshot.fingerprint(state), "objects": names}
 
-    def _action(self, number: int) -> Action:
+    def action(self, number: int) -> Action:
+        """Return the action of a step that is on disk."""
         request = read_json(self._step(number) / REQUEST)
         return load_action(
             self._step(number) / "action.npz",
@@ -151,7 +153,7 @@ class Session:
 
     def repeat(self, number: int) -> Result:
         """Return the result of a committed step from its files."""
-        folder, action = self._step(number), self._action(number)
+        folder, action = self._step(number), self.action(number)
         request, clip = read_json(folder / REQUEST), folder / "rollout" / "clip_1"
         info = read_json(folder / INFO)
         state = clip / "state"
@@ -159,7 +161,7 @@ class Session:
             step_id=number,
             frames=load_clip(clip / "frames.npz", self.backend.video.fps).frames,
             state=snapshot.load(state if state.exists() else self._base(number) / "state"),
-            row=np.array(request["row"], float),
+            row=np.array(request["rows"][-1], float),
             camera=last_camera(action),
             info=info,
         )
@@ -212,7 +214,7 @@ class Session:
         shutil.rmtree(folder, ignore_errors=True)
         about = {
             "prompt": chunk.action.prompt,
-            "row": chunk.rows[-1].tolist(),
+            "rows": chunk.rows.tolist(),
             "request": request,
             **chunk.info(self.actions),
         }
@@ -223,7 +225,7 @@ class Session:
     def finish(self) -> Result:
         """Make the step whose request is on disk, from its last finished phase; commit it."""
         number, now = self.committed + 1, self.now
-        folder, action = self._step(number), self._action(number)
+        folder, action = self._step(number), self.action(number)
         simulator = self.backend.simulator(now)
         rollout = Rollout(simulator, folder / "rollout")
         try:
@@ -243,7 +245,7 @@ class Session:
             "validity": validity(step, action, simulator.renderer),
         }
         write_json(folder / INFO, info)
-        row = np.array(request["row"], float)
+        row = np.array(request["rows"][-1], float)
         self.committed, self.pending = number, False
         self.now = now.after(step.state, row, action if self.backend.needs_past else None)
         self.result = self._made = Result(
@@ -279,13 +281,24 @@ class Session:
             )
         return self.restart(Start.load(folder))
 
+    def runs(self) -> Iterator[tuple[Start, list[int]]]:
+        """Yield the start and the committed steps of each stretch between resets and loads."""
+        starts = sorted(int(p.name) for p in (self.folder / "starts").iterdir() if p.name.isdigit())
+        for base, end in zip(starts, [*starts[1:], self.committed], strict=True):
+            if base < end:
+                steps = list(range(base + 1, end + 1))
+                yield Start.load(self.folder / "starts" / str(base)), steps
+
+    def rows(self, number: int) -> Float[np.ndarray, "f d"]:
+        """Return the row of each frame of a committed step."""
+        return np.array(read_json(self._step(number) / REQUEST)["rows"], float)
+
     def episode(self) -> Episode:
         """Return the steps since the last reset as an episode."""
-        base = int(self._base(self.committed).name) if self.committed else 0
-        start = Start.load(self.folder / "starts" / str(base))
+        *_, (start, steps) = self.runs()
         return Episode(
             state=start.state,
-            actions=tuple(self._action(n) for n in range(base + 1, self.committed + 1)),
+            actions=tuple(map(self.action, steps)),
             fps=self.backend.video.fps,
             first_frame=start.first_frame,
         )

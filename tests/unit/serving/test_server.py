@@ -102,7 +102,7 @@ def test_http_has_the_same_requests(server):
     rows = [session["row"]]
     path = f"/sessions/{session['session']}"
     _, body = http(port, f"{path}/step", {"step_id": 1, "actions": rows, "observe": ["frames"]})
-    assert json.loads(body)["frames"]["shape"] == [5, 24, 40, 3]
+    assert json.loads(body)["frames"]["shape"] == [5, 32, 48, 3]
     status, body = http(port, f"{path}/step", {"step_id": 9, "actions": rows})
     assert (status, json.loads(body)["code"]) == (409, "step_out_of_order")
     assert http(port, f"{path}/save", {"name": "a"})[0] == 200

@@ -1,0 +1,57 @@
+"""`egosim data export`: recorded sessions as LeRobot datasets, training shards or recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from egosim_jax.command import ExitCode
+from egosim_jax.types import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Export the sessions of `egosim serve`: to LeRobot, to training shards, or to Rerun.
+
+    lerobot: a dataset of version 3.0, an episode for each stretch between resets. shards: a clip
+    for each step, whose target is the generated clip. rerun: OUT/SESSION.rrd of each session, for
+    `egosim view`. Prints what was written.
+    """
+
+    sessions: Annotated[Path, tyro.conf.Positional]
+    """Folder of the sessions, --out of egosim serve."""
+    out: Path
+    """Folder to write."""
+    to: Literal["lerobot", "shards", "rerun"] = "lerobot"
+    """Format to write."""
+    session: tuple[str, ...] = ()
+    """Ids of the sessions; all if not given."""
+    config: str = "tabletop"
+    """Name of the model whose latent grid the shards must fit."""
+
+    def run(self) -> int:
+        """Read the sessions and write them."""
+        if self.to == "rerun" and find_spec("rerun") is None:
+            raise InputError(
+                "A recording is written by Rerun, which is not installed: pip install "
+                "'egosim-jax[viewer]'."
+            )
+        from egosim_jax import configs
+        from egosim_jax.serving import export
+
+        found = export.open_sessions(self.sessions, self.session)
+        if self.to == "lerobot":
+            export.to_lerobot(found, self.out)
+        elif self.to == "shards":
+            export.to_shards(found, self.out, grid=configs.get(self.config).grid)
+        else:
+            for session in found:
+                export.to_rerun(session, self.out / f"{session.id}.rrd")
+                print(self.out / f"{session.id}.rrd")
+            return ExitCode.DONE
+        print(self.out)
+        return ExitCode.DONE

@@ -1,0 +1,151 @@
+"""Recorded sessions as data: LeRobot datasets, training shards, and recordings for Rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.data.lerobot import ClipRecord, write_lerobot
+from egosim_jax.data.pack import triplet_record
+from egosim_jax.data.shards import ShardWriter
+from egosim_jax.env.backends import GeneratedWorld
+from egosim_jax.env.chunks import view_of
+from egosim_jax.io.untrusted import quote_path, read_json
+from egosim_jax.rendering import get
+from egosim_jax.rendering.portrait import up_of
+from egosim_jax.rendering.recording import Recording
+from egosim_jax.serving.session import SETTINGS, Session
+from egosim_jax.types import InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Unavailable:
+    """Generator of a world that is only read."""
+
+    renderer: Any
+    """Renderer of the views."""
+
+    def __call__(self, *_: Any) -> Any:
+        raise InputError("A recorded session cannot be continued here: use egosim serve.")
+
+
+def open_sessions(folder: Path, names: Sequence[str] = ()) -> list[Session]:
+    """Return the sessions of a server's folder, or those of some ids, with at least one step.
+
+    Raises `InputError` if there are none, or for an id that is not there.
+    """
+    paths = [path.parent for path in sorted(folder.glob(f"*/{SETTINGS}"))]
+    known = {path.name: path for path in paths}
+    if missing := sorted(set(names) - set(known)):
+        raise InputError(
+            f"{quote_path(folder)} has no session {missing[0][:40]!r}; it has {len(known)}: "
+            f"{', '.join(list(known)[:10]) or 'none'}. (--session)"
+        )
+    chosen = [known[name] for name in names] or paths
+    sessions = [Session(path, _recorded(path)) for path in chosen]
+    found = [session for session in sessions if session.committed]
+    if not found:
+        raise InputError(
+            f"{quote_path(folder)} has no session with a committed step: name the folder of "
+            "egosim serve. (SESSIONS)"
+        )
+    return found
+
+
+def _recorded(path: Path) -> GeneratedWorld:
+    """Return the world of a recorded session, which renders and does not generate."""
+    settings = read_json(path / SETTINGS)
+    fields = settings.get("video") if isinstance(settings, dict) else None
+    names = ("frames", "height", "width", "fps")
+    if not isinstance(fields, dict) or not all(type(fields.get(n)) is int for n in names):
+        raise InputError(f"{quote_path(path / SETTINGS)} does not describe a session. Restore it.")
+    video = VideoSpec(**{name: fields[name] for name in names})
+    return GeneratedWorld(generator=_Unavailable(renderer=get("jax")), video=video, perception=None)
+
+
+def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
+    """Write a LeRobot dataset with an episode for each stretch between resets."""
+    names = {session.actions.names for session in sessions}
+    rates = {session.backend.video.fps for session in sessions}
+    if len(names) > 1 or len(rates) > 1:
+        raise InputError(
+            f"The sessions have {len(names)} kinds of actions and {len(rates)} frame rates: a "
+            "dataset has one. Export them separately. (--session)"
+        )
+    episodes = [
+        [
+            ClipRecord(
+                frames=session.repeat(number).frames,
+                rows=session.rows(number),
+                prompt=session.action(number).prompt,
+            )
+            for number in steps
+        ]
+        for session in sessions
+        for _, steps in session.runs()
+    ]
+    kind = "gripper" if sessions[0].actions.kind == "robot" else "human_hands"
+    write_lerobot(
+        folder, episodes, names=sessions[0].actions.names, fps=rates.pop(), robot_type=kind
+    )
+
+
+def _steps(session: Session) -> Iterator[tuple[int, SceneState, View, Any]]:
+    """Yield number, state before, its view and first frame of each committed step."""
+    for start, steps in session.runs():
+        state, image = start.state, start.first_frame
+        simulator = session.backend.simulator(start)
+        for number in steps:
+            view = view_of(simulator, state, session.action(number).cameras)
+            yield number, state, view, view.frames[0] if image is None else image
+            state, image = session.repeat(number).state, None
+
+
+def to_shards(sessions: Sequence[Session], folder: Path, *, grid: VideoGrid) -> None:
+    """Write the steps as clips for training: prior, mask, hands, and the clip as the target."""
+    specs = {session.backend.video for session in sessions}
+    if len(specs) > 1:
+        raise InputError(
+            f"The sessions have clips of {len(specs)} sizes or rates: shards have one. Export them "
+            "separately. (--session)"
+        )
+    provenance = {"sessions": [session.id for session in sessions]}
+    (spec,) = specs
+    grid.check(spec)
+    renderer = get("jax")
+    with ShardWriter(folder, kind="frames", spec=spec, grid=grid, provenance=provenance) as writer:
+        for session in sessions:
+            for number, _, view, image in _steps(session):
+                action = session.action(number)
+                hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)
+                triplet = Triplet(
+                    video_id=f"{session.id}_{number}",
+                    prompt=action.prompt,
+                    prior=view.frames,
+                    mask=view.mask,
+                    hands=hands,
+                    first_frame=image,
+                    target=session.repeat(number).frames,
+                    extra={"kind": action.kind, "session": session.id},
+                )
+                record = triplet_record(triplet)
+                writer.add(record.arrays, record.metadata)
+
+
+def to_rerun(session: Session, path: Path) -> None:
+    """Write a recording of a session for the Rerun viewer (`egosim view`)."""
+    first = next(session.runs())[0].state
+    recording, state = Recording(path, session.id, up=up_of(first)), first
+    for number, before, view, _ in _steps(session):
+        result = session.repeat(number)
+        recording.add(
+            before,
+            session.action(number),
+            view=view.frames,
+            frames=result.frames,
+            ground_truth=None,
+        )
+        state = result.state
+    recording.close(state)
