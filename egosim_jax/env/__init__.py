@@ -48,12 +48,15 @@ def backend_of(
     from egosim_jax import configs
     from egosim_jax.env.backends import GeneratedWorld
     from egosim_jax.env.batching import Batcher
+    from egosim_jax.env.true_world import TrueWorld
     from egosim_jax.generator import Generator
     from egosim_jax.sharding import make_mesh, parts
     from egosim_jax.types import MeshConfig
 
     model = configs.get(config)
     model = replace(model, steps=steps or model.steps)
+    if world == "true":
+        return TrueWorld(video=model.video)
     if world != "generated":
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))

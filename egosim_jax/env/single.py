@@ -167,7 +167,7 @@ class Running:
         if "depth" in observe:
             found["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
         if "keypoints" in observe:
-            found["keypoints"] = self.actions.joints(self.row[None])[0]
+            found["keypoints"] = self.actions.joints(self.row[None])[0].copy()
         if "state" in observe:
             state, names = self.now.state, ("points_m", "colors", "object_ids")
             chosen = np.linspace(0, len(state.points_m) - 1, STATE_POINTS).astype(int)

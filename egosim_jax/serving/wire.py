@@ -8,6 +8,7 @@ only, and an array's size must be that of its data.
 from __future__ import annotations
 
 import base64
+import re
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from egosim_jax.types import InputError
 
 MAX_BYTES = 16 << 20
 """Largest message from a client in bytes."""
+DTYPES = re.compile(r"[<>=]?(?:i[1248]|u[1248]|f[248])|[|]?(?:b1|i1|u1)")
+"""Names of dtypes; NumPy would evaluate others, such as those with commas, as Python."""
 LISTED = 512
 """Most numbers of an array that JSON has as a list."""
 MAX_DEPTH = 16
@@ -105,13 +108,9 @@ def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
 
 
 def _dtype(name: Any) -> np.dtype:
-    try:
-        dtype = np.dtype(name if isinstance(name, str) and len(name) <= 4 else "O")
-    except (TypeError, ValueError):
-        dtype = np.dtype("O")
-    if dtype.kind not in "biuf":
+    if not isinstance(name, str) or not DTYPES.fullmatch(name):
         raise InputError(f"The dtype of an array is {quote(name)}: it must be of numbers or bool.")
-    return dtype
+    return np.dtype(name)
 
 
 def _check_depth(value: Any) -> None:

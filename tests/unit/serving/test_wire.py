@@ -22,6 +22,7 @@ def test_arrays_scalars_and_text_come_back():
     [
         ({**ARRAY, b"dtype": "O"}, "must be of numbers"),
         ({**ARRAY, b"dtype": "<c8"}, "must be of numbers"),
+        ({**ARRAY, b"dtype": ",f8"}, "must be of numbers"),
         ({**ARRAY, b"shape": [1 << 40]}, "whole numbers"),
         ({**ARRAY, b"shape": [2]}, "they must agree"),
         ({**ARRAY, b"shape": [-1, -1]}, "whole numbers"),
