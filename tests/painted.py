@@ -6,13 +6,15 @@ serves it on a free port and prints the address.
 """
 
 import argparse
+import functools
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.env.backends import GeneratedWorld
+from egosim_jax.env.actions import ActionSpec
+from egosim_jax.env.backends import GeneratedWorld, tabletop_start
 from egosim_jax.rendering import reference
 from egosim_jax.types import VideoSpec
 
@@ -37,9 +39,22 @@ class Painter:
         return "painter"
 
 
+class PaintedWorld(GeneratedWorld):
+    """World of a painter, whose scenes are rendered once."""
+
+    def start(self, seed, spec):
+        return _start(seed, spec.kind, spec.sides)
+
+
+@functools.cache
+def _start(seed, kind, sides):
+    layout = "gripper" if kind == "robot" else "wrist"
+    return tabletop_start(seed, ActionSpec(layout=layout, sides=sides), VIDEO)
+
+
 def painted(perception=None, pause=0.0):
     """World of the painter, by default without perception, which takes longest."""
-    return GeneratedWorld(generator=Painter(pause), video=VIDEO, perception=perception)
+    return PaintedWorld(generator=Painter(pause), video=VIDEO, perception=perception)
 
 
 def main():

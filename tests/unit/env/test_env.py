@@ -25,7 +25,10 @@ def ahead(env, rows=4):
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    "layout",
+    [n if n == "wrist" else pytest.param(n, marks=pytest.mark.slow) for n in LAYOUTS],
+)
 def test_gymnasiums_checker_passes(layout):
     actions = ActionSpec(layout=layout, camera=layout == "gripper")
     observe = ("frames", "depth", "keypoints", "state")

@@ -13,7 +13,7 @@ from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_scripts
 from egosim_jax.worlds.tabletop.policies import POLICIES
 
-VIDEO = VideoSpec(frames=17, height=16, width=32, fps=8)
+VIDEO = VideoSpec(frames=17, height=8, width=16, fps=8)
 JOINTS = ActionSpec(
     layout="keypoints", workspace_m=((-0.6, -0.4, -0.1), (0.6, 0.8, 0.6)), sides=("right",)
 )
@@ -40,15 +40,16 @@ def test_an_exact_policy_succeeds_exactly_and_a_resting_one_does_not():
     env.reset(options={"start": start})
     _, reward, terminated, _, info = env.chunk_step(rows[1:])
     assert (terminated, info["success"]) == (True, True)
-    assert reward > -1e-6
+    assert reward > -0.005  # the true world lets it down where the hand opens
     env.reset(options={"start": start})
     _, reward, terminated, _, info = env.chunk_step(rows[:1])
     assert not info["success"]
     assert reward == pytest.approx(-np.linalg.norm(task.offset_m))
 
 
+@pytest.mark.slow
 def test_a_start_of_the_past_continues_to_the_same_state():
-    seed, rows, task = carry()
+    seed, rows, _ = carry()
     world = TrueWorld(video=VIDEO)
     hashes = []
     for number in range(2):

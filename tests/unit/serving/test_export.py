@@ -97,6 +97,7 @@ def test_shards_have_a_clip_for_each_step(folder, tmp_path):
     np.testing.assert_array_equal(records[1].arrays["target"], sessions[0].repeat(2).frames)
 
 
+@pytest.mark.slow
 def test_a_recording_is_written(folder, tmp_path):
     export.to_rerun(export.open_sessions(folder)[0], tmp_path / "one.rrd")
     assert (tmp_path / "one.rrd").stat().st_size > 1000
