@@ -5,7 +5,7 @@ An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
     hands     litert, jax                                 perception.hands, networks.hands
     masks     geometry, sam3=FOLDER, grounded-sam3=FOLDER, grounded-sam2=FOLDER,
               grounded-edgetam=FOLDER                     perception.silhouettes, networks
-    cameras   ladder                                      perception.cameras
+    cameras   ladder, depth-anything-3=FOLDER             perception.cameras, networks
     depth     sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER
     caption   any text, or qwen=FOLDER
 
@@ -49,8 +49,12 @@ _MASKS = {
     "grounded-sam2": "perception.networks.grounded:GroundedSam2",
     "grounded-edgetam": "perception.networks.grounded:GroundedEdgeTam",
 }
+_CAMERAS = {
+    "ladder": "",
+    "depth-anything-3": "perception.networks.depth_anything_3:DepthAnything3Cameras",
+}
 _CAPTIONS = {"qwen": "perception.networks.qwen3_vl:Qwen3VL"}
-_BARE = ("sweep", "geometry")
+_BARE = ("sweep", "geometry", "ladder")
 """Estimators without weights."""
 
 
@@ -108,6 +112,8 @@ class AnnotateConfig:
     """Floating-point type of the networks."""
     phrases: tuple[str, ...] = ()
     """Objects to segment, where no network names them."""
+    cameras: str = "ladder"
+    """Camera estimator; the recording's cameras are used instead where it has some."""
     focal_px: float | None = None
     """Focal length in pixels of the video."""
     rung: Rung | None = None
@@ -142,6 +148,11 @@ class AnnotateConfig:
             raise InputError("--scale and --camera-height both give the scale: choose one.")
         if self.rung is not None and self.rung not in get_args(Rung):
             raise InputError(f"--rung must be one of {', '.join(get_args(Rung))}.")
+        if _find(_CAMERAS, self.cameras, "--cameras")[1] and (self.rung or self.focal_px):
+            raise InputError(
+                "--rung and --focal are options of --cameras ladder: a network that estimates "
+                "cameras takes neither. Omit them."
+            )
         _find(_DEPTH, self.depth, "--depth")
         name, _ = _find(_MASKS, self.masks, "--masks")
         if name.startswith("grounded-") != (self.detector is not None):
@@ -170,9 +181,12 @@ class AnnotateConfig:
         from egosim_jax.perception.cameras import CameraLadder
         from egosim_jax.perception.hands import LandmarkHands
 
-        ladder: dict[str, Any] = {} if self.rung is None else {"rung": self.rung}
         where: dict[str, Any] = {"device": self.device, "dtype": self.dtype}
         segmenter = captioner = None
+        cameras: CameraEstimator = CameraLadder(rung=self.rung)
+        name, folder = _find(_CAMERAS, self.cameras, "--cameras")
+        if folder is not None:
+            cameras = cast(CameraEstimator, _import(_CAMERAS[name])(folder, **where))
         name, folder = _find(_MASKS, self.masks, "--masks")
         if folder is not None:
             folders = [folder] if self.detector is None else [self.detector, folder]
@@ -189,7 +203,7 @@ class AnnotateConfig:
             hands=LandmarkHands(
                 weights=self.hand_weights, offline=self.offline, networks=self._hand_networks()
             ),
-            cameras=CameraLadder(**ladder),
+            cameras=cameras,
             depth=cast(DepthEstimator, depth),
             segmenter=segmenter,
             captioner=captioner,

@@ -79,6 +79,8 @@ class Annotate:
     """Floating-point type of the networks, but for Depth Anything 3, which chooses its own."""
     phrases: tuple[str, ...] = ()
     """Objects to segment, by name."""
+    cameras: str = "ladder"
+    """Cameras: ladder, of methods without weights, or depth-anything-3=FOLDER."""
     focal: float | None = None
     """Focal length of the video in its pixels, instead of estimating it."""
     rung: Rung | None = None
@@ -193,6 +195,7 @@ class Annotate:
             device=self.device,
             dtype=self.dtype,
             phrases=self.phrases,
+            cameras=self.cameras,
             focal_px=self.focal,
             rung=self.rung,
             depth=self.depth,

@@ -18,8 +18,10 @@ from egosim_jax.types import Cameras
 
 LEFT, RIGHT = 0, 1
 """Index of a hand's side in `HandTracks`."""
-Rung = Literal["given", "static", "incremental", "focal", "global", "rotation", "refused"]
-"""Rung of the ladder of camera estimation, from the best known to none."""
+Rung = Literal[
+    "given", "network", "static", "incremental", "focal", "global", "rotation", "refused"
+]
+"""Rung of the ladder of camera estimation, from the best known to none; or a network's cameras."""
 
 
 @no_type_check

@@ -63,8 +63,8 @@ class CameraLadder:
     def __post_init__(self) -> None:
         """Check that the options fit together."""
         problem = None
-        if self.rung == "refused":
-            problem = "the rung refused cannot be forced. Choose another one"
+        if self.rung in ("refused", "network"):
+            problem = f"the rung {self.rung} cannot be forced. Choose another one"
         elif (self.rung == "given") != (self.cameras is not None) and self.rung is not None:
             problem = "the rung given, and no other, goes with known cameras. Give both or neither"
         elif not 10 <= self.assumed_view_deg <= 150:

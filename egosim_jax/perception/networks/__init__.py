@@ -8,7 +8,7 @@ their path: a run is resumed when the folder has moved, and refused with other w
 """
 
 from egosim_jax.perception.networks.depth_anything import DepthAnything
-from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3
+from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3, DepthAnything3Cameras
 from egosim_jax.perception.networks.depth_files import DepthFiles
 from egosim_jax.perception.networks.depth_pro import DepthPro
 from egosim_jax.perception.networks.grounded import GroundedEdgeTam, GroundedSam2, GroundedSam3
@@ -20,6 +20,7 @@ from egosim_jax.perception.networks.worker import NetworkError, close_workers
 __all__ = [
     "DepthAnything",
     "DepthAnything3",
+    "DepthAnything3Cameras",
     "DepthFiles",
     "DepthPro",
     "GroundedEdgeTam",

@@ -1,4 +1,4 @@
-"""Depth Anything 3: depth of many views at once, consistent with each other and given cameras.
+"""Depth Anything 3: depth and cameras of many views at once, consistent with each other.
 
 Checkpoints: depth-anything/DA3-SMALL and DA3-BASE (Apache-2.0), DA3-LARGE, DA3-GIANT and
 DA3NESTED-GIANT-LARGE-1.1 (CC BY-NC 4.0), of which the last one is in meters. Its package demands
@@ -18,18 +18,20 @@ from jaxtyping import Bool, UInt8
 
 from egosim_jax.geometry import invert
 from egosim_jax.io.untrusted import quote, quote_path
-from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
+from egosim_jax.perception.cameras.path import complete_path
+from egosim_jax.perception.depth.triangulate import triangulate_frames
+from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict
 from egosim_jax.perception.networks.checkpoint import Network, check_device
 from egosim_jax.perception.networks.child import Run
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import Cameras, InputError, check_counts, is_rigid
 
 MIN_VIEWS = 2
 """Fewest views from which the scale of given cameras is found."""
 
 
 @dataclass(frozen=True)
-class DepthAnything3(Network):
-    """Multi-view depth by Depth Anything 3; a `DepthEstimator`."""
+class _DepthAnything3(Network):
+    """What depth and cameras by Depth Anything 3 share."""
 
     needs: ClassVar[str] = "Depth Anything 3 (depth-anything/DA3*)"
     packages: ClassVar[tuple[str, ...]] = ("torch", "torchvision", "depth_anything_3")
@@ -39,15 +41,13 @@ class DepthAnything3(Network):
     )
 
     _: KW_ONLY
-    context: int = 8
-    """Frames of the video that are seen besides the wanted ones, evenly spaced."""
     resolution_px: int = 504
     """Longer side of the images that the network sees, in pixels."""
 
     def __post_init__(self) -> None:
-        """Check the folder, and that sizes and numbers are positive."""
+        """Check the folder, and that sizes are positive."""
         super().__post_init__()
-        check_counts({"context": self.context, "resolution_px": self.resolution_px})
+        check_counts({"resolution_px": self.resolution_px})
 
     def check_config(self, config: Mapping[str, Any]) -> None:
         """Raise `InputError` unless the config names a model of Depth Anything 3."""
@@ -58,6 +58,20 @@ class DepthAnything3(Network):
                 f"{quote_path(self.folder)} is a checkpoint of {found}: {self.needs} needs a "
                 "config.json with a model_name such as da3nested-giant-large. Give its folder."
             )
+
+
+@dataclass(frozen=True)
+class DepthAnything3(_DepthAnything3):
+    """Multi-view depth by Depth Anything 3; a `DepthEstimator`."""
+
+    _: KW_ONLY
+    context: int = 8
+    """Frames of the video that are seen besides the wanted ones, evenly spaced."""
+
+    def __post_init__(self) -> None:
+        """Check the folder, and that sizes and numbers are positive."""
+        super().__post_init__()
+        check_counts({"context": self.context})
 
     def __call__(
         self,
@@ -92,6 +106,77 @@ class DepthAnything3(Network):
         )
 
 
+@dataclass(frozen=True)
+class DepthAnything3Cameras(_DepthAnything3):
+    """Cameras by Depth Anything 3; a `CameraEstimator`.
+
+    The network always gives cameras. They are accepted if corners of the first frame, which are
+    followed through the video by optical flow, meet where these cameras see them.
+    """
+
+    _: KW_ONLY
+    max_views: int = 61
+    """Most frames that the network sees, evenly spaced; poses between them are interpolated."""
+    min_points: int = 50
+    """Fewest corners that must show parallax."""
+    max_error_px: float = 2.0
+    """Largest median reprojection error of the corners in pixels."""
+
+    def __post_init__(self) -> None:
+        """Check the folder, and that sizes and numbers are positive."""
+        super().__post_init__()
+        check_counts({"max_views": self.max_views - 1, "min_points": self.min_points})
+
+    def __call__(
+        self,
+        frames: UInt8[np.ndarray, "f h w 3"],
+        moving: Bool[np.ndarray, "f h w"],
+        *,
+        focal_px: float | None = None,
+    ) -> CameraEstimate:
+        """Return cameras and points, in meters if the checkpoint is a metric one, or why not.
+
+        The network estimates the focal length; `focal_px` is not used.
+        """
+        count, height, width = frames.shape[:3]
+        views = np.unique(np.linspace(0, count - 1, min(self.max_views, count)).astype(int))
+        found, about = self.ask({"frames": frames[views]}, resolution_px=self.resolution_px)
+        if "extrinsics" not in found:
+            raise InputError(
+                f"{quote_path(self.folder)} gives depth alone: cameras need a checkpoint of many "
+                "views, such as DA3-BASE. (--cameras)"
+            )
+        poses = np.repeat(np.eye(4)[None], len(views), axis=0)
+        poses[:, :3] = found["extrinsics"][:, :3]
+        if not is_rigid(poses).all():
+            return _refused("the network's poses are not rigid transforms", {})
+        cameras = Cameras(
+            world_from_camera=complete_path(views, poses[0] @ invert(poses), count),
+            intrinsics_px=np.median(found["intrinsics"], axis=0).astype(float),
+            height=height,
+            width=width,
+        )
+        points = triangulate_frames(frames, moving, cameras, [0])
+        number = 0 if points is None else len(points.points_m)
+        error_px = float("nan") if points is None else float(np.median(points.error_px))
+        figures = {"network_points": float(number), "network_error_px": error_px}
+        if number < self.min_points:
+            reason = f"{number} corners show parallax in the network's cameras: too few to judge"
+            return _refused(reason, {"network_points": float(number)})
+        if error_px > self.max_error_px:
+            reason = f"followed corners miss the network's cameras by {error_px:.1f} pixels"
+            return _refused(f"{reason}, above {self.max_error_px:g}", figures)
+        reason = f"{number} followed corners meet at an error of {error_px:.2f} pixels"
+        verdict = Verdict(rung="network", reason=reason, figures=figures)
+        metric = bool(about["metric"])
+        return CameraEstimate(cameras=cameras, metric=metric, verdict=verdict, points=points)
+
+
+def _refused(reason: str, figures: Mapping[str, float]) -> CameraEstimate:
+    verdict = Verdict(rung="refused", reason=reason, figures=figures)
+    return CameraEstimate(cameras=None, metric=False, verdict=verdict)
+
+
 def _moves(estimate: CameraEstimate, views: np.ndarray) -> bool:
     """Return whether the cameras of some views are at different places."""
     if estimate.cameras is None or len(views) < MIN_VIEWS:
@@ -119,6 +204,13 @@ def load(folder: str, device: str, dtype: str) -> Run:
         )
         maps = torch.from_numpy(np.asarray(found.depth, np.float32))[:, None]
         maps = interpolate(maps, size=size, mode="bilinear", align_corners=False)[:, 0]
-        return {"depth": maps.numpy()}, {"metric": bool(found.is_metric)}
+        given = {"depth": maps.numpy()}
+        if found.extrinsics is not None and found.intrinsics is not None:
+            intrinsics = np.array(found.intrinsics, float)  # of the images that the network saw
+            scale = np.array(size[::-1]) / np.asarray(found.depth).shape[:0:-1]
+            intrinsics[:, :2] *= scale[:, None]
+            intrinsics[:, :2, 2] += (scale - 1) / 2
+            given |= {"extrinsics": np.asarray(found.extrinsics, float), "intrinsics": intrinsics}
+        return given, {"metric": bool(found.is_metric)}
 
     return run

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 import torch  # noqa: F401
 
+from egosim_jax.geometry import invert
 from egosim_jax.perception.estimates import CameraEstimate, Verdict
-from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3
+from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3, DepthAnything3Cameras
 from egosim_jax.perception.networks.worker import close_workers
 from egosim_jax.types import Cameras, InputError
+from tests.unit.perception.cameras import room
 
 PACKAGE = """
+from pathlib import Path
 from types import SimpleNamespace
 import numpy as np, torch
 
@@ -19,7 +22,9 @@ class DepthAnything3(torch.nn.Module):
     @classmethod
     def from_pretrained(cls, folder, *, local_files_only, strict):
         assert local_files_only and strict
-        return cls()
+        network = cls()
+        network.folder = Path(folder)
+        return network
 
     def inference(self, image, extrinsics=None, intrinsics=None, process_res=504):
         assert all(frame.dtype == np.uint8 for frame in image)
@@ -27,7 +32,12 @@ class DepthAnything3(torch.nn.Module):
         if extrinsics is not None:  # the distance of each camera, to be seen in the result
             assert extrinsics.shape == (len(image), 4, 4) and intrinsics.shape == (len(image), 3, 3)
             depth = depth + 100 * np.linalg.norm(extrinsics[:, :3, 3], axis=1)[:, None, None]
-        return SimpleNamespace(depth=depth, is_metric=1)
+        cameras = {"extrinsics": None, "intrinsics": None}
+        if (known := self.folder / "cameras.npz").exists():  # of images of half the size
+            cameras = dict(np.load(known))
+            height, width = image[0].shape[:2]
+            depth = np.ones((len(image), height // 2, width // 2))
+        return SimpleNamespace(depth=depth, is_metric=1, **cameras)
 """
 FRAMES = np.repeat(np.arange(10, dtype=np.uint8), 8 * 12 * 3).reshape(10, 8, 12, 3)
 STILL = np.zeros(FRAMES.shape[:3], bool)
@@ -51,7 +61,8 @@ def network(tmp_path, monkeypatch):
     (package / "__init__.py").touch()
     (package / "api.py").write_text(PACKAGE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "path"))
-    monkeypatch.setattr(DepthAnything3, "packages", ("torch",))
+    for kind in (DepthAnything3, DepthAnything3Cameras):
+        monkeypatch.setattr(kind, "packages", ("torch",))
     (tmp_path / "config.json").write_text(json.dumps({"model_name": "da3nested-giant-large"}))
     (tmp_path / "model.safetensors").write_bytes(b"weights")
     yield DepthAnything3(tmp_path, context=3)
@@ -69,6 +80,37 @@ def test_wanted_frames_get_depth_in_the_unit_of_moving_cameras(network):
         found = network(FRAMES, STILL, still, [3])
         assert found.depth_m[0, 4, 5] == pytest.approx(3)
         assert found.metric
+
+
+@pytest.mark.slow
+def test_cameras_are_accepted_if_followed_corners_meet_in_them(network, tmp_path):
+    true = room.path(9, move=np.array([0.4, 0.0, 0.1]))
+    frames = room.render(true)
+    still = np.zeros(frames.shape[:3], bool)
+    estimator = DepthAnything3Cameras(tmp_path)
+    with pytest.raises(InputError, match="gives depth alone"):
+        estimator(frames, still)
+
+    def seen(cameras):
+        half = cameras.intrinsics_px.copy()
+        half[:2] /= 2
+        half[:2, 2] -= 0.25
+        known = {
+            "extrinsics": invert(cameras.world_from_camera)[:, :3],
+            "intrinsics": np.repeat(half[None], len(frames), axis=0),
+        }
+        np.savez(tmp_path / "cameras.npz", **known)
+        return estimator(frames, still)
+
+    found = seen(true)
+    assert (found.verdict.rung, found.metric) == ("network", True)
+    expected = invert(true.world_from_camera[:1]) @ true.world_from_camera
+    np.testing.assert_allclose(found.cameras.world_from_camera, expected, atol=1e-6)
+    np.testing.assert_allclose(found.cameras.intrinsics_px, true.intrinsics_px, atol=1e-6)
+    wrong = room.path(9, move=np.array([0.0, 0.4, 0.1]))
+    refused = seen(wrong)
+    assert refused.cameras is None
+    assert "pixels, above 2" in refused.verdict.reason
 
 
 def test_another_folder_and_a_missing_package_are_refused(network, monkeypatch):
