@@ -256,6 +256,8 @@ def _check_order(action: Action) -> None:
                 "tip, index tip."
             )
         return
+    if _is_hand(hands):  # whose bones a fist may have shorter in another order
+        return
     lengths = {name: _bone_length(hands[:, order]) for name, order in ORDERS.items()}
     name = min(lengths, key=lambda name: lengths[name])
     if lengths[name] < SHORTER * _bone_length(hands):
@@ -267,10 +269,26 @@ def _check_order(action: Action) -> None:
         )
 
 
-def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
+def _bones(hands: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, "n 5 4"]:
+    """Return the lengths of each finger's bones, from the wrist outwards."""
     outer = np.arange(1, JOINTS["human"])
     inner = np.where(outer % 4 == 1, 0, outer - 1)
-    return float(np.linalg.norm(hands[:, outer] - hands[:, inner], axis=-1).sum())
+    return np.linalg.norm(hands[:, outer] - hands[:, inner], axis=-1).reshape(-1, 5, 4)
+
+
+def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
+    return float(_bones(hands).sum())
+
+
+def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
+    """Return True if bones are in proportion: those of the palm alike, and by far the longest.
+
+    Fingers but the thumb are looked at, by their medians; their last bones are shorter than the
+    first ones. It holds for any pose, however the fingers are bent.
+    """
+    palm, first, _, last = np.median(_bones(hands)[:, 1:], axis=0).T
+    alike = palm.min() > 0.75 * palm.mean() and palm.max() < 1.33 * palm.mean()
+    return bool(alike and (palm > 1.4 * first).all() and first.sum() > last.sum())
 
 
 def _check_scene(state: SceneState, cameras: Cameras) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.episode import ORDERS, Episode, _read_ground_truth
+from egosim_jax.episode import ORDERS, SHORTER, Episode, _bone_length, _read_ground_truth
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.state.snapshot import save
 from egosim_jax.types import InputError, VideoSpec
@@ -78,6 +78,15 @@ def test_another_order_of_the_joints_is_named(hands, order):
 @pytest.mark.parametrize("seed", range(4))
 def test_hands_of_any_closure_are_in_order(seed):
     to_episode(list(make_sequence(seed, spec=SPEC, clips=3)), fps=8)
+
+
+def test_a_fist_is_not_taken_for_a_hand_in_another_order(hands):
+    finger = np.array([[0, -0.09, 0], [0, -0.08, 0.022], [0, -0.06, 0.022], [0, -0.042, 0.014]])
+    across = np.arange(-2, 3)[:, None, None] * [0.003, 0, 0]
+    fist = np.concatenate([np.zeros((1, 3)), (finger + across).reshape(20, 3)])
+    lengths = [_bone_length(fist[None, order]) for order in ORDERS.values()]
+    assert min(lengths) < SHORTER * _bone_length(fist[None])
+    with_joints(hands, lambda a: a.joints_m[:, :, :1] + fist)
 
 
 def test_a_gripper_with_the_wrist_last_is_refused():
