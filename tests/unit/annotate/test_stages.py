@@ -60,7 +60,7 @@ def test_a_second_hand_for_a_moment_is_the_first_one_again():
     filled = np.zeros((60, 2), bool)
     filled[[12, 40], LEFT] = True
     kept = drop_flashes(replace(hands, filled=filled), Fraction(16))
-    assert np.argwhere(kept.filled).tolist() == [[40, LEFT]]
+    assert np.argwhere(np.asarray(kept.filled)).tolist() == [[40, LEFT]]
     assert np.flatnonzero(visible(kept)[:, LEFT]).tolist() == list(range(30, 45))
     assert visible(kept)[:, RIGHT].all()
     alone = StubHands(0.05, None)(np.zeros((60, 48, 80, 3), np.uint8))
@@ -68,14 +68,14 @@ def test_a_second_hand_for_a_moment_is_the_first_one_again():
 
 
 def test_all_hands_are_of_the_given_side(tmp_path):
-    hands = stages_of(tmp_path, config(side="left"), last="hands").hands
+    hands = stages_of(tmp_path, config(side="left"), last="hands").require("hands")
     assert visible(hands).all(axis=0).tolist() == [True, False]
     assert (hands.presence[:, LEFT] == 0.9).all()
 
 
 def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
     record = stages_of(tmp_path, config())
-    state = record.state
+    state = record.require("state")
     column = np.arange(48 * 80) % 80
     hidden = (
         (column >= 60) & (column < 78) & (column % 6 < 2)
@@ -87,7 +87,7 @@ def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
         object_ids=state.object_ids[~hidden],
         last_seen=state.last_seen[~hidden],
     )
-    still = np.repeat(record.first_frame[None], len(record.frames), axis=0)
+    still = np.repeat(record.require("first_frame")[None], len(record.frames), axis=0)
     _, figures = to_triplet(replace(record, state=state, frames=still), config())
     assert figures["seen"] == 1
     assert figures["psnr_background"] > 35  # 22 with the cracks
