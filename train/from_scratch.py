@@ -299,9 +299,16 @@ class FromTabletop(FromScratch):
     """Further scenes to train on, with states of the given weights' own rollouts; None: none."""
     rollout_clips: int = 4
     """Clips of each of these scenes."""
+    twins: bool | None = None
+    """True: static twins and hands as meshes, as DWM is conditioned on, of people alone."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` if rollouts are wanted without a model that makes them."""
+        """Raise `InputError` for rollouts without a model that makes them, or of static twins."""
+        if self.twins and self.rollouts is not None:
+            raise InputError(
+                f"{self.rollouts} scenes of rollouts cannot have static twins, which show each "
+                "clip's own first frame: omit one of them. (--rollouts, --twins)"
+            )
         if self.rollouts is not None and (self.weights is None or self.rollouts < 1):
             raise InputError(
                 f"{self.rollouts} scenes of rollouts cannot be made: there must be at least 1, and "
@@ -329,8 +336,10 @@ class FromTabletop(FromScratch):
             seeds=tuple(seeds),
             clips=clips,
             spec=model.video,
-            kind="mixed",
+            kind="human" if self.twins else "mixed",
             black_cloths=self.black_cloths,
+            prior="static" if self.twins else "state",
+            hands="mesh" if self.twins else "skeleton",
         )
         frames = out / "frames" / split
         workers, states = os.cpu_count() or 1, true_states

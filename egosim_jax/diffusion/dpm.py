@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.diffusion.process import Process
+from egosim_jax.diffusion.process import Process, at_least_float32
 from egosim_jax.diffusion.solver import sample_noise
 
 
@@ -76,11 +76,11 @@ class DPMSolver:
             -data * slope,
             sigma[1:] * np.sqrt(1 - damping**2),
         )
-        return DPMSolverRow(*(column.astype(np.float32) for column in columns))
+        return DPMSolverRow(*columns)
 
     def start(self, x: Float[Array, "*x"]) -> DPMSolverState:
         """Return the noise as the first latents, without predictions."""
-        x = x.astype(jnp.float32)
+        x = at_least_float32(x)
         return DPMSolverState(x, jnp.zeros_like(x))
 
     def step(
@@ -92,6 +92,6 @@ class DPMSolver:
         keys: Key[Array, " b"] | None = None,
     ) -> DPMSolverState:
         """Predict the data and extrapolate them over the step; add new noise."""
-        data = process.to_x0(state.x, output.astype(jnp.float32), row.alpha, row.sigma)
+        data = process.to_x0(state.x, at_least_float32(output), row.alpha, row.sigma)
         x = row.keep * state.x + row.data * data + row.before * state.before
         return DPMSolverState(x if keys is None else x + row.noise * sample_noise(keys, x), data)

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from egosim_jax.diffusion.process import DenoiseFn
+from egosim_jax.diffusion.process import DenoiseFn, at_least_float32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +32,7 @@ class Guidance:
         def guided(
             x: Float[Array, "b f h w c"], t: Float[Array, " b"]
         ) -> Float[Array, "b f h w c"]:
-            without = unconditional(x, t).astype(jnp.float32)
-            return without + self.scale * (conditional(x, t).astype(jnp.float32) - without)
+            without = at_least_float32(unconditional(x, t))
+            return without + self.scale * (at_least_float32(conditional(x, t)) - without)
 
         return guided

@@ -74,6 +74,11 @@ Prediction = Literal["velocity", "v", "epsilon", "x0"]
 Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
 
+def at_least_float32(x: Float[Array, "*x"]) -> Float[Array, "*x"]:
+    """Return an array in float32, or in float64 if it is that."""
+    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+
+
 class Process(ABC):
     """A path from data to noise, its sampling times and its prediction type."""
 

@@ -2,7 +2,8 @@
 
 A solver's coefficients depend on the process and on the visited times alone. They are computed for
 all steps on the host in float64, and the integration is one `lax.scan` over their rows
-(`integrate`). Latents stay float32 between steps whatever the network computes in.
+(`integrate`). Latents stay float32 between steps whatever the network computes in; DDIM
+and DPM-Solver++ keep float64 latents, where jax has them enabled.
 
 Euler (rectified flow) follows the straight line of the present velocity v:
 
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.diffusion.process import DenoiseFn, Process
+from egosim_jax.diffusion.process import DenoiseFn, Process, at_least_float32
 from egosim_jax.types import InputError
 
 
@@ -42,7 +43,7 @@ class Solver(Protocol):
         ...
 
     def coefficients(self, process: Process, times: Float[np.ndarray, " times"]) -> Any:
-        """Return every step's coefficients: float32 arrays with a leading step axis.
+        """Return every step's coefficients: arrays with a leading step axis.
 
         Raises `InputError` if the solver does not fit the process.
         """
@@ -207,11 +208,11 @@ class DDIM:
             sigma[1:] * np.sqrt(1 - new),
             sigma[1:] * np.sqrt(new),
         )
-        return DDIMRow(*(column.astype(np.float32) for column in columns))
+        return DDIMRow(*columns)
 
     def start(self, x: Float[Array, "*x"]) -> DDIMState:
         """Return the noise as the first latents."""
-        return DDIMState(x.astype(jnp.float32))
+        return DDIMState(at_least_float32(x))
 
     def step(
         self,
@@ -222,7 +223,7 @@ class DDIM:
         keys: Key[Array, " b"] | None = None,
     ) -> DDIMState:
         """Rescale the predicted data and noise, and add new noise."""
-        output = output.astype(jnp.float32)
+        output = at_least_float32(output)
         data = process.to_x0(state.x, output, row.alpha, row.sigma)
         epsilon = process.to_epsilon(state.x, output, row.alpha, row.sigma)
         x = row.data * data + row.epsilon * epsilon

@@ -30,11 +30,20 @@ def logged(out: Path) -> list[dict[str, float]]:
 class Run:
     """The processes of a run of `run_tiny`, one after the other."""
 
-    def __init__(self, data: Path, out: Path, *, steps: int, save_every: int, processes: int = 1):
+    def __init__(
+        self,
+        data: Path,
+        out: Path,
+        *,
+        steps: int,
+        save_every: int,
+        processes: int = 1,
+        task: str = "egosim",
+    ):
         self.out, self.processes = out, processes
         self._left: set[tuple[str, int]] = set()
         program = [sys.executable, "-m", "tests.training.run_tiny"]
-        self.command = [*program, str(data), str(out), str(steps), str(save_every)]
+        self.command = [*program, str(data), str(out), str(steps), str(save_every), task]
 
     def start(self) -> list[subprocess.Popen]:
         """Start or resume it."""

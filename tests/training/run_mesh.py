@@ -1,4 +1,7 @@
-"""Loss, gradients and 20 updates of a tiny model on a mesh: DATA FSDP CONTEXT PARTS OUT.npz."""
+"""Loss, gradients and 20 updates of a tiny model on a mesh.
+
+DATA FSDP CONTEXT PARTS OUT.npz [TASK]
+"""
 
 import dataclasses
 import sys
@@ -11,11 +14,13 @@ from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.networks import ModelConfig
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import TrainState, make_update
 from egosim_jax.types import VideoSpec
+from tests.training.run_tiny import TASKS as TINY
 
 STEPS, BATCH = 20, 8
 DEBUG = configs.get("debug")
@@ -28,32 +33,43 @@ MODEL = dataclasses.replace(
         dim=64, ffn_dim=96, heads=4, layers=2, text_dim=64, image_dim=32, remat="attention"
     ),
 )
-TASK = Denoising(model=MODEL, dropout=ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2))
+DWM = TINY["dwm"]
+DROPOUT = ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2)
+TASKS = {
+    "egosim": Denoising(model=MODEL, dropout=DROPOUT),
+    "dwm": dataclasses.replace(
+        DWM, model=dataclasses.replace(DWM.model, encoders="frozen"), dropout=DROPOUT
+    ),
+}
 
 
-def batch(seed: int) -> dict[str, np.ndarray]:
+def batch(seed: int, model: ModelConfig) -> dict[str, np.ndarray]:
     """Random latents and embeddings."""
     rng = np.random.default_rng(seed)
 
     def draw(*shape: int) -> np.ndarray:
         return rng.normal(size=(BATCH, *shape)).astype(np.float32)
 
-    shape, dit = MODEL.latent_shape, MODEL.dit
+    shape, dit = model.latent_shape, model.dit
+    names = ("target", "prior", "hands")
+    masks = model.layout.count("mask")
     return {
-        **{name: draw(*shape, 16) for name in ("target", "prior", "hands")},
-        "mask": rng.integers(0, 2, (BATCH, *shape, 4)).astype(np.uint8),
-        "text": draw(7, dit.text_dim),
-        "image": draw(5, dit.image_dim),
+        **{name: draw(*shape, 16) for name in names},
+        **({f"{name}_std": abs(draw(*shape, 16)) for name in names} if model.posterior else {}),
+        "mask": rng.integers(0, 2, (BATCH, *shape, masks)).astype(np.uint8),
+        "text": draw(8 if model.image is None else 7, dit.text_dim),
+        **({} if dit.image_dim is None else {"image": draw(5, dit.image_dim)}),
     }
 
 
-def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
+def main(data: int, fsdp: int, context: int, parts: int, out: str, task: str = "egosim") -> None:
     """Compute and write everything that must not depend on the mesh."""
+    chosen = TASKS[task]
     mesh = make_mesh(MeshConfig(data=data, fsdp=fsdp, context=context))
     config = OptimizerConfig(learning_rate=1e-3)
 
     def create() -> TrainState:
-        params = nnx.state(TASK.networks(nnx.Rngs(0)), nnx.Param)
+        params = nnx.state(chosen.networks(nnx.Rngs(0)), nnx.Param)
         # Zeros, as the head begins with, would hide errors.
         leaves, tree = jax.tree.flatten(params)
         keys = jax.random.split(jax.random.key(1), len(leaves))
@@ -62,17 +78,17 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
         ]
         return TrainState.create(jax.tree.unflatten(tree, noisy), config, STEPS)
 
-    graph = nnx.graphdef(nnx.eval_shape(lambda: TASK.networks(nnx.Rngs(0))))
+    graph = nnx.graphdef(nnx.eval_shape(lambda: chosen.networks(nnx.Rngs(0))))
     sharding = state_sharding(mesh, jax.eval_shape(create))
     placed = batch_sharding(mesh)
     state = init_sharded(create, out_shardings=sharding)
-    keys = TASK.keys(jax.random.key(0), BATCH)
+    keys = chosen.keys(jax.random.key(0), BATCH)
 
     def loss(params, batch):
-        return TASK.loss(nnx.merge(graph, params), batch, keys)[0]
+        return chosen.loss(nnx.merge(graph, params), batch, keys)[0]
 
     def put(seed: int):
-        return jax.device_put(batch(seed), placed)
+        return jax.device_put(batch(seed, chosen.model), placed)
 
     with jax.set_mesh(mesh):
         gradient = jax.jit(
@@ -82,7 +98,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
         )
         value, gradients = gradient(state.params, put(0))
         update = jax.jit(
-            make_update(TASK, graph, config, steps=STEPS, seed=0, grad_accum_steps=parts),
+            make_update(chosen, graph, config, steps=STEPS, seed=0, grad_accum_steps=parts),
             in_shardings=(sharding, None, placed),
             out_shardings=(sharding, None),
         )
@@ -98,4 +114,4 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:5]), sys.argv[5])
+    main(*map(int, sys.argv[1:5]), *sys.argv[5:])

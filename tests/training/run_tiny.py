@@ -1,8 +1,13 @@
-"""A tiny training run as a program, so that tests can kill it: DATA OUT STEPS SAVE_EVERY."""
+"""A tiny training run as a program, so that tests can kill it.
 
+DATA OUT STEPS SAVE_EVERY [TASK]
+"""
+
+import dataclasses
 import sys
 from pathlib import Path
 
+from egosim_jax import configs
 from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.io import weights
@@ -11,9 +16,24 @@ from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.distributed import distributed_context
 from egosim_jax.train.loop import train
 from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.types import VideoSpec
 
 MODEL = tiny_model()
-TASK = Denoising(model=MODEL, dropout=ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2))
+DROPOUT = ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2)
+SMALL = configs.get("dwm_tabletop")
+DWM = dataclasses.replace(
+    SMALL,
+    video=VideoSpec(frames=9, height=32, width=64, fps=8),
+    dit=dataclasses.replace(SMALL.dit, dim=64, heads=4, layers=2, time_dim=16),
+    vae=dataclasses.replace(SMALL.vae, dims=(4, 4, 8, 8), groups=2),
+    tokenizer=dataclasses.replace(SMALL.tokenizer, max_tokens=8),
+    posterior="sampled",
+)
+"""`dwm_tabletop`, tiny, with all of the randomness of a training of DWM."""
+TASKS = {
+    "egosim": Denoising(model=MODEL, dropout=DROPOUT),
+    "dwm": Denoising(model=DWM, dropout=DROPOUT, navigation=0.3),
+}
 
 
 def training(steps: int, save_every: int) -> TrainConfig:
@@ -34,13 +54,13 @@ def training(steps: int, save_every: int) -> TrainConfig:
     )
 
 
-def main(data: str, out: str, steps: str, save_every: str) -> int:
+def main(data: str, out: str, steps: str, save_every: str, task: str = "egosim") -> int:
     """Train, and write the weights."""
 
     def run() -> int:
         with distributed_context():
             schedule = training(int(steps), int(save_every))
-            networks = train(TASK, schedule, data=Path(data), validation=None, out=Path(out))
+            networks = train(TASKS[task], schedule, data=Path(data), validation=None, out=Path(out))
             weights.save(Path(out) / "dit.safetensors", networks.dit)
         return ExitCode.DONE
 
