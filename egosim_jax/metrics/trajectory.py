@@ -7,7 +7,7 @@ found by PnP (RANSAC, then least squares). On the ground-truth frames themselves
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -106,6 +106,53 @@ def camera_errors(
         return float("nan"), float("nan")
     between = invert(target[known]) @ world_from_camera[known]
     meters = np.linalg.norm(between[:, :3, 3], axis=1)
-    cosines = (np.trace(between[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    degrees = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    return float(np.sqrt(np.mean(meters**2))), float(np.sqrt(np.mean(degrees**2)))
+    return _rms(meters), _rms(_angles_deg(between))
+
+
+class PathErrors(NamedTuple):
+    """Errors of a camera path whose unit and world are unknown, such as an estimated one."""
+
+    rotation_deg: float
+    """RMS angle in degrees between the rotations since the first frame."""
+    translation: float
+    """RMS distance of the positions since the first frame, each path divided by its extent."""
+    ate: float
+    """RMS distance of the positions after a least-squares scale, in units of the target."""
+
+
+def path_errors(
+    world_from_camera: Float[np.ndarray, "f 4 4"], target: Float[np.ndarray, "f 4 4"]
+) -> PathErrors:
+    """Return the errors of a path relative to its first camera, whatever its scale.
+
+    A path's extent is the largest distance from its first camera; a path that stays there has an
+    extent of 1. Frames whose pose is not finite do not count; NaN if the first one's is not.
+    """
+    known = np.isfinite(world_from_camera).all(axis=(1, 2))
+    if not known[0]:
+        return PathErrors(float("nan"), float("nan"), float("nan"))
+    found, wanted = (invert(p[0]) @ p[known] for p in (world_from_camera, target))
+    between = invert(wanted) @ found
+    here, there = found[:, :3, 3], wanted[:, :3, 3]
+    strength = np.square(here).sum()
+    scale = max((here * there).sum() / strength, 0.0) if strength else 1.0
+    return PathErrors(
+        rotation_deg=_rms(_angles_deg(between)),
+        translation=_rms(np.linalg.norm(here / _extent(here) - there / _extent(there), axis=1)),
+        ate=_rms(np.linalg.norm(scale * here - there, axis=1)),
+    )
+
+
+def _extent(positions: Float[np.ndarray, "f 3"]) -> float:
+    """Return the largest distance from the first camera, or 1 for a camera that stays."""
+    return float(np.linalg.norm(positions, axis=1).max()) or 1.0
+
+
+def _angles_deg(a_from_b: Float[np.ndarray, "f 4 4"]) -> Float[np.ndarray, " f"]:
+    """Return the angle of each rotation in degrees."""
+    cosines = (np.trace(a_from_b[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def _rms(values: Float[np.ndarray, " n"]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from egosim_jax.metrics.image import MAX_PSNR, fit_colors, psnr, ssim
+from egosim_jax.metrics.image import MAX_PSNR, clip_psnr, color_drift, fit_colors, psnr, ssim
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +84,18 @@ def test_the_color_fit_of_a_black_video_is_the_mean_color(pair):
     fitted = fit_colors(np.zeros_like(reference), reference)
     mean = reference.reshape(-1, 3).mean(axis=0)
     assert np.abs(fitted - mean).max() <= 0.51
+
+
+def test_the_psnr_of_a_clip_is_that_of_one_error_over_all_frames(pair):
+    video, reference = pair
+    video = np.concatenate([video, reference])  # half of the frames are equal
+    reference = np.concatenate([reference, reference])
+    expected = peak_signal_noise_ratio(reference, video, data_range=255)
+    assert clip_psnr(psnr(video, reference)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_color_drift_is_the_difference_of_mean_colors(pair):
+    video = np.full((2, 16, 16, 3), 100, np.uint8)
+    drifted = video.copy()
+    drifted[1, :, :8, 0] += 10
+    np.testing.assert_allclose(color_drift(drifted, video), [[0, 0, 0], [5, 0, 0]])

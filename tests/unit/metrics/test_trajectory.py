@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.geometry import look_at
-from egosim_jax.metrics.trajectory import camera_errors, estimate_cameras
+from egosim_jax.metrics.trajectory import camera_errors, estimate_cameras, path_errors
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
@@ -67,3 +67,49 @@ def test_a_video_without_features_has_no_cameras(clip):
         clip.frames, gray, clip.depth_m, np.zeros_like(still(clip)), clip.cameras
     )
     assert np.isnan(found).all()
+
+
+def test_a_path_of_another_scale_and_world_has_no_error():
+    world = look_at(np.array([3.0, 1.0, 2.0]), np.zeros(3), up=np.array([0, 0, 1.0]))
+    found = path()
+    found[:, :3, 3] *= 2.5
+    np.testing.assert_allclose(path_errors(world @ found, path()), 0, atol=1e-5)
+
+
+def test_the_rotation_error_of_a_path_is_that_of_each_turn():
+    found = path()
+    turn = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
+    found[3, :3, :3] = found[3, :3, :3] @ turn
+    assert path_errors(found, path()).rotation_deg == pytest.approx(90 / np.sqrt(5), abs=1e-4)
+
+
+def line(*meters, axis=0):
+    poses = np.tile(np.eye(4), (len(meters), 1, 1))
+    poses[:, axis, 3] = meters
+    return poses
+
+
+def test_paths_at_right_angles_have_known_errors():
+    errors = path_errors(line(0, 1.0, 2.0, axis=1), line(0, 3.0, 6.0))
+    assert errors.rotation_deg == 0
+    # Divided by their extents, positions are 0, 1/2 and 1 along two axes.
+    assert errors.translation == pytest.approx(np.sqrt((0.5 + 2.0) / 3))
+    # No scale brings them closer than the origin is.
+    assert errors.ate == pytest.approx(np.sqrt((9.0 + 36.0) / 3))
+
+
+def test_the_scale_of_a_path_is_that_of_least_squares():
+    errors = path_errors(line(0, 1.0, 1.0), line(0, 2.0, 4.0))
+    assert errors.ate == pytest.approx(np.sqrt((1.0 + 1.0) / 3))  # scaled by 3
+
+
+def test_a_camera_that_stays_is_off_by_the_extent_of_the_path():
+    errors = path_errors(line(0, 0, 0), line(0, 3.0, 6.0))
+    assert errors.ate == pytest.approx(np.sqrt((9.0 + 36.0) / 3))
+    assert errors.translation == pytest.approx(np.sqrt((0.25 + 1.0) / 3))
+
+
+def test_a_path_without_a_first_pose_has_no_errors():
+    found = path()
+    found[0] = np.nan
+    assert np.isnan(path_errors(found, path())).all()
