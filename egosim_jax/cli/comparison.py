@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,9 +15,14 @@ if TYPE_CHECKING:
     from egosim_jax.evaluation.methods import Folder, Method
     from egosim_jax.evaluation.result import Evaluation
     from egosim_jax.evaluation.scoring import Protocol
+    from egosim_jax.perception.estimates import DepthEstimator
 
 Baseline = Literal["prior", "prior_fit", "still"]
 Network = Literal["alex", "vgg"]
+NO_DREAMSIM = (
+    "dreamsim: its weights are published for the package dreamsim alone, which is not used here; "
+    "the column has published figures only"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +42,18 @@ class Options:
     """Baselines without a model: the prior, the prior with fitted colors, and frame 0 repeated."""
     lpips: tuple[Network, ...] = ("alex",)
     """Networks of LPIPS, which needs the extra `metrics`."""
+    regions: bool = False
+    """Also PSNR near the drawn hands, and of the object where object_mask_video.mp4 has it."""
+    hands: bool = False
+    """Also hands detected in both videos: IoU, keypoint error and recall (extra `video`)."""
+    cameras: bool = False
+    """Also the camera path, estimated from both videos (extra `video`)."""
+    depth: Path | None = None
+    """Folder of Depth Anything V2 (metric) or 3, for the depth error (extra `networks`)."""
+    fvd: Path | None = None
+    """Folder of a VideoMAE, for the Fréchet video distance (extra `networks`)."""
+    device: str = "auto"
+    """Device of these networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     page_clips: int = 8
     """Most clips of each group that the page shows; 0: neither page nor picture."""
 
@@ -64,10 +81,41 @@ class Options:
         for name in networks:
             network = lpips.load_if_installed(name)
             if network is None:
-                unavailable.append(lpips.MISSING)
+                unavailable.append(f"lpips_{name}: {lpips.MISSING}")
             else:
                 measures.append(LpipsDistance(network, name))
-        return measures, unavailable
+        return [*measures, *self._estimated()], unavailable
+
+    def _estimated(self) -> Iterator[Measure]:
+        """Yield the measures that need estimates or networks."""
+        from egosim_jax.evaluation import estimated
+
+        if self.regions:
+            yield estimated.Regions()
+        if self.hands:
+            from egosim_jax.perception.hands import LandmarkHands
+
+            yield estimated.HandScores(LandmarkHands())
+        if self.cameras:
+            from egosim_jax.perception.cameras import CameraLadder
+
+            yield estimated.CameraError(CameraLadder())
+        if self.depth is not None:
+            yield estimated.DepthError(self._depth_network(self.depth))
+        if self.fvd is not None:
+            from egosim_jax.evaluation.fvd import Features
+            from egosim_jax.perception.networks import VideoMae
+
+            yield Features(VideoMae(self.fvd, device=self.device))
+
+    def _depth_network(self, folder: Path) -> DepthEstimator:
+        from egosim_jax.io.untrusted import read_json
+        from egosim_jax.perception.networks import DepthAnything, DepthAnything3
+
+        config = folder / "config.json"
+        content = read_json(config) if config.is_file() else {}
+        third = isinstance(content, dict) and "model_name" in content
+        return (DepthAnything3 if third else DepthAnything)(folder, device=self.device)
 
     def compare(
         self,
@@ -101,6 +149,10 @@ class Options:
             cache=ScoreCache(out / CACHE),
         )
         rows = scoring.run(clips)
+        extra = [key for m in measures[1:] for key in m.columns if key not in result["shown"]]
+        if "dreamsim" in result["shown"]:
+            unavailable.append(NO_DREAMSIM)
+        result["shown"] = (*result["shown"], *extra)
         evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
         write_files(evaluation, out)
         if self.page_clips:

@@ -50,6 +50,6 @@ class Evaluate(Options):
             out=self.out or first.path,
             title="Evaluation",
             networks=self.lpips,
-            shown=(*SHOWN, *(f"lpips_{name}" for name in self.lpips if name != "alex")),
+            shown=SHOWN,
         )
         return ExitCode.PARTIAL if evaluation.skipped else ExitCode.DONE

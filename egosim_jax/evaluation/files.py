@@ -12,8 +12,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -36,12 +38,20 @@ def write_files(evaluation: Evaluation, out: Path) -> None:
     for row in evaluation.rows:
         window = row.window
         line = {"video_id": window.output_id, "split": window.split}
-        lines.setdefault(window.output_id, line)[row.method] = dict(row.scores)
+        scores = {key: finite(row.scores[key]) for key in evaluation.measured if key in row.scores}
+        lines.setdefault(window.output_id, line)[row.method] = scores
     text = "".join(f"{json.dumps(line)}\n" for line in lines.values())
     write_text(out / "metrics.jsonl", text)
-    write_json(out / "report.json", evaluation.report)
+    write_json(out / "report.json", finite(evaluation.report))
     write_text(out / "scores.csv", to_csv(evaluation))
     write_text(out / "table.tex", to_latex(evaluation))
+
+
+def finite(value: Any) -> Any:
+    """Return a value for JSON with null for what could not be measured (NaN)."""
+    if isinstance(value, Mapping):
+        return {key: finite(item) for key, item in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def to_csv(evaluation: Evaluation) -> str:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
+from egosim_jax.batch import Window
 from egosim_jax.metrics import lpips
 from egosim_jax.metrics.image import clip_psnr, color_drift, psnr, ssim
 from egosim_jax.metrics.report import DEFINITIONS
@@ -25,13 +26,25 @@ class Column(NamedTuple):
     better: Literal["higher", "lower"]
 
 
-class Pair(NamedTuple):
-    """Videos that are compared."""
+@dataclass(frozen=True, kw_only=True)
+class GroundTruth:
+    """Ground truth of a window, with which the videos of all methods are compared."""
 
-    video: UInt8[np.ndarray, "f h w 3"]
-    """Frames of a method that count."""
-    target: UInt8[np.ndarray, "f h w 3"]
-    """Ground truth of the same frames."""
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """All frames of the window, the first one included."""
+    first: int
+    """First frame that counts."""
+    window: Window
+    """Clip and window."""
+
+    @property
+    def counted(self) -> UInt8[np.ndarray, "g h w 3"]:
+        """Frames that count."""
+        return self.frames[self.first :]
+
+
+Scorer = Callable[[np.ndarray], Mapping[str, float]]
+"""Function that returns the values by key of a video of as many frames as the ground truth."""
 
 
 @runtime_checkable
@@ -47,8 +60,8 @@ class Measure(Protocol):
         """Return what else the values depend on, such as the hash of weights."""
         ...
 
-    def __call__(self, pair: Pair) -> Mapping[str, float]:
-        """Return the values of one clip by key."""
+    def against(self, truth: GroundTruth) -> Scorer:
+        """Return the comparison with a ground truth, about which everything is computed once."""
         ...
 
 
@@ -73,16 +86,21 @@ class Pixels:
     def settings(self) -> Any:
         """Return nothing."""
 
-    def __call__(self, pair: Pair) -> Mapping[str, float]:
-        """Return all four."""
-        frames = psnr(*pair)
-        drift = color_drift(pair.video[-1:], pair.target[-1:])
-        return {
-            "psnr": float(frames.mean()),
-            "ssim": float(ssim(*pair).mean()),
-            "psnr_clip": clip_psnr(frames),
-            "color_drift": float(np.abs(drift).mean()),
-        }
+    def against(self, truth: GroundTruth) -> Scorer:
+        """Return a function that computes all four."""
+
+        def score(video: np.ndarray) -> Mapping[str, float]:
+            pair = video[truth.first :], truth.counted
+            frames = psnr(*pair)
+            drift = color_drift(video[-1:], truth.frames[-1:])
+            return {
+                "psnr": float(frames.mean()),
+                "ssim": float(ssim(*pair).mean()),
+                "psnr_clip": clip_psnr(frames),
+                "color_drift": float(np.abs(drift).mean()),
+            }
+
+        return score
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +127,12 @@ class LpipsDistance:
         """Return the config, which has the hash of the weights."""
         return self.network.config
 
-    def __call__(self, pair: Pair) -> Mapping[str, float]:
-        """Return the mean distance over frames."""
-        distances = lpips.frame_distances(self.network, *pair)
-        return {f"lpips_{self.name}": float(distances.mean())}
+    def against(self, truth: GroundTruth) -> Scorer:
+        """Return a function that computes the mean distance over frames."""
+        reference = lpips.Reference(self.network, truth.counted)
+        return lambda video: {
+            f"lpips_{self.name}": float(reference.distances(video[truth.first :]).mean())
+        }
 
 
 def standard() -> Sequence[Measure]:

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from egosim_jax.evaluation.fvd import distance_of, is_feature
 from egosim_jax.evaluation.measures import Column, columns_of
 from egosim_jax.evaluation.methods import FIT
-from egosim_jax.evaluation.scoring import Protocol, Row, Scoring
+from egosim_jax.evaluation.scoring import Protocol, Row, Scores, Scoring
 from egosim_jax.metrics import lpips
 from egosim_jax.metrics.report import DEFINITIONS, paired_difference, print_table, summarize
 
@@ -74,7 +75,8 @@ class Evaluation:
     @property
     def measured(self) -> list[str]:
         """Keys of the columns that any row has."""
-        return list(dict.fromkeys(key for row in self.rows for key in row.scores))
+        keys = (key for row in self.rows for key in row.scores if not is_feature(key))
+        return list(dict.fromkeys(keys))
 
     def group_of(self, row: Row) -> str:
         """Return the group of a row."""
@@ -84,14 +86,16 @@ class Evaluation:
         """Return the summary of each method over the clips of each group."""
         return {
             group: {
-                method: {
-                    "clips": len(scores),
-                    **summarize([row.scores for row in scores], self.measured),
-                }
-                for method, scores in by_method.items()
+                method: self._summary([row.scores for row in rows])
+                for method, rows in by_method.items()
             }
             for group, by_method in self._grouped().items()
         }
+
+    def _summary(self, scores: list[Scores]) -> dict[str, Any]:
+        distance = distance_of(scores)
+        fvd = {} if distance is None else {"fvd": {"mean": distance}}
+        return {"clips": len(scores), **summarize(scores, self.measured), **fvd}
 
     def differences(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
         """Return how each method differs from the first one on the same clips, by group."""
@@ -108,6 +112,7 @@ class Evaluation:
                             [scores[key] for scores, _ in shared], [at[key] for _, at in shared]
                         )
                         for key in shared[0][0]
+                        if not is_feature(key)
                     }
         return found
 

@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from egosim_jax.batch import Window, read_results
 from egosim_jax.data.metadata import ClipFiles
-from egosim_jax.evaluation.measures import VERSION, Measure, Pair
+from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.digest import sha256
@@ -203,8 +203,7 @@ class Scoring:
             raise InputError("There are no frames to compare.")
         like = truth if self.protocol.size == "target" else next(iter(known.values()))
         shape = Shape(count, like.height, like.width)
-        target = _Video(lambda: read_at(path, shape, window.start))
-        digest = sha256(path)
+        truth = _Truth(path, window, shape, self.protocol.first)
         rows = []
         for method in self.methods:
             own = known.get(method.name)
@@ -212,43 +211,53 @@ class Scoring:
             if absent or (method in self.folders and own is None):
                 continue
             source = f"{own.frames} x {own.width}x{own.height}" if own else "made here"
-            scores = self._scores(window, method, shape, target, digest)
+            scores = self._scores(method, truth)
             rows.append(
                 Row(window=window, method=method.name, shape=shape, source=source, scores=scores)
             )
         return rows
 
-    def _scores(
-        self, window: Window, method: Method, shape: Shape, target: _Video, digest: str
-    ) -> Scores:
+    def _scores(self, method: Method, truth: _Truth) -> Scores:
+        """Return the scores of a method on one window; what is cached is not computed."""
         content = {
             "version": VERSION,
-            "target": digest,
-            "start": window.start,
-            "shape": list(shape),
-            "first": self.protocol.first,
+            "target": truth.digest,
+            "start": truth.window.start,
+            "shape": list(truth.shape),
+            "first": truth.first,
             "method": type(method).__name__ if isinstance(method, Folder) else method,
-            "sources": [sha256(path) for path in method.sources(window)],
+            "sources": [sha256(path) for path in method.sources(truth.window)],
         }
-        video = _Video(lambda: method.video(window, shape, target.frames))
+        video: np.ndarray | None = None
         scores: dict[str, float] = {}
         for measure in self.measures:
             key = fingerprint([content, type(measure).__name__, measure.settings()])
             found = self.cache.get(key)
             if found is None:
-                first = self.protocol.first
-                found = measure(Pair(video.frames[first:], target.frames[first:]))
+                if video is None:
+                    video = method.video(truth.window, truth.shape, truth.known.frames)
+                found = truth.scorer(measure)(video)
                 self.cache.put(key, found)
             scores |= found
         return scores
 
 
-@dataclass(eq=False)
-class _Video:
-    """Video that is decoded when it is first used."""
+class _Truth:
+    """Ground truth of a window, decoded when a score is not cached."""
 
-    read: Any
+    def __init__(self, path: Path, window: Window, shape: Shape, first: int):
+        self.path, self.window, self.shape, self.first = path, window, shape, first
+        self.digest = sha256(path)
+        self._scorers: dict[int, Scorer] = {}
 
     @cached_property
-    def frames(self) -> np.ndarray:
-        return self.read()
+    def known(self) -> GroundTruth:
+        """Decoded frames."""
+        frames = read_at(self.path, self.shape, self.window.start)
+        return GroundTruth(frames=frames, first=self.first, window=self.window)
+
+    def scorer(self, measure: Measure) -> Scorer:
+        """Return the comparison by a measure, made once."""
+        if id(measure) not in self._scorers:
+            self._scorers[id(measure)] = measure.against(self.known)
+        return self._scorers[id(measure)]

@@ -24,8 +24,12 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import Array, Float, UInt8
 
+from egosim_jax.metrics.batches import Batches, check_same_shape
+
 MAX_PSNR = 100.0
 """Largest PSNR in dB, that of equal frames."""
+MOST_PIXELS = 1 << 23
+"""Pixels of the frames that are compared together on an accelerator."""
 _GRAY = 127.5
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
@@ -74,11 +78,15 @@ def ssim(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
     """Return the SSIM of every frame, of at least 11 pixels in height and width."""
+    check_same_shape(video, reference)
+    count, height, width, _ = video.shape
+    alone = jax.default_backend() == "cpu"  # where a frame fits the caches
+    batches = Batches(count, 1 if alone else MOST_PIXELS // (height * width))
     values = []
-    for frame, other in zip(video, reference, strict=True):
-        moments, center = _moments(frame, other)
-        values.append(float(_similarity(_blur(_blur(moments, axis=1), axis=2), center)))
-    return np.array(values)
+    for frames, others in zip(batches.of(video), batches.of(reference), strict=True):
+        moments, center = _moments(frames, others)
+        values.append(_similarity(_blur(_blur(moments, axis=2), axis=3), center))
+    return batches.join(values).astype(float)
 
 
 def fit_colors(
@@ -118,21 +126,22 @@ def _with_one(frame: UInt8[Array, "h w 3"]) -> Float[Array, "n 4"]:
 
 @jax.jit
 def _moments(
-    a: UInt8[Array, "h w c"], b: UInt8[Array, "h w c"]
-) -> tuple[Float[Array, "4 h w c"], Float[Array, ""]]:
-    """Return a, b, a b and a^2 + b^2 of values minus a constant, and that constant.
+    a: UInt8[Array, "b h w c"], b: UInt8[Array, "b h w c"]
+) -> tuple[Float[Array, "b 4 h w c"], Float[Array, "b 1 1 1"]]:
+    """Return a, b, a b and a^2 + b^2 of values minus a constant of the frame, and that constant.
 
     Variances are small differences of large squares; subtracting the frames' mean first keeps
     float32 exact enough.
     """
     a, b = a.astype(jnp.float32), b.astype(jnp.float32)
-    center = jnp.rint((a.mean() + b.mean()) / 2)
+    mean = (a + b).mean(axis=(1, 2, 3), keepdims=True)
+    center = jnp.rint(mean / 2)
     a, b = a - center, b - center
-    return jnp.stack([a, b, a * b, a * a + b * b]), center
+    return jnp.stack([a, b, a * b, a * a + b * b], axis=1), center
 
 
 @functools.partial(jax.jit, static_argnames="axis")
-def _blur(x: Float[Array, "4 _ _ c"], *, axis: int) -> Float[Array, "4 _ _ c"]:
+def _blur(x: Float[Array, "b 4 _ _ c"], *, axis: int) -> Float[Array, "b 4 _ _ c"]:
     """Apply the Gaussian window along one axis, where it is inside the frame.
 
     Two jitted passes: in one program XLA would compute the first pass again for each tap of the
@@ -149,11 +158,14 @@ def _blur(x: Float[Array, "4 _ _ c"], *, axis: int) -> Float[Array, "4 _ _ c"]:
 
 
 @jax.jit
-def _similarity(blurred: Float[Array, "4 h w c"], center: Float[Array, ""]) -> Float[Array, ""]:
+def _similarity(
+    blurred: Float[Array, "b 4 h w c"], center: Float[Array, "b 1 1 1"]
+) -> Float[Array, " b"]:
     """Return the mean SSIM over windows and channels."""
-    mu_a, mu_b, product, squares = blurred
+    mu_a, mu_b, product, squares = (blurred[:, number] for number in range(4))
     covariance = product - mu_a * mu_b
     variances = squares - mu_a**2 - mu_b**2
     mu_a, mu_b = mu_a + center, mu_b + center
     above = (2 * mu_a * mu_b + _C1) * (2 * covariance + _C2)
-    return (above / ((mu_a**2 + mu_b**2 + _C1) * (variances + _C2))).mean()
+    ratio = above / ((mu_a**2 + mu_b**2 + _C1) * (variances + _C2))
+    return ratio.mean(axis=(1, 2, 3))

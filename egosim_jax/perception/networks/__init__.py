@@ -15,6 +15,7 @@ from egosim_jax.perception.networks.grounded import GroundedEdgeTam, GroundedSam
 from egosim_jax.perception.networks.grounding_dino import GroundingDino
 from egosim_jax.perception.networks.qwen3_vl import Qwen3VL
 from egosim_jax.perception.networks.sam3 import Sam3
+from egosim_jax.perception.networks.video_mae import VideoMae
 from egosim_jax.perception.networks.worker import NetworkError, close_workers
 
 __all__ = [
@@ -30,5 +31,6 @@ __all__ = [
     "NetworkError",
     "Qwen3VL",
     "Sam3",
+    "VideoMae",
     "close_workers",
 ]

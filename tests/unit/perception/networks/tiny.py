@@ -286,3 +286,21 @@ def qwen3_vl(folder: Path) -> Path:
         image_std=[0.5] * 3, size={"shortest_edge": 32 * 32, "longest_edge": 64 * 64},
     ).save_pretrained(folder)  # fmt: skip
     return folder
+
+
+def video_mae(folder: Path) -> Path:
+    import torch
+    import transformers as hf
+
+    torch.manual_seed(0)
+    config = hf.VideoMAEConfig(
+        image_size=32, patch_size=8, num_frames=4, tubelet_size=2, hidden_size=24,
+        num_hidden_layers=2, num_attention_heads=2, intermediate_size=32,
+    )  # fmt: skip
+    hf.VideoMAEForVideoClassification(config).save_pretrained(folder)
+    processor = {
+        "image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.25],
+        "size": {"shortest_edge": 32}, "crop_size": {"height": 32, "width": 32},
+    }  # fmt: skip
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
+    return folder

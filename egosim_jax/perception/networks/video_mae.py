@@ -1,0 +1,68 @@
+"""VideoMAE: features of videos, for a Fréchet video distance.
+
+The I3D network of the original FVD is distributed as TorchScript, a program, which is not run here.
+Checkpoints: MCG-NJU/videomae-base-finetuned-kinetics and -large-finetuned-kinetics (CC BY-NC 4.0),
+of which the encoder is used. Distances of different networks cannot be compared. Source: Tong et
+al., VideoMAE, 2022; Ge et al., On the Content Bias in Fréchet Video Distance, 2024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from egosim_jax.io.untrusted import read_json
+from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
+from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.pixels import normalize, resize_levels, to_images
+
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Statistics of ImageNet's colors, for checkpoints without a processor file."""
+
+
+@dataclass(frozen=True)
+class VideoMae(Network):
+    """Features of videos by VideoMAE's encoder."""
+
+    needs: ClassVar[str] = "VideoMAE (MCG-NJU/videomae-*)"
+    model_types: ClassVar[tuple[str, ...]] = ("videomae",)
+
+    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Float32[np.ndarray, " d"]:
+        """Return the mean feature of a video's tubes, at evenly spaced frames."""
+        found, _ = self.ask({"frames": frames})
+        return found["features"]
+
+
+def load(folder: str, device: str, dtype: str) -> Run:
+    """Load the encoder in a worker."""
+    import torch
+    from transformers import VideoMAEModel
+
+    device = check_device(device)
+    network = load_network(VideoMAEModel, Path(folder), device=device, dtype=dtype)
+    size = network.config.image_size
+    sides = (size, size) if isinstance(size, int) else tuple(size)
+    mean, std = _statistics(Path(folder))
+
+    def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
+        frames = arrays["frames"]
+        count = network.config.num_frames
+        chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
+        images = normalize(resize_levels(to_images(frames[chosen], device), sides), mean, std)
+        with torch.inference_mode():
+            output = network(images[None].to(network.dtype)).last_hidden_state
+        return {"features": output[0].float().mean(dim=0).cpu().numpy()}, None
+
+    return run
+
+
+def _statistics(folder: Path) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mean and deviation of the colors on which a checkpoint was trained."""
+    path = folder / "preprocessor_config.json"
+    found = read_json(path) if path.is_file() else {}
+    return found.get("image_mean") or MEAN, found.get("image_std") or STD
