@@ -17,10 +17,13 @@ from urllib.parse import urlsplit
 
 import uvicorn
 from fastapi import Body, FastAPI, Path, WebSocket, WebSocketDisconnect
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, PlainTextResponse
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from egosim_jax.io.untrusted import quote_text
 from egosim_jax.serving import wire
 from egosim_jax.serving.errors import RequestError, as_request_error
 from egosim_jax.serving.service import Service
@@ -148,10 +151,25 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
     async def refused(_: Any, error: RequestError) -> JSONResponse:
         return _response(error)
 
+    @app.exception_handler(RequestValidationError)
+    async def invalid(_: Any, error: RequestValidationError) -> JSONResponse:
+        found = error.errors()[0]
+        place = quote_text(".".join(map(str, found["loc"])))
+        what = quote_text(str(found["msg"]))
+        return _response(
+            RequestError(422, "invalid", f"{place}: {what}. The body must be a JSON object.")
+        )
+
+    @app.exception_handler(HTTPException)
+    async def unknown(_: Any, error: HTTPException) -> JSONResponse:
+        message = f"{error.detail}: /openapi.json lists the paths and methods of this server."
+        return _response(RequestError(error.status_code, "unknown_path", message))
+
     async def call(name: str, fields: dict[str, Any]) -> JSONResponse:
         """Reply to a request of HTTP."""
-        reply = await service.handle({**_from_json(fields), "request": name})
-        return JSONResponse(wire.to_json(reply))
+        with service.active():
+            reply = await service.handle({**_from_json(fields), "request": name})
+            return JSONResponse(wire.to_json(reply))
 
     @app.get("/healthz", summary="The process is up")
     async def healthz() -> PlainTextResponse:
@@ -235,7 +253,8 @@ async def _converse(socket: WebSocket, service: Service) -> None:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
-            await _reply(socket, service, message.get("bytes"))
+            with service.active():
+                await _reply(socket, service, message.get("bytes"))
     except (WebSocketDisconnect, RuntimeError):  # it vanished while a reply was on its way
         return
     finally:

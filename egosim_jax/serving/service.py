@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import metadata
 from typing import Any, TypeVar
@@ -61,18 +62,24 @@ class Service:
             "limits": asdict(limits),
         }
 
-    async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply to a request. Raises `RequestError`."""
+    @contextmanager
+    def active(self) -> Iterator[None]:
+        """Keep a shutdown waiting, until a reply is sent."""
         with self._quiet:
             self._active += 1
         try:
-            return await self._handle(message)
-        except Exception as error:
-            raise as_request_error(error) from error
+            yield
         finally:
             with self._quiet:
                 self._active -= 1
                 self._quiet.notify_all()
+
+    async def handle(self, message: Any) -> dict[str, Any]:
+        """Return the reply to a request. Raises `RequestError`."""
+        try:
+            return await self._handle(message)
+        except Exception as error:
+            raise as_request_error(error) from error
 
     def drain(self, timeout_s: float) -> bool:
         """Refuse new work; return True when no request is under way any more."""

@@ -261,6 +261,8 @@ class Session:
     def restart(self, start: Start) -> Result:
         """Continue from another start; step numbers continue."""
         start.save(self.folder / "starts" / str(self.committed))
+        shutil.rmtree(self._step(self.committed + 1), ignore_errors=True)
+        self.pending = False
         self.now, self.result = start, self._opening(start)
         return self.result
 

@@ -126,6 +126,8 @@ class Store:
                     retry_after_s=5.0,
                 )
             folder = self.folder / check_name(name, "session")
+            if folder.is_dir() and not any(folder.glob("*.json")):  # a crash while it was created
+                shutil.rmtree(folder)
             if name in self.sessions or folder.exists():
                 raise RequestError(
                     409,

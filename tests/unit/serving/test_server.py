@@ -144,7 +144,8 @@ def test_a_body_too_large_or_no_json_is_refused(server):
     with connection.getresponse() as reply:
         assert (reply.status, json.loads(reply.read())["code"]) == (413, "too_large")
     connection.close()
-    assert http(port, "/sessions", [1])[0] == 422
+    for path, fields, code in (("/sessions", [1], "invalid"), ("/fly", None, "unknown_path")):
+        assert json.loads(http(port, path, fields)[1])["code"] == code
 
 
 def test_text_and_damaged_messages_are_refused_and_the_connection_stays(server):
