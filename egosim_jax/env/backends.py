@@ -23,10 +23,8 @@ class Backend(Protocol):
         """Length, size and rate of its clips."""
         ...
 
-    @property
-    def needs_past(self) -> bool:
-        """Simulators depend on the actions since the seed."""
-        ...
+    needs_past: ClassVar[bool]
+    """Simulators depend on the actions since the seed."""
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
         """Return the start of a seed's episode."""

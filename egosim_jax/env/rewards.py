@@ -106,7 +106,7 @@ class GoalImage:
 
 
 def _lpips(frame: np.ndarray, goal: np.ndarray) -> float:
-    from egosim_jax.metrics.lpips import Lpips, alex_if_installed, frame_distances
+    from egosim_jax.metrics.lpips import Lpips, frame_distances, load_if_installed
 
-    network = alex_if_installed() or Lpips.load("alex")  # which names the missing package
+    network = load_if_installed("alex") or Lpips.load("alex")  # which names the missing package
     return float(frame_distances(network, frame, goal)[0])

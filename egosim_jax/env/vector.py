@@ -161,7 +161,8 @@ class WorldVectorEnv(VectorEnv):
     def _observations(self) -> dict[str, Any]:
         found = [running.observation(self._observe) for running in self.running]
         empty = create_empty_array(self.single_observation_space, self.num_envs)
-        return concatenate(self.single_observation_space, found, empty)
+        batch: Any = concatenate(self.single_observation_space, found, empty)
+        return batch
 
     def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}

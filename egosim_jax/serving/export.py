@@ -17,7 +17,7 @@ from egosim_jax.rendering import get
 from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.recording import Recording
 from egosim_jax.serving.session import SETTINGS, Session
-from egosim_jax.types import InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
+from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class _Unavailable:
     renderer: Any
     """Renderer of the views."""
 
-    def __call__(self, *_: Any) -> Any:
+    def __call__(self, view: View, action: Action, first_frame: Any, seed: int) -> Any:
         raise InputError("A recorded session cannot be continued here: use egosim serve.")
 
 

@@ -6,8 +6,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from egosim_jax import env as egosim
+from egosim_jax.env import rewards
 from egosim_jax.env.actions import LAYOUTS, ActionSpec
-from egosim_jax.env.rewards import MoveObject
+from egosim_jax.env.rewards import GoalImage, MoveObject
 from egosim_jax.env.start import Start
 from egosim_jax.env.vector import WorldVectorEnv
 from egosim_jax.types import InputError
@@ -100,6 +101,27 @@ def test_moving_an_object_is_rewarded_by_its_distance():
     env.reset(seed=3)
     _, reward, terminated, _, info = env.unwrapped.chunk_step(ahead(env))
     assert (reward, terminated, info["success"]) == (0.0, True, True)
+
+
+def test_a_goal_image_is_reached_by_its_own_frame(monkeypatch):
+    env = make()
+    env.reset(seed=3)
+    goal = env.unwrapped.chunk_step(ahead(env))[0]["frames"][-1]
+    monkeypatch.setattr(rewards, "_lpips", lambda a, b: float(np.abs(a / 255 - b / 255).mean()))
+    near = make(reward=GoalImage(image=goal, threshold=0.001))
+    near.reset(seed=3)
+    assert near.unwrapped.chunk_step(ahead(env))[4]["success"]
+    far = make(reward=GoalImage(image=255 - goal))
+    far.reset(seed=3)
+    _, reward, terminated, _, _ = far.unwrapped.chunk_step(ahead(env))
+    assert reward < -0.1
+    assert not terminated
+
+
+@pytest.mark.slow
+def test_lpips_to_the_same_image_is_zero():
+    image = np.random.default_rng(0).integers(0, 255, (1, 64, 64, 3)).astype(np.uint8)
+    assert rewards._lpips(image, image) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_vector_environment_equals_its_episodes():
