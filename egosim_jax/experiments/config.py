@@ -78,12 +78,12 @@ class Update(ModelExperiment):
 class LookAway(ModelExperiment):
     """Move an object, look elsewhere, look back: is it where it was left?
 
-    In view, or out of view by the second hand; with the state updated by the oracle, by classical
+    In view, or by a hand out of view; with the state updated by the oracle, by classical
     perception, and not at all. Prints a table and the differences from no update, writes
     report.json and contact_sheet.png. The same command resumes an interrupted experiment.
     """
 
-    scenes: int = 16
+    scenes: int = 12
     """Number of scenes in which an object is carried."""
     first_scene: int = 300
     """Seed of the first scene; the shipped model was trained on those from 1000 on."""

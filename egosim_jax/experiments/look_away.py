@@ -1,8 +1,8 @@
 """`egosim experiment look_away`: is a change still there after looking elsewhere?
 
 Three clips in each scene. Seen: a hand carries an object, the wearer turns away, and turns back.
-Unseen: the wearer turns away, the second hand carries the object out of view, the wearer turns
-back. The pipeline gets no hand that is out of view; only the true world executes it.
+Unseen: the wearer turns away, a hand carries the object out of view, the wearer turns back. The
+pipeline gets no hand that is out of view; only the true world executes it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rollout import Rollout, load_clip
 from egosim_jax.simulator import Simulator
-from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec, check_counts
+from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Script, TabletopClip, World, make_scripts, to_episode
 from egosim_jax.worlds.tabletop import actions as scripted
 from egosim_jax.worlds.tabletop.clips import film_scene
@@ -38,7 +38,7 @@ from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 CASES = ("seen", "unseen")
 """Moves in view, and moves while the wearer looks elsewhere."""
-AWAY_DEGREES = 45.0
+AWAY_DEGREES = 50.0
 """Angle by which the wearer turns away, to the side where the object is not."""
 OUTSIDE_DEGREES = 35.0
 """Smallest horizontal angle to the view's axis of an object that is out of view."""
@@ -58,7 +58,7 @@ DEFINITIONS = {
     "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the picture's width of its true "
     f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
     "object_error": "distance of the centroid of the object, segmented by color, from that of its "
-    "ground-truth ids, in percent of the width, mean over those frames",
+    "ground-truth ids, in percent of the width, median over those frames",
     "region_psnr": "dB over the pixels of those frames where the object is or was before the move",
     "state_accuracy": "share of the object's points in the last state within 1 cm of its true "
     "surface; 0 if there are none",
@@ -89,7 +89,8 @@ class Story:
         here = clip.ids[last] == number
         movers = {n: c for n, c in clip.paints.items() if n == number or n >= FIRST_HAND}
         found = region.label(frames[last], self.background, movers) == number
-        error = 100 * float(region.centroid_errors(found, here).mean()) / frames.shape[2]
+        errors = region.centroid_errors(region.open_mask(found), here)
+        error = 100 * float(np.median(errors)) / frames.shape[2] if len(errors) else np.nan
         part = clip.parts[self.target]
         surface = transform(clip.world_from_body[self.target][-1], part.vertices_m), part.triangles
         points = state.points_m[state.object_ids == number]
@@ -198,29 +199,21 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
         raise ValueError(f"the object of scene {seed} cannot be out of view")
     joints, prompt = script.action.joints_m[:, :1], script.caption
     still = "The wearer looks around."
+    missing = np.full_like(joints, np.nan)
     if case == "seen":
-        view = replace(script.cameras, world_from_camera=script.cameras.world_from_camera[-1:])
-        hands = [joints, *[np.repeat(joints[-1:], frames, axis=0)] * 2]
+        poses = script.cameras.world_from_camera[-1:]
+        view, hands = replace(script.cameras, world_from_camera=poses), [joints, missing, missing]
         cameras = [script.cameras, _turn(view, 0, angle, frames), _turn(view, angle, 0, frames)]
         prompts = [prompt, still, still]
     else:
-        view = script.cameras
-        side = script.moments[0].hands[0].side
-        waiting = scripted.waiting_hand(side, np.random.default_rng(seed))
-        rest, _ = waiting.grip.pose(script.kind, waiting.side)
-        first = np.repeat(rest[None, None], frames, axis=0)
-        missing = np.full_like(joints, np.nan)
-        hands = [np.concatenate([first, other], axis=1) for other in (missing, joints, missing)]
-        cameras = [
-            _turn(view, 0, angle, frames), _turn(view, angle, angle, frames),
-            _turn(view, angle, 0, frames),
-        ]  # fmt: skip
+        view, hands = script.cameras, [missing, joints, missing]
+        ends = ((0, angle), (angle, angle), (angle, 0))
+        cameras = [_turn(view, first, last, frames) for first, last in ends]
         prompts = [still] * 3
     world, clips = World(scene=script.scene, seed=seed), []
     for path, joint, text in zip(cameras, hands, prompts, strict=True):
-        clip, world = world.execute(
-            _action(path, joint.shape[1], script.kind, text), joints_m=joint
-        )
+        action = Action(cameras=path, joints_m=missing, kind=script.kind, prompt=text)
+        clip, world = world.execute(action, joints_m=joint)
         clips.append(clip)
     target, last = script.intent.name, cameras[-1]
     back = replace(last, world_from_camera=last.world_from_camera[-FRAMES_BACK:])
@@ -232,12 +225,6 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
         before=np.stack([picture.ids == number for picture in film_scene(script.scene, back)]),
         background=np.stack([p.colors for p in film_scene(world.scene, back, without=target)]),
     )
-
-
-def _action(cameras: Cameras, hands: int, kind: Kind, prompt: str) -> Action:
-    """Return an action whose hands are missing: the true world gets them separately."""
-    joints = np.full((len(cameras.world_from_camera), hands, 21, 3), np.nan)
-    return Action(cameras=cameras, joints_m=joints, kind=kind, prompt=prompt)
 
 
 def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:

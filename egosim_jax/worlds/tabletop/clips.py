@@ -217,7 +217,7 @@ def to_action(clip: TabletopClip) -> Action:
 
     They are known to the true world only.
     """
-    seen = near_view(clip.cameras, clip.joints_m).any(axis=0)[:, None, None]
+    seen = np.asarray(near_view(clip.cameras, clip.joints_m).any(axis=0))[:, None, None]
     joints = clip.joints_m if seen.all() else np.where(seen, clip.joints_m, np.nan)
     return Action(cameras=clip.cameras, joints_m=joints, kind=clip.kind, prompt=clip.caption)
 

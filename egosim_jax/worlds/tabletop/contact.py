@@ -122,7 +122,7 @@ def advance(
     kind: Kind,
 ) -> Contact:
     """Return the contact after all hands moved in straight lines; a missing hand holds nothing."""
-    seen = np.isfinite(before_m).all(axis=(1, 2)) & np.isfinite(after_m).all(axis=(1, 2))
+    seen = np.asarray(np.isfinite(before_m + after_m).all(axis=(1, 2)))
     contact = _let_go(contact, [grasp for grasp in contact.grasps if not seen[grasp.hand]])
     if not seen.any():
         return contact

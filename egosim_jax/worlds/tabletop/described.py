@@ -266,7 +266,8 @@ def _object(item: Any) -> Object:
             f"An object is {quote(item)} with {wrong}: it must have shape and color, and may have "
             f"{', '.join(known[2:])}."
         )
-    return Object(**{key: tuple(v) if isinstance(v, list) else v for key, v in item.items()})
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in item.items()}
+    return Object(**values)
 
 
 def write_scene(path: Path | str, objects: Sequence[Object], *, room: int = 0) -> None:

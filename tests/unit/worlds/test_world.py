@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from egosim_jax.types import Action, VideoSpec
+from egosim_jax.types import Action, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import Object, World, actions, make_scene, make_sequence, to_action
 from egosim_jax.worlds.tabletop.actions import Grip
 from egosim_jax.worlds.tabletop.hands import closure_for, frame_of, joints_of, side_of
@@ -22,7 +22,7 @@ def cameras():
     return next(make_sequence(3, spec=SPEC)).cameras
 
 
-def drive(cameras, *keys, kind="robot", frames=8, yaw=0.0):
+def drive(cameras, *keys, kind: Kind = "robot", frames=8, yaw=0.0):
     """Return the action of one hand through keys (x, y, z, closure) in meters, in straight lines.
 
     A longer key also has a yaw and a downward pitch of the fingers.
@@ -41,7 +41,7 @@ def drive(cameras, *keys, kind="robot", frames=8, yaw=0.0):
     return act(cameras, np.array([*path, poses[-1]])[:, None], kind)
 
 
-def act(cameras, joints, kind="robot"):
+def act(cameras, joints, kind: Kind = "robot"):
     poses = np.repeat(cameras.world_from_camera[:1], len(joints), axis=0)
     return Action(cameras=replace(cameras, world_from_camera=poses), joints_m=joints, kind=kind,
                   prompt="")  # fmt: skip
@@ -234,7 +234,7 @@ def test_an_executed_clip_has_its_ground_truth(cameras):
     np.testing.assert_array_equal(state.points_m, clip.state.points_m)
 
 
-def differences(seeds, kind, frames=17):
+def differences(seeds, kind: Kind, frames=17):
     """Return for scripts the largest and the last distance of the target, and that of others."""
     found = []
     for seed in seeds:
