@@ -33,7 +33,7 @@ from egosim_jax.simulator import Simulator
 from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Script, TabletopClip, World, make_scripts, to_episode
 from egosim_jax.worlds.tabletop import actions as scripted
-from egosim_jax.worlds.tabletop.clips import film_scene
+from egosim_jax.worlds.tabletop.clips import film_scenes
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 CASES = ("seen", "unseen")
@@ -222,8 +222,12 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
         seed=seed,
         clips=tuple(clips),
         target=target,
-        before=np.stack([picture.ids == number for picture in film_scene(script.scene, back)]),
-        background=np.stack([p.colors for p in film_scene(world.scene, back, without=target)]),
+        before=np.stack(
+            [picture.ids == number for picture in film_scenes([script.scene] * FRAMES_BACK, back)]
+        ),
+        background=np.stack(
+            [p.colors for p in film_scenes([world.scene] * FRAMES_BACK, back, without=target)]
+        ),
     )
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count, islice
 from pathlib import Path
 
@@ -21,16 +22,17 @@ from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import read_json
 from egosim_jax.metrics import ranking, region
-from egosim_jax.metrics.report import print_table
+from egosim_jax.metrics.report import Summary, print_table
 from egosim_jax.perception import Perception, registry
 from egosim_jax.progress import track
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Action, Clip, SceneState, Triplet, VideoSpec, check_counts
+from egosim_jax.types import Action, Cameras, Clip, SceneState, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Scene, Script, World, make_scripts
-from egosim_jax.worlds.tabletop.clips import POINT_PX, film_scene
+from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, film_scenes
 from egosim_jax.worlds.tabletop.hands import SKIN, SLEEVE
 from egosim_jax.worlds.tabletop.policies import POLICIES, WITHIN_M, error_m, succeeded
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+from egosim_jax.worlds.tabletop.world import arms_of, sides_of
 
 SHEET_SCENES = 2
 """Scenes on the contact sheet."""
@@ -38,17 +40,23 @@ LAST_FRAMES = 3
 """Frames at the end of a clip in which the object is looked for."""
 MEASURES = {
     "true": ("true success %", "{:.0f}"),
+    "seen": ("in ground-truth frames %", "{:.0f}"),
     "frames": ("in generated frames %", "{:.0f}"),
     "state": ("in the state after %", "{:.0f}"),
 }
-JUDGES = ("frames", "state")
-"""Readers of success in the generated world."""
+
+Videos = Sequence[UInt8[np.ndarray, "f h w 3"]]
+"""Generated clips of all policies in one scene."""
+Outcomes = Mapping[str, Mapping[str, float]]
+"""Success and error in meters of every policy in one scene, by name."""
+Judge = Callable[["Task", Videos], Outcomes]
+"""Reader of the outcomes in one scene."""
 DEFINITIONS = {
     "true": "share of scenes in which the executed action leaves the object within 3 cm of the "
     "goal horizontally and 2 cm vertically",
-    "frames": "the same by the generated frames: the centroid of the object, segmented by color, "
-    "is within 3 cm, at the goal's depth, of that of the object at the goal; median over the last "
-    "3 frames",
+    "seen, frames": "the same by the ground-truth and by the generated frames: the centroid of the "
+    "object, segmented by color, is within 3 cm, at the goal's depth, of that of the object at the "
+    "goal; median over the last 3 frames in which the hand does not hide it; else no success",
     "state": "the same as true by the pose of the object in the state after the generated clip",
     **ranking.DEFINITIONS,
 }
@@ -81,45 +89,83 @@ class Task:
         error = error_m(moved, np.asarray(self.script.intent.goal_m))
         return {"success": float(succeeded(error)), "error_m": error[0]}
 
-    def outcome_seen(self, frames: UInt8[np.ndarray, "f h w 3"]) -> dict[str, float]:
-        """Return success and distance to the goal in meters of the object that frames show."""
-        script, last = self.script, self.script.cameras
-        last = replace(last, world_from_camera=last.world_from_camera[-LAST_FRAMES:])
-        name, pose = script.intent.name, np.eye(4)
+    def outcome_seen(
+        self, frames: UInt8[np.ndarray, "f h w 3"], action: Action
+    ) -> dict[str, float]:
+        """Return success and distance to the goal in meters of the object that last frames show.
+
+        An object that is not shown, or hidden by the hand where it should be, has no distance.
+        """
+        script, name, pose = self.script, self.script.intent.name, np.eye(4)
+        number, last = script.scene.number(name), self.last_cameras
         pose[:3, :3] = script.scene.body(name).world_from_body[:3, :3]
         pose[:3, 3] = np.asarray(script.intent.goal_m)
-        there, number = film_scene(self._with(pose), last), script.scene.number(name)
+        arms = self.last_arms(action)
+        there = film_scenes([self._with(pose)] * LAST_FRAMES, last, arms=arms)
         goal = np.stack([picture.ids == number for picture in there])
-        background = np.stack([p.colors for p in film_scene(script.scene, last, without=name)])
+        bare = film_scenes([script.scene] * LAST_FRAMES, last, without=name)
         paints = {number: script.scene.body(name).parts[0].paint.color, FIRST_HAND: SKIN,
                   FIRST_HAND + 1: SLEEVE}  # fmt: skip
-        found = region.label(frames[-LAST_FRAMES:], background, paints) == number
+        background = np.stack([picture.colors for picture in bare])
+        found = region.open_mask(region.label(frames, background, paints) == number)
+        errors = region.centroid_errors(found, goal)
+        if not len(errors):
+            return {"success": 0.0, "error_m": float("nan")}
         depth = np.median(np.stack([picture.depth_m for picture in there])[goal])
-        errors = region.centroid_errors(region.open_mask(found), goal)
         error = float(np.median(errors) * depth / last.intrinsics_px[0, 0])
         return {"success": float(error <= WITHIN_M[0]), "error_m": error}
+
+    def last_frames(self, action: Action) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return the last frames of the true clip of an action."""
+        scenes, _ = World(scene=self.script.scene).move(action)
+        pictures = film_scenes(
+            scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action)
+        )
+        return np.stack([picture.colors for picture in pictures])
+
+    @property
+    def last_cameras(self) -> Cameras:
+        """Cameras of the last frames."""
+        cameras = self.script.cameras
+        return replace(cameras, world_from_camera=cameras.world_from_camera[-LAST_FRAMES:])
+
+    def last_arms(self, action: Action) -> list[list[Arm | None]]:
+        """Return joints and meshes of the hands in the last frames."""
+        joints = action.joints_m[-LAST_FRAMES:]
+        return arms_of(joints, action.kind, sides_of(joints, action.kind))
 
     def _with(self, world_from_body: np.ndarray) -> Scene:
         return self.script.scene.with_pose(self.script.intent.name, world_from_body)
 
 
 def run(settings: Policies) -> None:
-    """Execute and generate every policy in every scene; rank, compare, draw."""
+    """Execute and generate every policy in every scene; rank, compare, draw.
+
+    Frames are judged first, and reported; then states, for which every clip is perceived.
+    """
     check_counts({"--scenes": settings.scenes, "--batch-size": settings.batch_size})
     perceive = registry.parse(settings.perception).build()
     generator = open_experiment(settings)
-    spec, found = generator.config.video, []
-    tasks = islice(_tasks(settings, spec), settings.scenes)
-    for task in track(tasks, "scenes", total=settings.scenes):
-        path = settings.out / "scenes" / f"{task.seed}.json"
-        if not path.exists():
-            videos = _generate(task, generator, settings.batch_size)
-            with atomic_write(path.with_suffix(".npz")) as temporary:
-                np.savez_compressed(temporary, frames=np.stack(videos))
-            write_json(path, _outcomes(task, videos, perceive, spec))
-        found.append(read_json(path))
-    _report(settings.out, found)
-    _draw(settings, spec)
+    folder, found = settings.out / "scenes", {key: [] for key in MEASURES}
+    tasks = list(islice(_tasks(settings, generator.config.video), settings.scenes))
+    for task in track(tasks, "generating", total=len(tasks)):
+        videos = _videos(task, generator, settings.batch_size, folder)
+        for name, judge in (("true", _executed), ("seen", _seen_true), ("frames", _seen)):
+            found[name].append(_cached(folder / f"{task.seed}_{name}.json", judge, task, videos))
+    _report(settings.out, found, judges=("seen", "frames"))
+    _draw(settings.out, tasks[:SHEET_SCENES], generator)
+    for task in track(tasks, "perceiving", total=len(tasks)):
+        videos = _videos(task, generator, settings.batch_size, folder)
+        judge = partial(_perceived, perceive=perceive, fps=generator.config.video.fps)
+        found["state"].append(_cached(folder / f"{task.seed}_state.json", judge, task, videos))
+    _report(settings.out, found, judges=("seen", "frames", "state"))
+
+
+def _cached(path: Path, judge: Judge, task: Task, videos: Videos) -> Outcomes:
+    """Return the outcome of every policy in one scene, by a judge or from its file."""
+    if not path.exists():
+        write_json(path, judge(task, videos))
+    return read_json(path)
 
 
 def _tasks(settings: Policies, spec: VideoSpec) -> Iterator[Task]:
@@ -130,7 +176,17 @@ def _tasks(settings: Policies, spec: VideoSpec) -> Iterator[Task]:
             yield Task.make(seed, script)
 
 
-def _generate(task: Task, generator: Generator, size: int) -> list[UInt8[np.ndarray, "f h w 3"]]:
+def _videos(task: Task, generator: Generator, size: int, folder: Path) -> Videos:
+    """Return the generated clips of every policy in one scene, or read them from their file."""
+    path = folder / f"{task.seed}.npz"
+    if not path.exists():
+        videos = _generate(task, generator, size)
+        with atomic_write(path) as temporary:
+            np.savez(temporary, frames=np.stack(videos))
+    return list(read_arrays(path, {"frames": "uint8"})["frames"])
+
+
+def _generate(task: Task, generator: Generator, size: int) -> Videos:
     """Generate the clip of every policy, from equal noise."""
     first, state = World(scene=task.script.scene).observe(task.script.cameras)
     view = generator.renderer.render(state, task.script.cameras, point_px=POINT_PX)
@@ -154,21 +210,38 @@ def _generate(task: Task, generator: Generator, size: int) -> list[UInt8[np.ndar
     ]
 
 
-def _outcomes(
-    task: Task, videos: Sequence[np.ndarray], perceive: Perception, spec: VideoSpec
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the outcome of every policy in the true world and in its generated clip."""
-    start = World(scene=task.script.scene, seed=task.seed)
-    _, state = start.observe(task.script.cameras)
-    name, outcomes = task.script.intent.name, {}
-    for policy, action, frames in zip(POLICIES, task.actions, videos, strict=True):
+def _executed(task: Task, videos: Videos) -> Outcomes:
+    """Return the outcome of every policy in the true world."""
+    start, name, outcomes = World(scene=task.script.scene), task.script.intent.name, {}
+    for policy, action in zip(POLICIES, task.actions, strict=True):
         _, after = start.move(action)
-        perceived = perceive(Clip(frames=frames, fps=spec.fps), action, state)
-        outcomes[policy.name] = {
-            "true": task.outcome(after.scene.body(name).world_from_body),
-            "frames": task.outcome_seen(frames),
-            "state": task.outcome(_pose_in(fuse(state, perceived), task.script)),
-        }
+        outcomes[policy.name] = task.outcome(after.scene.body(name).world_from_body)
+    return outcomes
+
+
+def _seen(task: Task, videos: Videos) -> Outcomes:
+    """Return the outcome of every policy by its generated frames."""
+    return {
+        policy.name: task.outcome_seen(frames[-LAST_FRAMES:], action)
+        for policy, action, frames in zip(POLICIES, task.actions, videos, strict=True)
+    }
+
+
+def _seen_true(task: Task, videos: Videos) -> Outcomes:
+    """Return the outcome of every policy by its ground-truth frames, which tests the judge."""
+    return {
+        policy.name: task.outcome_seen(task.last_frames(action), action)
+        for policy, action in zip(POLICIES, task.actions, strict=True)
+    }
+
+
+def _perceived(task: Task, videos: Videos, *, perceive: Perception, fps: int) -> Outcomes:
+    """Return the outcome of every policy by the state after its generated clip."""
+    _, state = World(scene=task.script.scene, seed=task.seed).observe(task.script.cameras)
+    outcomes = {}
+    for policy, action, frames in zip(POLICIES, task.actions, videos, strict=True):
+        after = fuse(state, perceive(Clip(frames=frames, fps=fps), action, state))
+        outcomes[policy.name] = task.outcome(_pose_in(after, task.script))
     return outcomes
 
 
@@ -179,29 +252,33 @@ def _pose_in(state: SceneState, script: Script) -> np.ndarray:
     return moved @ script.scene.body(name).world_from_body
 
 
-def _report(out: Path, found: Sequence[Mapping]) -> None:
+def _report(out: Path, found: Mapping[str, Sequence[Outcomes]], *, judges: Sequence[str]) -> None:
     success = {
-        key: np.array([[scene[p.name][key]["success"] for scene in found] for p in POLICIES])
-        for key in MEASURES
+        key: np.array([[scene[p.name]["success"] for scene in found[key]] for p in POLICIES])
+        for key in ("true", *judges)
     }
     rows = {
-        policy.name: {key: {"mean": 100 * float(success[key][row].mean())} for key in MEASURES}
+        policy.name: {
+            key: {"mean": 100 * float(shares[row].mean())} for key, shares in success.items()
+        }
         for row, policy in enumerate(POLICIES)
     }
-    agreement = {judge: ranking.agreement(success[judge], success["true"]) for judge in JUDGES}
-    report = {"definitions": DEFINITIONS, "scenes": len(found), "table": rows}
-    write_json(out / "report.json", {**report, "agreement": agreement})
-    print_table("policy", rows, MEASURES, title=f"success in {len(found)} scenes")
+    agreement = {judge: ranking.agreement(success[judge], success["true"]) for judge in judges}
+    scenes = len(found["true"])
+    report = {"definitions": DEFINITIONS, "scenes": scenes, "table": rows, "agreement": agreement}
+    write_json(out / "report.json", report)
+    print_table("policy", rows, MEASURES, title=f"success in {scenes} scenes")
     title = "agreement with true success, with its 95 % interval"
     print_table("success read from", agreement, ranking.MEASURES, title=title)
-    _plot(rows, out / "ranking.png")
+    _plot(rows, out / "ranking.png", judges)
 
 
-def _plot(rows: Mapping[str, Mapping[str, Mapping[str, float]]], path: Path) -> None:
+def _plot(rows: Mapping[str, Summary], path: Path, judges: Sequence[str]) -> None:
     """Plot success in the generated world against true success, a point for each policy."""
     matplotlib.use("agg")
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    for axes, judge in zip(figure.subplots(1, 2, sharey=True), JUDGES, strict=True):
+    figure = Figure(figsize=(5.5 * len(judges), 5), layout="constrained")
+    panels = figure.subplots(1, len(judges), sharey=True, squeeze=False)[0]
+    for axes, judge in zip(panels, judges, strict=True):
         axes.plot([0, 100], [0, 100], color="gray", linewidth=0.8)
         for name, row in rows.items():
             axes.plot(row["true"]["mean"], row[judge]["mean"], "o", label=name)
@@ -213,17 +290,17 @@ def _plot(rows: Mapping[str, Mapping[str, Mapping[str, float]]], path: Path) -> 
         figure.savefig(temporary, dpi=100)
 
 
-def _draw(settings: Policies, spec: VideoSpec) -> None:
+def _draw(out: Path, tasks: Sequence[Task], generator: Generator) -> None:
     """Draw clips of every policy: generated, and true."""
     clips = []
-    for task in islice(_tasks(settings, spec), min(SHEET_SCENES, settings.scenes)):
-        path = settings.out / "scenes" / f"{task.seed}.npz"
-        videos = read_arrays(path, {"frames": "uint8"})["frames"]
+    for task in tasks:
         start = World(scene=task.script.scene, seed=task.seed)
+        videos = _videos(task, generator, 1, out / "scenes")
         for policy, action, frames in zip(POLICIES, task.actions, videos, strict=True):
             true, _ = start.execute(action)
             title = f"scene {task.seed}, {policy.name}: generated, true. {action.prompt}"
             clips.append(SheetClip(title, [frames, true.frames]))
-    moments = [0, spec.frames // 4, spec.frames // 2, 3 * spec.frames // 4, spec.frames - 1]
-    draw_sheet(clips, settings.out / "contact_sheet.png", moments=moments)
-    print(settings.out / "ranking.png", settings.out / "contact_sheet.png", sep="\n")
+    last = generator.config.video.frames - 1
+    moments = [round(share * last) for share in (0, 0.25, 0.5, 0.75, 1)]
+    draw_sheet(clips, out / "contact_sheet.png", moments=moments)
+    print(out / "ranking.png", out / "contact_sheet.png", sep="\n")

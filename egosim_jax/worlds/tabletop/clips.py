@@ -100,12 +100,7 @@ def film(
     """Render a clip of the scenes and arms of its frames; `bare` without arms and target."""
     pictures, joints, paints = [], [], {}
     for scene, here, pose in zip(scenes, arms, cameras.world_from_camera, strict=True):
-        placed = scene.placed()
-        for index, arm in enumerate(here):
-            placed += [
-                Placed(part=part, world_from_part=np.eye(4), number=FIRST_HAND + 2 * index + k)
-                for k, part in enumerate(arm[1] if arm else ())
-            ]
+        placed = place(scene, here)
         joints.append(
             [np.full((JOINTS[kind], 3), np.nan) if arm is None else arm[0] for arm in here]
         )
@@ -142,11 +137,30 @@ def film(
     )
 
 
-def film_scene(scene: Scene, cameras: Cameras, *, without: str | None = None) -> list[Picture]:
-    """Render a scene at rest along a camera path, without hands and without one of its bodies."""
-    hidden = None if without is None else scene.number(without)
-    caster = RayCaster([item for item in scene.placed() if item.number != hidden])
-    return [_render(caster, pose, cameras) for pose in cameras.world_from_camera]
+def film_scenes(
+    scenes: Sequence[Scene],
+    cameras: Cameras,
+    *,
+    arms: Sequence[Sequence[Arm | None]] | None = None,
+    without: str | None = None,
+) -> list[Picture]:
+    """Render the scenes and arms of some frames, `without` one of the bodies."""
+    hidden = None if without is None else scenes[0].number(without)
+    pictures = []
+    for index, (scene, pose) in enumerate(zip(scenes, cameras.world_from_camera, strict=True)):
+        placed = place(scene, () if arms is None else arms[index])
+        caster = RayCaster([item for item in placed if item.number != hidden])
+        pictures.append(_render(caster, pose, cameras))
+    return pictures
+
+
+def place(scene: Scene, arms: Sequence[Arm | None]) -> list[Placed]:
+    """Return every part of a scene and of arms, which are in the world, with its pose and id."""
+    return scene.placed() + [
+        Placed(part=part, world_from_part=np.eye(4), number=FIRST_HAND + 2 * index + k)
+        for index, arm in enumerate(arms)
+        for k, part in enumerate(arm[1] if arm else ())
+    ]
 
 
 def provenance(seed: int) -> dict[str, str]:
