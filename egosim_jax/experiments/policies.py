@@ -110,7 +110,7 @@ class Task:
         found = region.open_mask(region.label(frames, background, paints) == number)
         errors = region.centroid_errors(found, goal)
         if not len(errors):
-            return {"success": 0.0, "error_m": float("nan")}
+            return {"success": 0.0}
         depth = np.median(np.stack([picture.depth_m for picture in there])[goal])
         error = float(np.median(errors) * depth / last.intrinsics_px[0, 0])
         return {"success": float(error <= WITHIN_M[0]), "error_m": error}

@@ -39,7 +39,7 @@ def test_policies_are_ranked_and_the_ranking_resumes(weights, tmp_path, capsys):
     assert list(report["table"]) == [policy.name for policy in POLICIES]
     assert report["table"]["exact"]["true"]["mean"] == 100
     assert report["table"]["never closes"]["true"]["mean"] == 0
-    assert report["agreement"].keys() == {"frames", "state"}
+    assert report["agreement"].keys() == {"seen", "frames", "state"}
     assert (out / "ranking.png").exists()
     assert (out / "contact_sheet.png").exists()
     assert "MMRV" in capsys.readouterr().out
