@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
+from egosim_jax.conditioning.baselines import DROPPED, Baseline, with_hand_mask
 from egosim_jax.convert.lora import check_base
 from egosim_jax.data.clips import Policy, check_clip, load_triplet
 from egosim_jax.data.metadata import ClipFiles, check_presence, is_safe_id
@@ -142,6 +143,8 @@ class BatchJob:
     """Skip windows whose video exists."""
     reconstruct: bool = False
     """Also write the ground truth through the autoencoder."""
+    baseline: Baseline | None = None
+    """Baseline to generate instead of the model with all of its conditions."""
 
     def open(self) -> None:
         """Record the settings in the folder. Raises `InputError` if it is of another job."""
@@ -158,6 +161,8 @@ class BatchJob:
         }
         if self.decoding != "accurate":
             settings["decoding"] = self.decoding
+        if self.baseline is not None:
+            settings["baseline"] = self.baseline
         open_folder(self.out, settings)
         for name, digest in (digests or {}).items():
             print(f"{self.model.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
@@ -310,7 +315,7 @@ class BatchJob:
         seeds = [seed_of(self.seed, w.output_id) for w in (*windows, *[windows[-1]] * fill)]
         then = time.monotonic()
         try:
-            clips = generator.generate(triplets, seeds)
+            clips = self._clips(generator, triplets, seeds)
         except FloatingPointError as error:
             for window in windows:
                 self._report(window, status="failed", error=str(error))
@@ -324,6 +329,13 @@ class BatchJob:
             self._report(window, status="done", seed=seed, seconds=round(seconds, 3))
             print(self._video(window))
         return []
+
+    def _clips(
+        self, generator: Generator, triplets: Sequence[Triplet], seeds: Sequence[int]
+    ) -> list[Clip]:
+        if self.baseline == "hand_mask":
+            triplets = [with_hand_mask(triplet) for triplet in triplets]
+        return generator.generate(triplets, seeds, without=self.baseline and DROPPED[self.baseline])
 
     def _write(
         self, window: Window, triplet: Triplet, clip: Clip, reconstruction: Clip | None

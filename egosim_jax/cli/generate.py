@@ -85,6 +85,10 @@ class Generate:
     It repeats or cuts frames, resizes videos, and treats all pixels as observed without a mask."""
     decoding: Literal["accurate", "official"] = "accurate"
     """Color decoding of videos; official: as in EgoSim's loader, a gray level darker."""
+    baseline: Literal["no_hands", "hand_mask", "sdedit"] | None = None
+    """Generate a baseline of the model: without hands, with their mask, or by SDEdit.
+
+    SDEdit begins with the noised prior, at the model's strength or 0.75."""
     skip_existing: bool = False
     """Skip clips whose video exists."""
     reconstruct: bool = False
@@ -111,6 +115,7 @@ class Generate:
             decoding=self.decoding,
             skip_existing=self.skip_existing,
             reconstruct=self.reconstruct,
+            baseline=self.baseline,
         )
         windows = None if self.metadata is None else self._windows(self.metadata)
         job.open()
@@ -155,12 +160,16 @@ class Generate:
     def _model(self) -> ModelConfig:
         """Return the config of the model with the options applied."""
         from egosim_jax import configs
+        from egosim_jax.conditioning.baselines import STRENGTH
         from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
 
         config = configs.get(self.config)
         config = config if self.sampling is None else configs.sampled(config, self.sampling)
         config = config if self._weights is None else config.at(self._weights)
-        config = replace(config, steps=self.steps or config.steps, strength=self.strength)
+        strength = self.strength
+        if self.baseline == "sdedit" and strength is None:
+            strength = STRENGTH
+        config = replace(config, steps=self.steps or config.steps, strength=strength)
         if self.solver is not None:
             solvers = {
                 "euler": Euler(),

@@ -116,6 +116,26 @@ class Evaluation:
                     }
         return found
 
+    def by_index(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the summaries of each method over the first, second, ... window of all clips.
+
+        Empty unless a clip has several windows, as in continuous generation.
+        """
+        starts: dict[str, set[int]] = {}
+        for row in self.rows:
+            starts.setdefault(row.window.files.video_id, set()).add(row.window.start)
+        if max(map(len, starts.values())) == 1:
+            return {}
+        places = {name: sorted(found) for name, found in starts.items()}
+        scores: dict[str, dict[int, list[Scores]]] = {}
+        for row in self.rows:
+            place = places[row.window.files.video_id].index(row.window.start)
+            scores.setdefault(row.method, {}).setdefault(place, []).append(row.scores)
+        return {
+            method: [self._summary(found[place]) for place in sorted(found)]
+            for method, found in scores.items()
+        }
+
     def _grouped(self) -> dict[str, dict[str, list[Row]]]:
         """Return the rows by group, sorted by name, and method."""
         grouped: dict[str, dict[str, list[Row]]] = {}
@@ -148,6 +168,7 @@ class Evaluation:
             },
             "splits": self.summaries(),
             "differences": self.differences(),
+            "by_index": self.by_index(),
             "published": {"source": self.source, "rows": self.published} if self.published else {},
         }
 
@@ -185,6 +206,10 @@ class Evaluation:
             if others:
                 reference = next(iter(self.titles.values()))
                 print_table("", others, headings, title=f"difference from {reference}, 95 %")
+        for method, summaries in self.by_index().items():
+            rows = {str(number): row for number, row in enumerate(summaries, start=1)}
+            title = f"{self.titles[method]}: decay by clip"
+            print_table("clip", rows, headings, title=title)
         for line in self.notes():
             print(line)
 

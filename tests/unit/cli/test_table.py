@@ -149,6 +149,23 @@ def test_differences_are_paired_with_the_first_folder(metadata, folders, tmp_pat
     assert "egovid" not in report["differences"]  # of one clip
 
 
+def test_windows_of_one_clip_are_summarized_by_their_order(metadata, folders, tmp_path, capsys):
+    near = tmp_path / "near"
+    lines = []
+    for name in ("clip0", "clip1"):
+        for place, start in enumerate((0, 4)):
+            target = target_of(metadata, name)[start : start + 5]
+            write_video(near / f"{name}_{start}.mp4", target // (2 + place), 16)
+            line = {"video_id": f"{name}_{start}", "source_id": name, "start": start}
+            lines.append({**line, "status": "done"})
+    (near / "results.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    make(metadata, folders[:1], tmp_path / "out", name="egosim_continuous", baselines=())
+    first, second = json.loads((tmp_path / "out" / "report.json").read_text())["by_index"]["near"]
+    assert first["clips"] == second["clips"] == 2
+    assert first["psnr"]["mean"] > second["psnr"]["mean"]
+    assert "decay by clip" in capsys.readouterr().out
+
+
 def test_latex_has_a_table_for_each_group_and_is_escaped(metadata, folders, tmp_path):
     make(metadata, folders, tmp_path / "out")
     text = (tmp_path / "out" / "table.tex").read_text()
