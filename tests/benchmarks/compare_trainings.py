@@ -23,13 +23,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from flax import nnx
+from jaxtyping import Array, Float, Key
 
 from egosim_jax import configs
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.diffusion.objective import Objective
+from egosim_jax.diffusion.objective import Objective, sample_keys
+from egosim_jax.diffusion.process import Process
 from egosim_jax.experiments import scenes
 from egosim_jax.generator import Generator
 from egosim_jax.io.weights import place
@@ -98,6 +101,12 @@ DENOISERS: Mapping[str, Mapping[str, Any]] = {
     "shift 1": {"shift": 1.0},
     "shift 5": {"shift": 5.0},
     "change 4": {"change": 4.0},
+    "bfloat16, change 4": {"dit": {"products": "bfloat16"}, "change": 4.0},
+    "bfloat16, change 4, own steps": {
+        "dit": {"products": "bfloat16"},
+        "change": 4.0,
+        "times": "own steps",
+    },
     "batch 4": {"batch": 4},
     "batch 16": {"batch": 16},
     "routing": {"routing": True},
@@ -107,7 +116,24 @@ DENOISERS: Mapping[str, Mapping[str, Any]] = {
 }
 """Changes of the recipe `tabletop`; `wide`, `deep` and `random` start from random weights.
 
-`routing` leaves half of the tokens out of most blocks (`routing.py`)."""
+`routing` leaves half of the tokens out of most blocks (`routing.py`); `own steps` trains at the
+noise levels that the sampler visits alone (`OwnSteps`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnSteps(Objective):
+    """The objective at the noise levels of a sampler's steps alone, each as likely."""
+
+    steps: int
+    """Number of its denoising steps."""
+
+    def sample_times(
+        self, process: Process, key: Key[Array, " *keys"], batch: int
+    ) -> Float[Array, " b"]:
+        """Draw one of the steps for each sample."""
+        times = jnp.asarray(process.times(self.steps)[:-1], jnp.float32)
+        draw = jax.vmap(lambda key: jax.random.randint(key, (), 0, self.steps))
+        return times[draw(sample_keys(key, batch))]
 
 
 @dataclass(frozen=True)
@@ -178,10 +204,12 @@ def train_denoiser(settings: Settings, changes: Mapping[str, Any]) -> Trained:
     )
     training = replace(training, optimizer=optimizer, batch_size=changes.get("batch", 8))
     kind = Routing if changes.get("routing") else Denoising
+    times = changes.get("times", "uniform")
+    own = OwnSteps(steps=settings.sampling_steps)
     task = kind(
         model=model,
         dropout=TABLETOP.dropout,
-        objective=Objective(times=changes.get("times", "uniform")),
+        objective=own if times == "own steps" else Objective(times=times),
         change_loss_weight=changes.get("change", 0.0),
     )
     sizes = {"dim", "layers"} & changes.get("dit", {}).keys()
