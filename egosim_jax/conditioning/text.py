@@ -4,7 +4,7 @@ In both, id 0 pads and id 1 ends a prompt. `byt5` needs no files: the tokens are
 of the prompt, byte x as id x + 3, after the ids for padding, end and unknown (Xue et al. 2022).
 A folder in the layout of google/umt5-xxl gives the tokenizer of the released text encoder. Its
 `tokenizer.json` is read as it is: the T5 class of transformers 5 would rebuild it, and lose its
-byte fallback and its id for unknown on the way.
+byte fallback and its id for unknown on the way. Where there is none, its `spiece.model` is read.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Literal, no_type_check
 import numpy as np
 from jaxtyping import Bool, Int32
 
+from egosim_jax.conditioning.sentencepiece import read_spiece
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class PromptTokenizer:
     """Tokenizer of prompts."""
 
     kind: Literal["byt5"] | Path = "byt5"
-    """`byt5`, or a folder with the tokenizer.json of google/umt5-xxl or another model of T5."""
+    """`byt5`, or a folder with tokenizer.json or spiece.model, of umT5 or another model of T5."""
     clean: bool = True
     """Repair encodings, HTML entities and white space first, as Wan does and CogVideoX does not."""
     max_tokens: int = 512
@@ -107,7 +108,11 @@ def clean_prompt(text: str) -> str:
 def _read(folder: Path) -> tokenizers.Tokenizer:
     from tokenizers import Tokenizer
 
-    file = folder / "tokenizer.json"
+    file, pieces = folder / "tokenizer.json", folder / "spiece.model"
+    if not file.is_file() and pieces.is_file():
+        tokenizer = read_spiece(pieces)
+        _check_ids(tokenizer, pieces)
+        return tokenizer
     if not file.is_file():
         raise InputError(
             f"No tokenizer at {file}: umT5 needs the tokenizer.json of google/umt5-xxl, which the "
@@ -117,11 +122,16 @@ def _read(folder: Path) -> tokenizers.Tokenizer:
         tokenizer = Tokenizer.from_file(str(file))
     except Exception as error:  # the library raises bare Exceptions
         raise InputError(f"{file} is not a readable tokenizer: {error}.") from error
+    _check_ids(tokenizer, file)
+    tokenizer.no_truncation()
+    tokenizer.no_padding()
+    return tokenizer
+
+
+def _check_ids(tokenizer: tokenizers.Tokenizer, file: Path) -> None:
+    """Raise `InputError` unless padding and end have the ids of the T5 family."""
     for token, want in (("<pad>", PAD), ("</s>", END)):
         if (have := tokenizer.token_to_id(token)) != want:
             raise InputError(
                 f"{file} is no tokenizer of the T5 family: {token} must be id {want}, not {have}."
             )
-    tokenizer.no_truncation()
-    tokenizer.no_padding()
-    return tokenizer
