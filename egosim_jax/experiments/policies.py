@@ -116,7 +116,7 @@ class Task:
         return {"success": float(error <= WITHIN_M[0]), "error_m": error}
 
     def last_frames(self, action: Action) -> UInt8[np.ndarray, "f h w 3"]:
-        """Return the last frames of the true clip of an action."""
+        """Return the last frames of the ground truth of an action."""
         scenes, _ = World(scene=self.script.scene).move(action)
         pictures = film_scenes(
             scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action)
