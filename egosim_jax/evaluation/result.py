@@ -207,9 +207,10 @@ class Evaluation:
                 reference = next(iter(self.titles.values()))
                 print_table("", others, headings, title=f"difference from {reference}, 95 %")
         for method, summaries in self.by_index().items():
-            rows = {str(number): row for number, row in enumerate(summaries, start=1)}
-            title = f"{self.titles[method]}: decay by clip"
-            print_table("clip", rows, headings, title=title)
+            shown = [{k: row[k] for k in self.shown if k in row} for row in summaries]
+            rows = {str(number): row for number, row in enumerate(shown, start=1)}
+            columns = {k: (self.columns[k].heading, self.columns[k].form) for k in shown[0]}
+            print_table("clip", rows, columns, title=f"{self.titles[method]}: decay by clip")
         for line in self.notes():
             print(line)
 
