@@ -51,10 +51,15 @@ Scorer = Callable[[np.ndarray], Mapping[str, float]]
 class Measure(Protocol):
     """Columns of a table that are computed together."""
 
-    columns: Mapping[str, Column]
-    """Headings by key."""
-    definitions: Mapping[str, str]
-    """Definitions by key or keys."""
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        ...
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key or keys."""
+        ...
 
     def settings(self) -> Any:
         """Return what else the values depend on, such as the hash of weights."""

@@ -43,10 +43,15 @@ class Shape(NamedTuple):
 class Method(Protocol):
     """A row of a table."""
 
-    name: str
-    """Key of a method in reports."""
-    title: str
-    """Name of a method in tables."""
+    @property
+    def name(self) -> str:
+        """Key of a method in reports."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """Name of a method in tables."""
+        ...
 
     def sources(self, window: Window) -> tuple[Path, ...]:
         """Return the files that determine the video, in addition to the ground truth."""

@@ -152,9 +152,9 @@ class Scoring:
                 raise InputError(f"There is no folder {folder.path}. (--generated)")
             results = read_results(folder.path)
             if results is None:
-                results = {name: {"source_id": name} for name in rows}
+                results = {name: {"source_id": name, "start": 0} for name in rows}
             for output_id, line in results.items():
-                files, start = rows.get(str(line.get("source_id"))), line.get("start", 0)
+                files, start = rows.get(str(line.get("source_id"))), int(line.get("start", 0))
                 if files is None:
                     continue
                 if line.get("status") == "failed":

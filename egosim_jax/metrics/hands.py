@@ -61,4 +61,4 @@ def hull_mask(
 
 
 def _present(joints_px: Float[np.ndarray, "f 2 21 2"]) -> Bool[np.ndarray, "f 2"]:
-    return np.isfinite(joints_px).all(axis=(2, 3))
+    return np.asarray(np.isfinite(joints_px).all(axis=(2, 3)))

@@ -128,7 +128,7 @@ def path_errors(
     A path's extent is the largest distance from its first camera; a path that stays there has an
     extent of 1. Frames whose pose is not finite do not count; NaN if the first one's is not.
     """
-    known = np.isfinite(world_from_camera).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(world_from_camera).all(axis=(1, 2)))
     if not known[0]:
         return PathErrors(float("nan"), float("nan"), float("nan"))
     found, wanted = (invert(p[0]) @ p[known] for p in (world_from_camera, target))
