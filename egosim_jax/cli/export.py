@@ -41,8 +41,11 @@ class Export:
                 "'egosim-jax[viewer]'."
             )
         from egosim_jax import configs
+        from egosim_jax.data.lerobot import check_new
         from egosim_jax.serving import export
 
+        if self.to == "lerobot":
+            check_new(self.out)
         found = export.open_sessions(self.sessions, self.session)
         if self.to == "lerobot":
             export.to_lerobot(found, self.out)

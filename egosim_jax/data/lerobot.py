@@ -25,6 +25,7 @@ from PIL import Image
 
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import quote_path
 from egosim_jax.types import InputError
 
 IMAGE, STATE, ACTION = "observation.images.ego", "observation.state", "action"
@@ -80,6 +81,15 @@ class _Totals:
     frames: int = 0
 
 
+def check_new(folder: Path) -> None:
+    """Raise `InputError` unless nothing exists at a path, or an empty folder."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise InputError(
+            f"{quote_path(folder)} exists and is not empty: a dataset needs a new or an empty "
+            "folder. Choose another one, or remove it first. (--out)"
+        )
+
+
 def write_lerobot(
     folder: Path,
     episodes: Sequence[Sequence[ClipRecord]],
@@ -90,8 +100,10 @@ def write_lerobot(
 ) -> None:
     """Write a dataset, complete or absent; `names` are those of the numbers of a row.
 
-    Raises `InputError` if there is nothing to write, if clips differ in size, or without pyarrow.
+    Raises `InputError` if there is nothing to write, if clips differ in size, if the folder holds
+    files, or without pyarrow.
     """
+    check_new(folder)
     if find_spec("pyarrow") is None:
         raise InputError(
             "A LeRobot dataset is written by pyarrow, which is not installed: pip install "
