@@ -59,7 +59,7 @@ class Guard:
             await _refuse(_too_large(self._limit), scope, receive, send)
 
     def _check(self, connection: HTTPConnection) -> None:
-        headers, path = connection.headers, connection.url.path
+        headers, path = connection.headers, connection.scope["path"]  # url contains the Host header
         host, origin = headers.get("host", ""), headers.get("origin")
         if origin is not None and urlsplit(origin).netloc != host:
             raise RequestError(
