@@ -15,6 +15,7 @@ import numpy as np
 
 from egosim_jax.serving import wire
 from egosim_jax.serving.errors import RequestError
+from egosim_jax.types import InputError
 
 
 class Client:
@@ -60,9 +61,20 @@ class Client:
         )
 
     def request(self, kind: str, /, **fields: Any) -> dict[str, Any]:
-        """Return the reply to a request. Raises `RequestError` with the server's message."""
-        self._socket.send(wire.pack({"request": kind, **fields}))
-        return wire.unpack(self._received())
+        """Return the reply to a request. Raises `RequestError` with the server's message.
+
+        If it is interrupted, or waits too long, the connection is closed: connect and attach again.
+        """
+        message = wire.pack({"request": kind, **fields})
+        try:
+            self._socket.send(message)
+            reply = self._received()
+        except RequestError:
+            raise
+        except BaseException:  # a late reply would be taken for that to the next request
+            self.close()
+            raise
+        return wire.unpack(reply)
 
     def create(self, **fields: Any) -> RemoteSession:
         """Create a session of a `seed` or `episode`."""
@@ -99,6 +111,12 @@ class RemoteSession:
                     raise
                 time.sleep(wait)
                 continue
+            if (reply["session"], reply["step_id"]) != (self.id, self.step_id + 1):
+                raise InputError(
+                    f"The reply is step {reply['step_id']} of session {reply['session']}, not step "
+                    f"{self.step_id + 1} of {self.id}: a client is for one thread. Give each "
+                    "thread its own."
+                )
             self.step_id = reply["step_id"]
             return reply
 
