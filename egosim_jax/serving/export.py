@@ -12,11 +12,11 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.env.backends import GeneratedWorld
 from egosim_jax.env.chunks import view_of
-from egosim_jax.io.untrusted import quote_path, read_json
+from egosim_jax.io.untrusted import quote_path
 from egosim_jax.rendering import get
 from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.recording import Recording
-from egosim_jax.serving.session import SETTINGS, Session
+from egosim_jax.serving.session import CLOSED, SETTINGS, Session, settings_of
 from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 
 
@@ -34,9 +34,10 @@ class _Unavailable:
 def open_sessions(folder: Path, names: Sequence[str] = ()) -> list[Session]:
     """Return the sessions of a server's folder, or those of some ids, with at least one step.
 
+    These are the open ones and those that were closed and kept.
     Raises `InputError` if there are none, or for an id that is not there.
     """
-    paths = [path.parent for path in sorted(folder.glob(f"*/{SETTINGS}"))]
+    paths = sorted({p.parent for name in (SETTINGS, CLOSED) for p in folder.glob(f"[!.]*/{name}")})
     known = {path.name: path for path in paths}
     if missing := sorted(set(names) - set(known)):
         raise InputError(
@@ -56,11 +57,10 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> list[Session]:
 
 def _recorded(path: Path) -> GeneratedWorld:
     """Return the world of a recorded session, which renders and does not generate."""
-    settings = read_json(path / SETTINGS)
-    fields = settings.get("video") if isinstance(settings, dict) else None
+    fields = settings_of(path).get("video")
     names = ("frames", "height", "width", "fps")
     if not isinstance(fields, dict) or not all(type(fields.get(n)) is int for n in names):
-        raise InputError(f"{quote_path(path / SETTINGS)} does not describe a session. Restore it.")
+        raise InputError(f"{quote_path(path)} does not describe a session's clips. Restore it.")
     video = VideoSpec(**{name: fields[name] for name in names})
     return GeneratedWorld(generator=_Unavailable(renderer=get("jax")), video=video, perception=None)
 

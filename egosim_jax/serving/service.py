@@ -121,12 +121,11 @@ class Service:
                 "draining": self.store.draining,
             }
         session = self.store.get(request["session"])
-        saved = (session.folder / "saved").glob("*")
         return {
             "session": session.id,
             "committed_step_id": session.committed,
             "busy": session.busy.locked(),
-            "saved": sorted(path.name for path in saved),
+            "saved": session.saved,
             "actions": vars_of(session.actions),
             **session.result.info,
         }

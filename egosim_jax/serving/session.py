@@ -1,9 +1,9 @@
 """One session: journaled steps in a folder.
 
-    session.json              settings
+    session.json              settings; closed.json once it is closed and kept
     starts/N/                 start after committed step N, where a reset or load chose one
     steps/N/request.json      row of each frame, prompt and hash of a step's request
-    steps/N/action.npz        cameras and joints
+    steps/N/action.npz        cameras and joints; the step is accepted when both are there
     steps/N/rollout/          journal, clip and state (rollout.py)
     steps/N/info.json         what is known of the step; it is committed when this is there
     saved/NAME/               starts that the client saved
@@ -33,13 +33,14 @@ from egosim_jax.env.start import Start
 from egosim_jax.episode import Episode, check_action, load_action, save_action
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import quote, read_json
+from egosim_jax.io.untrusted import quote, quote_path, read_json
 from egosim_jax.rollout import Rollout, load_clip
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 
-SETTINGS, INFO, REQUEST = "session.json", "info.json", "request.json"
+SETTINGS, CLOSED = "session.json", "closed.json"
+INFO, REQUEST, ACTION = "info.json", "request.json", "action.npz"
 
 
 @no_type_check
@@ -65,29 +66,35 @@ class Session:
     """Session of a backend in a folder; one request at a time changes it."""
 
     def __init__(self, folder: Path, backend: Backend):
-        """Open the session that `create` wrote. Raises `InputError` if it is damaged."""
+        """Open what `create` wrote, open or closed. Raises `InputError` if it is damaged."""
         self.folder, self.backend = folder, backend
         self.id = folder.name
-        settings = read_json(folder / SETTINGS)
-        if not isinstance(settings, dict) or not isinstance(settings.get("actions"), dict):
-            raise InputError(f"{folder / SETTINGS} does not describe a session. Restore it.")
-        self.actions = spec_of(settings["actions"])
+        self.actions = spec_of(settings_of(folder)["actions"])
         self.busy = threading.Lock()
         self.flight: tuple[tuple[int, str], Future[Result]] | None = None
         """Number and hash of the step that is under way, and its future result."""
         steps = [int(p.name) for p in (folder / "steps").glob("[0-9]*")]
         self.committed = max((n for n in steps if self._is_committed(n)), default=0)
-        self.pending = self.committed + 1 in steps and self._is_accepted(self.committed + 1)
         self._made: Result | None = None
         self.now, self.result = self._where()
 
     @classmethod
     def create(cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start) -> Session:
-        """Write the folder of a new session and open it."""
-        start.save(folder / "starts" / "0")
+        """Write the folder of a new session and open it; after an error there is no folder."""
         settings = {"actions": vars_of(actions), "video": backend.video, "seed": start.seed}
-        write_json(folder / SETTINGS, settings)
-        return cls(folder, backend)
+        try:
+            start.save(folder / "starts" / "0")
+            write_json(folder / SETTINGS, settings)
+            return cls(folder, backend)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+    @property
+    def pending(self) -> bool:
+        """Return True if the request of the next step is on disk."""
+        folder = self._step(self.committed + 1)
+        return all((folder / name).exists() for name in (REQUEST, ACTION))
 
     def _step(self, number: int) -> Path:
         return self.folder / "steps" / str(number)
@@ -95,8 +102,11 @@ class Session:
     def _is_committed(self, number: int) -> bool:
         return (self._step(number) / INFO).exists()
 
-    def _is_accepted(self, number: int) -> bool:
-        return (self._step(number) / "action.npz").exists()
+    def _drop(self, number: int) -> None:
+        """Remove a step, in an order in which a crash leaves no half of it to be resumed."""
+        for name in (INFO, ACTION):
+            (self._step(number) / name).unlink(missing_ok=True)
+        shutil.rmtree(self._step(number), ignore_errors=True)
 
     def _where(self) -> tuple[Start, Result]:
         """Return start and result of a session that is read from its folder."""
@@ -120,10 +130,13 @@ class Session:
         return now, result
 
     def _opening(self, start: Start) -> Result:
-        """Return the result of a reset: the first frame alone."""
-        image = start.first_frame
+        """Return the result of a reset: the first frame alone.
+
+        Raises `InputError` for a start that the world cannot continue from.
+        """
+        simulator, image = self.backend.simulator(start), start.first_frame
         if image is None:
-            image = view_of(self.backend.simulator(start), start.state, start.camera).frames[0]
+            image = view_of(simulator, start.state, start.camera).frames[0]
         return Result(
             step_id=self.committed,
             frames=image[None],
@@ -141,7 +154,7 @@ class Session:
         """Return the action of a step that is on disk."""
         request = read_json(self._step(number) / REQUEST)
         return load_action(
-            self._step(number) / "action.npz",
+            self._step(number) / ACTION,
             kind=self.actions.kind,
             size=(self.backend.video.height, self.backend.video.width),
             prompt=request["prompt"],
@@ -177,7 +190,7 @@ class Session:
         Raises `RequestError` for a step out of order, or for another action under a used number.
         """
         request = request_hash(rows, prompt)
-        if step_id <= self.committed or (self.pending and step_id == self.committed + 1):
+        if step_id <= self.committed:
             return self._again(step_id, request)
         if step_id != self.committed + 1:
             raise RequestError(
@@ -193,25 +206,20 @@ class Session:
         return self.finish()
 
     def _again(self, step_id: int, request: str) -> Result:
-        known = None
-        if 1 <= step_id <= self.committed + self.pending:
-            known = self.request(step_id)
-        if known != request or step_id < 1:
+        if self.request(step_id) != request:
             raise RequestError(
                 409,
                 "step_used",
                 f"Step {step_id} was made with another action: a used step_id repeats its result "
                 f"only for the same action. Committed is step {self.committed}; send step "
-                f"{self.committed + 1 + self.pending}.",
+                f"{self.committed + 1}.",
             )
-        if step_id > self.committed:
-            return self.finish()
         made = self._made
         return made if made is not None and made.step_id == step_id else self.repeat(step_id)
 
     def _accept(self, number: int, chunk: Chunk, request: str) -> None:
         folder = self._step(number)
-        shutil.rmtree(folder, ignore_errors=True)
+        self._drop(number)
         about = {
             "prompt": chunk.action.prompt,
             "rows": chunk.rows.tolist(),
@@ -219,24 +227,28 @@ class Session:
             **chunk.info(self.actions),
         }
         write_json(folder / REQUEST, about)
-        save_action(folder / "action.npz", chunk.action)
-        self.pending = True
+        save_action(folder / ACTION, chunk.action)
 
     def finish(self) -> Result:
-        """Make the step whose request is on disk, from its last finished phase; commit it."""
-        number, now = self.committed + 1, self.now
-        folder, action = self._step(number), self.action(number)
-        simulator = self.backend.simulator(now)
-        rollout = Rollout(simulator, folder / "rollout")
+        """Make the step whose request is on disk, from its last finished phase; commit it.
+
+        After an error the request is removed.
+        """
         try:
-            with announced(simulator.generator):
-                (step,) = rollout.run(
-                    now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
-                )
+            self.result = self._made = self._finished(self.committed + 1)
         except Exception:
-            shutil.rmtree(folder, ignore_errors=True)
-            self.pending = False
+            self._drop(self.committed + 1)
             raise
+        self.committed += 1
+        return self.result
+
+    def _finished(self, number: int) -> Result:
+        folder, action, now = self._step(number), self.action(number), self.now
+        simulator = self.backend.simulator(now)
+        with announced(simulator.generator):
+            (step,) = Rollout(simulator, folder / "rollout").run(
+                now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
+            )
         request = read_json(folder / REQUEST)
         info = {
             **self._facts(step.state, number),
@@ -244,11 +256,10 @@ class Session:
             "hidden_hands": request["hidden_hands"],
             "validity": validity(step, action, simulator.renderer),
         }
-        write_json(folder / INFO, info)
         row = np.array(request["rows"][-1], float)
-        self.committed, self.pending = number, False
+        write_json(folder / INFO, info)
         self.now = now.after(step.state, row, action if self.backend.needs_past else None)
-        self.result = self._made = Result(
+        return Result(
             step_id=number,
             frames=step.clip.frames,
             state=step.state,
@@ -256,15 +267,19 @@ class Session:
             camera=last_camera(action),
             info=info,
         )
-        return self.result
 
     def restart(self, start: Start) -> Result:
-        """Continue from another start; step numbers continue."""
+        """Continue from another start; step numbers continue. A refused one changes nothing."""
+        result = self._opening(start)
+        self._drop(self.committed + 1)
         start.save(self.folder / "starts" / str(self.committed))
-        shutil.rmtree(self._step(self.committed + 1), ignore_errors=True)
-        self.pending = False
-        self.now, self.result = start, self._opening(start)
-        return self.result
+        self.now, self.result = start, result
+        return result
+
+    @property
+    def saved(self) -> list[str]:
+        """Return the names of what is saved."""
+        return sorted(path.name for path in (self.folder / "saved").glob("[!.]*"))
 
     def save(self, name: str) -> None:
         """Save where the session is under a name."""
@@ -274,12 +289,11 @@ class Session:
         """Continue from a saved start. Raises `RequestError` if there is none of that name."""
         folder = self.folder / "saved" / name
         if not folder.exists():
-            known = sorted(path.name for path in (self.folder / "saved").glob("*"))
             raise RequestError(
                 404,
                 "unknown_name",
-                f"The session has saved nothing as {quote(name)}; it has {known[:20]}. Save it "
-                "first.",
+                f"The session has saved nothing as {quote(name)}; it has {self.saved[:20]}. Save "
+                "it first.",
             )
         return self.restart(Start.load(folder))
 
@@ -304,6 +318,15 @@ class Session:
             fps=self.backend.video.fps,
             first_frame=start.first_frame,
         )
+
+
+def settings_of(folder: Path) -> dict[str, Any]:
+    """Return the settings of a session's folder. Raises `InputError` if they are damaged."""
+    path = folder / (SETTINGS if (folder / SETTINGS).exists() else CLOSED)
+    settings = read_json(path)
+    if not isinstance(settings, dict) or not isinstance(settings.get("actions"), dict):
+        raise InputError(f"{quote_path(path)} does not describe a session. Restore it.")
+    return settings
 
 
 def request_hash(rows: object, prompt: str | None) -> str:

@@ -23,12 +23,16 @@ from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import quote
 from egosim_jax.serving.errors import RequestError, as_request_error
 from egosim_jax.serving.metrics import Metrics
-from egosim_jax.serving.session import Result, Session, request_hash, spec_of
+from egosim_jax.serving.session import CLOSED, SETTINGS, Result, Session, request_hash, spec_of
 from egosim_jax.types import InputError, check_counts, check_seed
 
 T = TypeVar("T")
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 """Names of sessions and of what is saved."""
+UNFINISHED = re.compile(r"starts|\.session\..*")
+"""Names that a crash during the creation of a session leaves in its folder."""
+REMOVED = ".removed-{}"
+"""Name of the folder of a session while it is removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,17 +77,20 @@ class Store:
 
     def _resume(self) -> None:
         """Open all sessions of the folder, and finish the steps that were under way."""
-        for path in sorted(self.folder.glob("*/session.json")):
+        for path in self.folder.glob(REMOVED.format("*")):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in sorted(self.folder.glob(f"*/{SETTINGS}")):
             try:
                 session = Session(path.parent, self.backend)
-            except (InputError, OSError, ValueError, KeyError) as error:
+                number = session.committed + 1
+                key = (number, session.request(number)) if session.pending else None
+            except (InputError, OSError, ValueError, KeyError, TypeError, IndexError) as error:
                 self.damaged[path.parent.name] = str(error)
                 print(f"session {path.parent.name} is not resumed: {error}", file=sys.stderr)
                 continue
             self.sessions[session.id] = session
-            if session.pending:
-                key = session.committed + 1, session.request(session.committed + 1)
-                session.flight = key, self.submit(session, session.finish)
+            if key is not None:
+                session.flight = key, self.submit(session, session.finish, bounded=False)
         self.metrics.sessions.set(len(self.sessions))
 
     def close(self) -> None:
@@ -126,7 +133,7 @@ class Store:
                     retry_after_s=5.0,
                 )
             folder = self.folder / check_name(name, "session")
-            if folder.is_dir() and not any(folder.glob("*.json")):  # a crash while it was created
+            if folder.is_dir() and all(UNFINISHED.fullmatch(p.name) for p in folder.iterdir()):
                 shutil.rmtree(folder)
             if name in self.sessions or folder.exists():
                 raise RequestError(
@@ -205,7 +212,7 @@ class Store:
         check_name(name, "name")
 
         def run() -> str:
-            saved = {path.name for path in (session.folder / "saved").glob("*")}
+            saved = session.saved
             if len(saved) >= self.limits.saved and name not in saved:
                 raise RequestError(
                     429,
@@ -229,28 +236,37 @@ class Store:
         if not isinstance(keep, bool):
             raise InputError(f"keep is {quote(keep)}: it must be true or false.")
 
+        removed = self.folder / REMOVED.format(session.id)
+
         def run() -> str:
             with self._changing:
+                if keep:
+                    (session.folder / SETTINGS).rename(session.folder / CLOSED)
+                else:
+                    shutil.rmtree(removed, ignore_errors=True)
+                    session.folder.rename(removed)
                 self.sessions.pop(session.id, None)
                 self.metrics.sessions.set(len(self.sessions))
-            if keep:
-                (session.folder / "session.json").rename(session.folder / "closed.json")
-            else:
-                shutil.rmtree(session.folder, ignore_errors=True)
+            shutil.rmtree(removed, ignore_errors=True)
             return session.id
 
         return self.submit(session, run)
 
     def submit(
-        self, session: Session, run: Callable[[], T], *, exclusive: bool = True
+        self,
+        session: Session,
+        run: Callable[[], T],
+        *,
+        exclusive: bool = True,
+        bounded: bool = True,
     ) -> Future[T]:
-        """Run a request of a session in a thread; refuse it if the queue is full.
+        """Run a request of a session in a thread; a `bounded` one is refused if the queue is full.
 
         Of the `exclusive` ones, which change the session, another one must not be under way.
         """
         self._check_open()
         with self._changing:
-            if self._queued >= self.limits.queue:
+            if bounded and self._queued >= self.limits.queue:
                 self.metrics.refused.labels("queue_full").inc()
                 raise RequestError(
                     429,

@@ -31,7 +31,7 @@ np.savez(sys.argv[2], frames=frames.astype(np.uint8).transpose(0, 2, 3, 1),
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Sessions: one of two steps and, after a reset, one more; and an empty one."""
+    """Sessions: one of two steps and, after a reset, one more, closed and kept; an empty one."""
     folder = tmp_path_factory.mktemp("recorded") / "sessions"
     store = Store(folder, painted(), Limits(), Metrics())
     session = store.create({"seed": 3, "session": "one"})
@@ -41,6 +41,7 @@ def folder(tmp_path_factory):
         if number == 3:
             store.reset({"session": "one", "seed": 4}).result()
         store.step({"session": "one", "step_id": number, "actions": rows * 1.0}).result()
+    store.remove({"session": "one", "keep": True}).result()
     store.close()
     return folder
 
@@ -108,3 +109,10 @@ def test_an_unknown_session_is_refused(folder, tmp_path):
         export.open_sessions(folder, ["two"])
     with pytest.raises(InputError, match="no session with a committed step"):
         export.open_sessions(tmp_path)
+
+
+def test_a_folder_with_files_is_not_replaced_by_a_dataset(folder, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty"):
+        export.to_lerobot(export.open_sessions(folder), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

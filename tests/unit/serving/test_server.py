@@ -9,12 +9,15 @@ import urllib.request
 import numpy as np
 import pytest
 import websockets.sync.client
+from fastapi import FastAPI
+from starlette.datastructures import URL
+from starlette.requests import HTTPConnection
 
 from egosim_jax.serving import wire
 from egosim_jax.serving.client import Client
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.metrics import Metrics
-from egosim_jax.serving.server import _Server, serve
+from egosim_jax.serving.server import Guard, _Server, serve
 from egosim_jax.serving.service import Service
 from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
@@ -168,6 +171,34 @@ def test_a_token_is_asked_for(tmp_path):
     with Client(f"ws://127.0.0.1:{port}", token=TOKEN) as client:
         assert client.request("status")["sessions"] == {}
     service.store.close()
+
+
+class OldConnection(HTTPConnection):
+    """Connection whose URL begins with the Host header, as in older versions of Starlette."""
+
+    url = URL("http://a/healthz?/sessions")
+
+
+def test_the_host_header_does_not_open_a_path():
+    headers = [(b"host", b"a/healthz?")]
+    connection = OldConnection({"type": "http", "path": "/sessions", "headers": headers})
+    with pytest.raises(RequestError, match="token"):
+        Guard(FastAPI(), token=TOKEN)._check(connection)
+
+
+def test_an_interrupted_request_closes_the_connection(server, monkeypatch):
+    _, port = server
+    client = Client(f"ws://127.0.0.1:{port}")
+    session = client.create(seed=3)
+    monkeypatch.setattr(client, "_received", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        session.step(session.reply["row"][None])
+    with pytest.raises(websockets.exceptions.ConnectionClosed):
+        session.status()
+
+
+def interrupt():
+    raise KeyboardInterrupt
 
 
 def test_another_address_needs_a_token(server):

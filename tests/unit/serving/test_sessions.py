@@ -1,16 +1,20 @@
 """Sessions of a painted world: journaled, resumed, never disturbed by each other."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from egosim_jax.env.actions import ActionSpec
+from egosim_jax.env.true_world import TrueWorld
+from egosim_jax.serving import session as session_module
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.session import Session
 from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
-from tests.painted import painted
+from tests.painted import VIDEO, painted
 
 
 @pytest.fixture
@@ -69,6 +73,83 @@ def test_a_failed_step_leaves_the_session_where_it_was(store, monkeypatch):
     assert not (session.folder / "steps" / "2").exists()
     assert session.result == first
     assert step(store, session, 2, rows(session, 5)).step_id == 2
+
+
+def test_a_step_that_fails_at_its_last_write_is_removed(store, monkeypatch):
+    write = session_module.write_json
+
+    def fail(path, value):
+        if path.name == "info.json":
+            raise OSError("no space")
+        write(path, value)
+
+    made = store.create({"seed": 3})
+    with monkeypatch.context() as patched:
+        patched.setattr(session_module, "write_json", fail)
+        with pytest.raises(RequestError, match="inside the server"):
+            step(store, made, 1)
+    assert not made.pending
+    assert step(store, made, 1, rows(made, 5)).step_id == 1
+
+
+def test_a_pending_step_without_its_request_is_not_resumed(store):
+    made = store.create({"seed": 3, "session": "one"})
+    for number in (1, 2):
+        step(store, made, number)
+    store.close()
+    last = made.folder / "steps" / "2"
+    for name in ("info.json", "request.json"):
+        (last / name).unlink()
+    again = Store(store.folder, painted(), Limits(), Metrics())
+    assert step(again, again.sessions["one"], 2, rows(made, 5)).step_id == 2
+    again.close()
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "{"])
+def test_a_damaged_request_does_not_keep_the_store_from_opening(store, text):
+    for name in ("good", "bad"):
+        step(store, store.create({"session": name}), 1)
+    store.close()
+    last = store.folder / "bad" / "steps" / "1"
+    (last / "info.json").unlink()
+    (last / "request.json").write_text(text)
+    again = Store(store.folder, painted(), Limits(), Metrics())
+    assert (set(again.sessions), set(again.damaged)) == ({"good"}, {"bad"})
+    again.close()
+
+
+def test_more_pending_steps_than_the_queue_are_resumed(store):
+    for name in ("one", "two", "three"):
+        made = store.create({"seed": 3, "session": name})
+        step(store, made, 1)
+        (made.folder / "steps" / "1" / "info.json").unlink()
+    store.close()
+    again = Store(store.folder, painted(), Limits(queue=1, threads=1), Metrics())
+    again.close()
+    assert [session.committed for session in again.sessions.values()] == [1, 1, 1]
+
+
+def test_a_start_that_the_world_refuses_changes_nothing(store, tmp_path):
+    world = TrueWorld(video=VIDEO)
+    start = store.backend.start(3, ActionSpec())
+    made = Session.create(tmp_path / "one", world, ActionSpec(), start)
+    with pytest.raises(InputError, match="scenes of its seeds"):
+        made.restart(replace(start, seed=4))
+    assert Session(made.folder, world).now.seed == 3
+    with pytest.raises(InputError, match="scenes of its seeds"):
+        Session.create(tmp_path / "two", world, ActionSpec(), replace(start, seed=4))
+    assert not (tmp_path / "two").exists()
+
+
+def test_a_folder_is_taken_for_an_unfinished_session_only_if_it_is_one(store):
+    (store.folder / "one" / "starts" / "0").mkdir(parents=True)
+    (store.folder / "other").mkdir()
+    (store.folder / "other" / "config.json").write_text("{}")
+    assert store.create({"session": "one"}).id == "one"
+    with pytest.raises(RequestError, match="choose another id"):
+        store.create({"session": "other"})
+    store.remove({"session": "one"}).result()
+    assert {path.name for path in store.folder.iterdir()} == {".lock", "other"}
 
 
 def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
