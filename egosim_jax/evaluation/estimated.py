@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -60,15 +60,24 @@ def _shape(truth: GroundTruth) -> Shape:
 class Regions:
     """PSNR near the hands and, where there is a mask, of the object acted on."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
-        "hand_psnr": Column("PSNR near hands dB", "{:.2f}", "higher"),
-        "object_psnr": Column("PSNR of the object dB", "{:.2f}", "higher"),
-    }
-    definitions: ClassVar[Mapping[str, str]] = {
-        "hand_psnr": "dB over the pixels within 3 % of the width of the drawn hands, all frames of "
-        "a clip together",
-        "object_psnr": f"dB over the white pixels of {OBJECT_MASK}, all frames of a clip together",
-    }
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        return {
+            "hand_psnr": Column("PSNR near hands dB", "{:.2f}", "higher"),
+            "object_psnr": Column("PSNR of the object dB", "{:.2f}", "higher"),
+        }
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key."""
+        return {
+            "hand_psnr": "dB over the pixels within 3 % of the width of the drawn hands, all "
+            "frames of "
+            "a clip together",
+            "object_psnr": f"dB over the white pixels of {OBJECT_MASK}, all frames of a clip "
+            "together",
+        }
 
     def settings(self) -> Any:
         """Return the parameters of the regions."""
@@ -101,14 +110,22 @@ class DepthError:
     estimator: DepthEstimator
     """Depth network."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
-        "depth_error": Column("depth error % (ours)", "{:.2f}", "lower"),
-    }
-    definitions: ClassVar[Mapping[str, str]] = {
-        "depth_error": "ours; mean |depth - ground truth| / ground truth in percent over "
-        f"{DEPTH_FRAMES} frames, both estimated by the depth network; depth of unknown scale is "
-        "first multiplied by the ratio of the medians",
-    }
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        return {
+            "depth_error": Column("depth error % (ours)", "{:.2f}", "lower"),
+        }
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key."""
+        return {
+            "depth_error": "ours; mean |depth - ground truth| / ground truth in percent over "
+            f"{DEPTH_FRAMES} frames, both estimated by the depth network; depth of unknown scale "
+            "is "
+            "first multiplied by the ratio of the medians",
+        }
 
     def settings(self) -> Any:
         """Return the hash of the network."""
@@ -143,19 +160,27 @@ class CameraError:
     estimator: CameraEstimator
     """Camera estimator, which needs no weights."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
-        "camera_rotation": Column("camera rotation ° (ours)", "{:.3f}", "lower"),
-        "camera_error": Column("camera error (ours)", "{:.4f}", "lower"),
-        "camera_ate": Column("camera ATE (ours)", "{:.4f}", "lower"),
-    }
-    definitions: ClassVar[Mapping[str, str]] = {
-        "camera_rotation": "ours; RMS angle between rotations since the first frame, both paths "
-        "estimated from the videos without the pixels near hands",
-        "camera_error": "ours; RMS distance between positions since the first frame, each path "
-        "divided by its largest distance from there",
-        "camera_ate": "ours; RMS distance between positions since the first frame after the "
-        "least-squares scale, divided by the extent of the ground truth's path",
-    }
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        return {
+            "camera_rotation": Column("camera rotation ° (ours)", "{:.3f}", "lower"),
+            "camera_error": Column("camera error (ours)", "{:.4f}", "lower"),
+            "camera_ate": Column("camera ATE (ours)", "{:.4f}", "lower"),
+        }
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key."""
+        return {
+            "camera_rotation": "ours; RMS angle between rotations since the first frame, both "
+            "paths "
+            "estimated from the videos without the pixels near hands",
+            "camera_error": "ours; RMS distance between positions since the first frame, each path "
+            "divided by its largest distance from there",
+            "camera_ate": "ours; RMS distance between positions since the first frame after the "
+            "least-squares scale, divided by the extent of the ground truth's path",
+        }
 
     def settings(self) -> Any:
         """Return the estimator's options."""
@@ -189,19 +214,29 @@ class HandScores:
     estimator: HandEstimator
     """Hand detector."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
-        "hand_iou": Column("hand IoU", "{:.3f}", "higher"),
-        "keypoint_error": Column("keypoint error %", "{:.2f}", "lower"),
-        "hand_recall": Column("hand recall", "{:.3f}", "higher"),
-    }
-    definitions: ClassVar[Mapping[str, str]] = {
-        "hand_iou": "ours; IoU of the convex hulls of the keypoints detected in both videos, mean "
-        "over frames with a hand in the ground truth",
-        "keypoint_error": "ours; mean distance of the keypoints of hands detected in both videos, "
-        "in percent of the width",
-        "hand_recall": "ours; share of the hands detected in the ground truth that are detected in "
-        "the video",
-    }
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        return {
+            "hand_iou": Column("hand IoU", "{:.3f}", "higher"),
+            "keypoint_error": Column("keypoint error %", "{:.2f}", "lower"),
+            "hand_recall": Column("hand recall", "{:.3f}", "higher"),
+        }
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key."""
+        return {
+            "hand_iou": "ours; IoU of the convex hulls of the keypoints detected in both videos, "
+            "mean "
+            "over frames with a hand in the ground truth",
+            "keypoint_error": "ours; mean distance of the keypoints of hands detected in both "
+            "videos, "
+            "in percent of the width",
+            "hand_recall": "ours; share of the hands detected in the ground truth that are "
+            "detected in "
+            "the video",
+        }
 
     def settings(self) -> Any:
         """Return the detector's options."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +27,15 @@ class Features:
     network: VideoMae
     """Feature network."""
 
-    columns: ClassVar[Mapping[str, Column]] = {"fvd": COLUMN}
-    definitions: ClassVar[Mapping[str, str]] = {"fvd": DEFINITION}
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        return {"fvd": COLUMN}
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key."""
+        return {"fvd": DEFINITION}
 
     def settings(self) -> Any:
         """Return the network, which counts by the hash of its files."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -74,19 +74,28 @@ class Measure(Protocol):
 class Pixels:
     """PSNR in both papers' definitions, SSIM and color drift."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
-        "psnr": Column("PSNR dB", "{:.2f}", "higher"),
-        "ssim": Column("SSIM", "{:.4f}", "higher"),
-        "psnr_clip": Column("PSNR of the clip dB", "{:.2f}", "higher"),
-        "color_drift": Column("color drift", "{:.2f}", "lower"),
-    }
-    definitions: ClassVar[Mapping[str, str]] = {
-        **{key: DEFINITIONS[key] for key in ("psnr", "ssim")},
-        "psnr_clip": "dB; one mean squared error over all frames, pixels and channels of a clip, "
-        "as torchmetrics computes PSNR and DWM reports it",
-        "color_drift": "levels of 255; |mean RGB of the last frame - that of the ground truth|, "
-        "mean over channels",
-    }
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Headings by key."""
+        return {
+            "psnr": Column("PSNR dB", "{:.2f}", "higher"),
+            "ssim": Column("SSIM", "{:.4f}", "higher"),
+            "psnr_clip": Column("PSNR of the clip dB", "{:.2f}", "higher"),
+            "color_drift": Column("color drift", "{:.2f}", "lower"),
+        }
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definitions by key."""
+        return {
+            **{key: DEFINITIONS[key] for key in ("psnr", "ssim")},
+            "psnr_clip": "dB; one mean squared error over all frames, pixels and channels of a "
+            "clip, "
+            "as torchmetrics computes PSNR and DWM reports it",
+            "color_drift": "levels of 255; |mean RGB of the last frame - that of the ground "
+            "truth|, "
+            "mean over channels",
+        }
 
     def settings(self) -> Any:
         """Return nothing."""
