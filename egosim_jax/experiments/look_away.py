@@ -173,7 +173,7 @@ def _away(script: Script) -> float | None:
         [moment.scene.body(script.intent.name).world_from_body[:3, 3] for moment in script.moments]
     )
     for sign in (1.0, -1.0):
-        turned = _turn(script.cameras, 0, sign * np.radians(AWAY_DEGREES), len(places))
+        turned = _turn(script.cameras, 0.0, sign * np.radians(AWAY_DEGREES), len(places))
         local = transform(invert(turned.world_from_camera[-1]), places)
         angles = np.degrees(np.arctan2(np.abs(local[:, 0]), local[:, 2]))
         if angles.min() > OUTSIDE_DEGREES:
@@ -203,11 +203,11 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
     if case == "seen":
         poses = script.cameras.world_from_camera[-1:]
         view, hands = replace(script.cameras, world_from_camera=poses), [joints, missing, missing]
-        cameras = [script.cameras, _turn(view, 0, angle, frames), _turn(view, angle, 0, frames)]
+        cameras = [script.cameras, _turn(view, 0.0, angle, frames), _turn(view, angle, 0.0, frames)]
         prompts = [prompt, still, still]
     else:
         view, hands = script.cameras, [missing, joints, missing]
-        ends = ((0, angle), (angle, angle), (angle, 0))
+        ends = ((0.0, angle), (angle, angle), (angle, 0.0))
         cameras = [_turn(view, first, last, frames) for first, last in ends]
         prompts = [still] * 3
     world, clips = World(scene=script.scene, seed=seed), []

@@ -33,7 +33,7 @@ def test_looking_away_reports_each_case_and_method_and_resumes(weights, tmp_path
 def test_policies_are_ranked_and_the_ranking_resumes(weights, tmp_path, capsys):
     out = tmp_path / "out"
     fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
-    command = ["experiment", "policies", *fixed, "--scenes", "2"]
+    command = ["experiment", "policies", *fixed, "--scenes", "1"]
     assert main(command) == 0
     report = json.loads((out / "report.json").read_text("utf-8"))
     assert list(report["table"]) == [policy.name for policy in POLICIES]
