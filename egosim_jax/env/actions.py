@@ -33,6 +33,20 @@ REST = (0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25)
 """Row of a right hand at rest: position in meters, rotation vector in radians, closure."""
 
 
+def numbers(rows: object) -> Float[np.ndarray, ...]:
+    """Return rows as an array. Raises `InputError` for text and other values that are no numbers.
+
+    Rows of unequal lengths are none either, and whole numbers beyond 64 bits.
+    """
+    try:
+        found = np.asarray(rows)
+    except (TypeError, ValueError, OverflowError):
+        found = np.empty(0, object)
+    if found.dtype.kind not in "biuf":
+        raise InputError(f"The actions are {quote(rows)}: they must be rows of numbers.")
+    return found.astype(np.float64)
+
+
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class ActionSpec:
@@ -53,21 +67,27 @@ class ActionSpec:
     """Largest translation of the camera in meters and rotation in radians, along each axis."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for an unknown layout, no hands, or an empty workspace."""
+        """Raise `InputError` for an unknown layout, no hands, or an empty workspace or reach."""
         if self.layout not in LAYOUTS:  # which a client may have chosen
             raise InputError(
                 f"There is no action layout {str(self.layout)[:40]!r}: it must be one of "
                 f"{', '.join(LAYOUTS)}."
             )
-        if not 1 <= len(self.sides) <= 2 or not set(self.sides) <= {"left", "right"}:
+        if sorted(self.sides) not in (["left"], ["right"], ["left", "right"]):
             raise InputError(
-                f"The hands are {self.sides!r:.60}: give one or two of 'left' and 'right'."
+                f"The hands are {self.sides!r:.60}: give 'left', 'right' or one of each."
             )
         low, high = np.array(self.workspace_m, float)
         if not (np.isfinite([low, high]).all() and (low < high).all()):
             raise InputError(
                 f"The workspace is {self.workspace_m!r:.120}: it must be the lowest and the "
                 "highest x, y and z in meters."
+            )
+        translation_m, turn = self.camera_reach
+        if not (0 < translation_m < np.inf and 0 < turn <= np.pi):
+            raise InputError(
+                f"The reach of the camera is {self.camera_reach!r:.60}: it must be a translation "
+                "above 0 in meters and a rotation above 0 and at most pi in radians."
             )
 
     @property
@@ -119,13 +139,7 @@ class ActionSpec:
 
         `most` is the largest number of rows of a chunk.
         """
-        try:
-            found = np.asarray(rows, float)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"The actions are {quote(rows)}: they must be numbers of shape (rows, "
-                f"{len(self.names)})."
-            ) from None
+        found = numbers(rows)
         if found.ndim != 2 or not 1 <= len(found) <= most or found.shape[1] != len(self.names):
             raise InputError(
                 f"The actions have shape {found.shape}: {self.layout} of {len(self.sides)} hands "
