@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.batching import announced
 from egosim_jax.env.start import Start
-from egosim_jax.episode import check_action
 from egosim_jax.rendering import Renderer
 from egosim_jax.simulator import Simulator, Step
 from egosim_jax.types import Action, Cameras, SceneState, View
@@ -106,10 +105,8 @@ def timed_step(
 ) -> tuple[Step, Timing]:
     """Run one step of a simulator; return it with the seconds of its phases.
 
-    The caller is announced to a generator that gathers batches. Raises `InputError` for an action
-    that the state does not allow.
+    The caller is announced to a generator that gathers batches.
     """
-    check_action(action, state=state, fps=simulator.fps)
     then = time.monotonic()
     with announced(simulator.generator):
         view = simulator.render(state, action)

@@ -25,7 +25,7 @@ from egosim_jax.env.chunks import (
 )
 from egosim_jax.env.rewards import Outcome, RewardFn, no_reward
 from egosim_jax.env.start import Start, check_size
-from egosim_jax.episode import Episode
+from egosim_jax.episode import Episode, check_action
 from egosim_jax.simulator import Step
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError, SceneState, VideoSpec, View, check_seed
@@ -111,14 +111,19 @@ class Running:
         return self.now.steps - self.start.steps
 
     def chunk(self, rows: object, *, prompt: str | None = None) -> Chunk:
-        """Return the next chunk; a hand out of view is given as missing."""
-        frames = self.backend.video.frames
-        return make_chunk(
-            self.actions, rows, start=self.now, frames=frames, prompt=prompt, hide=True
-        )
+        """Return the next chunk; a hand out of view is given as missing.
 
-    def advance(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
-        """Simulate a chunk; return its step and what is known of it."""
+        Raises `InputError` for rows that the state does not allow.
+        """
+        video = self.backend.video
+        chunk = make_chunk(
+            self.actions, rows, start=self.now, frames=video.frames, prompt=prompt, hide=True
+        )
+        check_action(chunk.action, state=self.now.state, fps=video.fps)
+        return chunk
+
+    def simulate(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
+        """Return the step of a chunk and what is known of it; the episode is not changed."""
         now, action = self.now, chunk.action
         simulator = self.backend.simulator(now)
         step, timing = timed_step(
@@ -128,15 +133,18 @@ class Running:
             seed=now.seed + now.steps + 1,
             first_frame=now.first_frame,
         )
-        kept = action if self.backend.needs_past else None
-        self.last, self.now = step, now.after(step.state, chunk.rows[-1], kept)
-        self.camera = last_camera(action)
         return step, {
-            **self.info(),
             **chunk.info(self.actions),
             "validity": validity(step, action, simulator.renderer),
             "timing": timing,
         }
+
+    def advance(self, chunk: Chunk, step: Step) -> dict[str, Any]:
+        """Continue the episode after the step of a chunk; return where it is."""
+        kept = chunk.action if self.backend.needs_past else None
+        self.last, self.now = step, self.now.after(step.state, chunk.rows[-1], kept)
+        self.camera = last_camera(chunk.action)
+        return self.info()
 
     def info(self) -> dict[str, Any]:
         """Return number of the chunk that took effect last, hash of the state, and names."""
@@ -238,10 +246,11 @@ class WorldEnv(gymnasium.Env):
         hands, hash of the state, seconds of each phase, `validity` and `success`.
         """
         running = self.running
-        step, info = running.advance(running.chunk(actions, prompt=prompt))
+        chunk = running.chunk(actions, prompt=prompt)
+        step, known = running.simulate(chunk)
         result = self._reward(Outcome(first=running.start.state, step=step))
+        info = {**running.advance(chunk, step), **known, "success": result.success}
         truncated = running.chunks >= self._max_chunks and not result.terminated
-        info["success"] = result.success
         observation = running.observation(self._observe)
         return observation, result.reward, result.terminated, truncated, info
 

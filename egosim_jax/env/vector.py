@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any, SupportsIndex
 
 import numpy as np
 from gymnasium import spaces
@@ -17,7 +18,7 @@ from egosim_jax.env.backends import Backend
 from egosim_jax.env.chunks import straight
 from egosim_jax.env.rewards import Outcome, RewardFn, no_reward
 from egosim_jax.env.single import Running, observation_space, start_of
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError, check_counts, check_seed
 
 Result = tuple[
     dict[str, Any],
@@ -85,7 +86,7 @@ class WorldVectorEnv(VectorEnv):
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: SupportsIndex | Sequence[SupportsIndex | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin episodes: those of `reset_mask`, or all.
@@ -96,23 +97,29 @@ class WorldVectorEnv(VectorEnv):
         given = dict(options or {})
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
         starts = given.pop("starts", [given] * self.num_envs)
-        if mask.shape != (self.num_envs,) or len(starts) != self.num_envs:
+        seeds = self._seeds(seed)
+        if mask.shape != (self.num_envs,) or {len(starts), len(seeds)} != {self.num_envs}:
             raise InputError(
-                f"reset_mask has shape {mask.shape} and starts {len(starts)} entries: both must "
-                f"have one for each of {self.num_envs} episodes."
+                f"reset_mask has shape {mask.shape}, starts {len(starts)} and seed {len(seeds)} "
+                f"entries: all must have one for each of {self.num_envs} episodes."
             )
-        if seed is None or isinstance(seed, int):
-            first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-            seeds: Sequence[int | None] = [first + n for n in range(self.num_envs)]
-        else:
-            seeds = seed
         for number in np.flatnonzero(mask).tolist():
             chosen = seeds[number]
-            chosen = int(np.random.default_rng().integers(2**31)) if chosen is None else chosen
             start = start_of(self.backend, self.actions, seed=chosen, options=starts[number])
             self._running[number] = Running(self.backend, self.actions, start)
         self._ended[mask] = False
         return self._observations(), self._infos([running.info() for running in self.running])
+
+    def _seeds(self, seed: SupportsIndex | Sequence[SupportsIndex | None] | None) -> list[int]:
+        """Return the seed of each episode; those that are not given follow from the last given."""
+        several = isinstance(seed, Sequence)
+        given = [None if n is None else operator.index(n) for n in (seed if several else [seed])]
+        known = [number for number in given if number is not None]
+        for number in known:
+            check_seed(number, name="seed")
+        super().reset(seed=known[0] if known else None)
+        seeds = [int(self.np_random.integers(2**31)) if n is None else n for n in given]
+        return seeds if several else [seeds[0] + number for number in range(self.num_envs)]
 
     def step(self, actions: Float[np.ndarray, "n d"]) -> Result:
         """Move each episode to a row in a straight line, over a whole chunk."""
@@ -128,7 +135,8 @@ class WorldVectorEnv(VectorEnv):
     ) -> Result:
         """Simulate k rows in each episode as one batch (`WorldEnv.chunk_step`).
 
-        All actions are checked before any episode is changed. An ended episode must be reset first.
+        If an action is refused or a step fails, no episode is changed. An ended episode must be
+        reset first.
         """
         if len(actions) != self.num_envs:
             raise InputError(
@@ -144,13 +152,22 @@ class WorldVectorEnv(VectorEnv):
             running.chunk(rows, prompt=prompt)
             for running, rows, prompt in zip(self.running, actions, texts, strict=True)
         ]
-        steps, infos = zip(*self._threads.map(Running.advance, self.running, chunks), strict=True)
+        made = [
+            self._threads.submit(running.simulate, chunk)
+            for running, chunk in zip(self.running, chunks, strict=True)
+        ]
+        wait(made)
+        steps, known = zip(*(future.result() for future in made), strict=True)
         results = [
             reward(Outcome(first=running.start.state, step=step))
             for running, reward, step in zip(self.running, self._rewards, steps, strict=True)
         ]
-        for info, result in zip(infos, results, strict=True):
-            info["success"] = result.success
+        infos = [
+            {**running.advance(chunk, step), **facts, "success": result.success}
+            for running, chunk, step, facts, result in zip(
+                self.running, chunks, steps, known, results, strict=True
+            )
+        ]
         rewards = np.array([result.reward for result in results])
         terminated = np.array([result.terminated for result in results])
         chunks_done = np.array([running.chunks for running in self.running])

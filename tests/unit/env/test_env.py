@@ -148,3 +148,24 @@ def test_an_ended_episode_must_be_reset_alone():
         envs.chunk_step(rows)
     envs.reset(seed=5, options={"reset_mask": np.array([True, True])})
     envs.chunk_step(rows)
+
+
+def test_a_refused_action_of_one_episode_changes_none():
+    envs = WorldVectorEnv(painted(), 2, actions=ActionSpec(camera=True, camera_reach=(5.0, 1.0)))
+    envs.reset(seed=0)
+    rows = np.stack([envs.actions.rest[None]] * 2)
+    rows[1, 0, 7] = 4.0  # meters in one frame
+    with pytest.raises(InputError, match="camera moves at"):
+        envs.chunk_step(np.repeat(rows, 4, axis=1) * 1.0)
+    assert [running.chunks for running in envs.running] == [0, 0]
+
+
+def test_a_seeded_vector_environment_repeats_its_later_resets():
+    seeds = []
+    for _ in range(2):
+        envs = WorldVectorEnv(painted(), 2)
+        envs.reset(seed=np.int64(3))
+        envs.reset(options={"reset_mask": np.array([False, True])})
+        seeds.append([running.start.seed for running in envs.running])
+    assert seeds[0] == seeds[1]
+    assert seeds[0][0] == 3
