@@ -13,7 +13,7 @@ the clip before. Followed: `lerobot` 0.4.4, `datasets/lerobot_dataset.py`, `data
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -79,6 +79,7 @@ class _Totals:
     tasks: dict[str, int] = field(default_factory=dict)
     episodes: list[dict[str, Any]] = field(default_factory=list)
     frames: int = 0
+    sizes: set[tuple[int, ...]] = field(default_factory=set)
 
 
 def check_new(folder: Path) -> None:
@@ -92,7 +93,7 @@ def check_new(folder: Path) -> None:
 
 def write_lerobot(
     folder: Path,
-    episodes: Sequence[Sequence[ClipRecord]],
+    episodes: Iterable[Iterable[ClipRecord]],
     *,
     names: Sequence[str],
     fps: int,
@@ -100,6 +101,7 @@ def write_lerobot(
 ) -> None:
     """Write a dataset, complete or absent; `names` are those of the numbers of a row.
 
+    One clip after the other is taken from `episodes` and written.
     Raises `InputError` if there is nothing to write, if clips differ in size, if the folder holds
     files, or without pyarrow.
     """
@@ -109,13 +111,6 @@ def write_lerobot(
             "A LeRobot dataset is written by pyarrow, which is not installed: pip install "
             "'egosim-jax[video]'."
         )
-    sizes = {clip.frames.shape[1:3] for clips in episodes for clip in clips}
-    if len(sizes) != 1 or not all(episodes):
-        raise InputError(
-            f"The episodes have clips of the sizes {sorted(sizes)}: a dataset needs at least one "
-            "clip in each episode, all of one size. Export them separately."
-        )
-    ((height, width),) = sizes
     statistics = {
         IMAGE: _Statistics((3, 1, 1)),
         STATE: _Statistics((len(names),)),
@@ -125,39 +120,52 @@ def write_lerobot(
     with atomic_folder(folder) as temporary:
         for clips in episodes:
             _write_episode(temporary, clips, totals, statistics, fps)
+        if not totals.episodes:
+            raise InputError("There are no episodes: a dataset needs at least one. Record one.")
         _write_meta(temporary, totals, statistics, fps=fps, robot_type=robot_type,
-                    size=(height, width), names=names)  # fmt: skip
+                    names=names)  # fmt: skip
 
 
-def _steps(clips: Sequence[ClipRecord]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, str]]:
+def _steps(
+    clips: Iterable[ClipRecord], totals: _Totals
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, str]]:
     """Yield frame, row, next row and prompt; the last frame of all holds its row."""
-    for clip in clips:
-        for frame, row, following in zip(clip.frames, clip.rows[:-1], clip.rows[1:], strict=False):
-            yield frame, row, following, clip.prompt
-    last = clips[-1]
+    last = None
+    for last in clips:
+        totals.sizes.add(last.frames.shape[1:3])
+        if len(totals.sizes) > 1:
+            raise InputError(
+                f"The episodes have clips of the sizes {sorted(totals.sizes)}: all must have one "
+                "size. Export them separately."
+            )
+        for frame, row, following in zip(last.frames, last.rows[:-1], last.rows[1:], strict=False):
+            yield frame, row, following, last.prompt
+    if last is None:
+        raise InputError("An episode has no clip: it needs at least one. Remove it.")
     yield last.frames[-1], last.rows[-1], last.rows[-1], last.prompt
 
 
 def _write_episode(
     folder: Path,
-    clips: Sequence[ClipRecord],
+    clips: Iterable[ClipRecord],
     totals: _Totals,
     statistics: dict[str, _Statistics],
     fps: int,
 ) -> None:
-    number, steps = len(totals.episodes), list(_steps(clips))
-    pictures = [frame for frame, *_ in steps]
-    states, actions = (np.stack([step[i] for step in steps]).astype(np.float32) for i in (1, 2))
+    number, pictures, steps = len(totals.episodes), [], []
+    for frame, *step in _steps(clips, totals):
+        statistics[IMAGE].add(frame.reshape(-1, 3) / 255)
+        pictures.append({"bytes": _png(frame), "path": None})
+        steps.append(step)
+    states, actions = (np.stack([step[i] for step in steps]).astype(np.float32) for i in (0, 1))
     prompts = [prompt for *_, prompt in steps]
     for prompt in prompts:
         totals.tasks.setdefault(prompt, len(totals.tasks))
-    for frame in pictures:
-        statistics[IMAGE].add(frame.reshape(-1, 3) / 255)
     statistics[STATE].add(states.astype(float))
     statistics[ACTION].add(actions.astype(float))
     count, first = len(steps), totals.frames
     columns = {
-        IMAGE: [{"bytes": _png(frame), "path": None} for frame in pictures],
+        IMAGE: pictures,
         STATE: list(states),
         ACTION: list(actions),
         "timestamp": (np.arange(count) / fps).astype(np.float32),
@@ -211,7 +219,6 @@ def _write_meta(
     *,
     fps: int,
     robot_type: str,
-    size: tuple[int, int],
     names: Sequence[str],
 ) -> None:
     """Write description, statistics, tasks and places of the episodes."""
@@ -221,6 +228,7 @@ def _write_meta(
     frames = totals.frames
     stats = {key: found.result(frames) for key, found in statistics.items()}
     write_json(folder / "meta/stats.json", stats)
+    (size,) = totals.sizes
     vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
     picture = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
     own = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}

@@ -68,28 +68,26 @@ def _recorded(path: Path) -> GeneratedWorld:
 def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
     """Write a LeRobot dataset with an episode for each stretch between resets."""
     names = {session.actions.names for session in sessions}
-    rates = {session.backend.video.fps for session in sessions}
-    if len(names) > 1 or len(rates) > 1:
+    videos = {session.backend.video for session in sessions}
+    if len(names) > 1 or len(videos) > 1:
         raise InputError(
-            f"The sessions have {len(names)} kinds of actions and {len(rates)} frame rates: a "
-            "dataset has one. Export them separately. (--session)"
+            f"The sessions have {len(names)} kinds of actions and clips of {len(videos)} sizes or "
+            "rates: a dataset has one. Export them separately. (--session)"
         )
-    episodes = [
-        [
-            ClipRecord(
-                frames=session.repeat(number).frames,
-                rows=session.rows(number),
-                prompt=session.action(number).prompt,
-            )
-            for number in steps
-        ]
-        for session in sessions
-        for _, steps in session.runs()
-    ]
+    episodes = (_clips(session, steps) for session in sessions for _, steps in session.runs())
     kind = "gripper" if sessions[0].actions.kind == "robot" else "human_hands"
     write_lerobot(
-        folder, episodes, names=sessions[0].actions.names, fps=rates.pop(), robot_type=kind
+        folder, episodes, names=sessions[0].actions.names, fps=videos.pop().fps, robot_type=kind
     )
+
+
+def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
+    for number in steps:
+        yield ClipRecord(
+            frames=session.repeat(number).frames,
+            rows=session.rows(number),
+            prompt=session.action(number).prompt,
+        )
 
 
 def _steps(session: Session) -> Iterator[tuple[int, SceneState, View, Any]]:
