@@ -60,7 +60,7 @@ def painted(perception=None, pause=0.0):
 def main():
     """Serve the painted world with perception."""
     from egosim_jax.serving.metrics import Metrics
-    from egosim_jax.serving.server import serve
+    from egosim_jax.serving.server import bind, serve
     from egosim_jax.serving.service import Service
     from egosim_jax.serving.store import Limits, Store
 
@@ -74,7 +74,7 @@ def main():
     def ready(port):
         print(f"http://127.0.0.1:{port}", flush=True)
 
-    serve(service, host="127.0.0.1", port=0, token=None, ready=ready)
+    serve(service, bind("127.0.0.1", 0, token=None), token=None, ready=ready)
     service.store.close()
 
 

@@ -70,19 +70,15 @@ class Serve:
         check_counts({"--batch": self.batch, "--steps": self.steps, "--threads": self.threads})
         if not 0 <= self.port < 1 << 16:
             raise InputError(f"--port must be from 0 to 65535, not {self.port}.")
-        from egosim_jax.serving.server import is_loopback, serve
+        from egosim_jax.serving.server import bind, serve
 
-        token = os.environ.get(TOKEN) or None
-        if not is_loopback(self.host) and token is None:
-            raise InputError(
-                f"{self.host} can be reached from other machines: the server needs a token to "
-                f"listen on it. Set {TOKEN}, or listen on 127.0.0.1. (--host)"
-            )
-        service = self._service()
-        try:
-            serve(service, host=self.host, port=self.port, token=token, ready=self._ready)
-        finally:
-            service.store.close()
+        token = os.environ.get(TOKEN, "").strip() or None
+        with bind(self.host, self.port, token=token) as bound:
+            service = self._service()
+            try:
+                serve(service, bound, token=token, ready=self._ready)
+            finally:
+                service.store.close()
         return ExitCode.DONE
 
     def _service(self) -> Service:

@@ -8,6 +8,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.start import Start
+from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.perception import registry
 from egosim_jax.simulator import Simulator, VideoGenerator
 from egosim_jax.types import VideoSpec, check_seed
@@ -25,6 +26,10 @@ class Backend(Protocol):
 
     needs_past: ClassVar[bool]
     """Simulators depend on the actions since the seed."""
+
+    def identity(self) -> dict[str, str]:
+        """Return what the clips depend on, by name; equal worlds continue each other's sessions."""
+        ...
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
         """Return the start of a seed's episode."""
@@ -47,6 +52,15 @@ class GeneratedWorld:
     """Perception that updates the state, by name with its options; None keeps the first state."""
 
     needs_past: ClassVar[bool] = False
+
+    def identity(self) -> dict[str, str]:
+        """Return the size of the clips, perception, and content hash of the generator."""
+        return {
+            "world": "generated",
+            "video": str(self.video),
+            "perception": str(self.perception),
+            "generator": fingerprint(self.generator),
+        }
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
         """Return a scene of the tabletop world with its first camera."""

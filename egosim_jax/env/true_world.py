@@ -45,6 +45,10 @@ class TrueWorld:
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
 
+    def identity(self) -> dict[str, str]:
+        """Return the size of the clips: all else is fixed."""
+        return {"world": "true", "video": str(self.video)}
+
     def start(self, seed: int, spec: ActionSpec) -> Start:
         """Return the scene of a seed with its first camera."""
         return tabletop_start(seed, spec, self.video)

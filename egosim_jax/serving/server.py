@@ -11,9 +11,10 @@ import asyncio
 import hmac
 import ipaddress
 import json
+import socket
 import threading
 from typing import Annotated, Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 import uvicorn
 from fastapi import Body, FastAPI, Path, WebSocket, WebSocketDisconnect
@@ -23,9 +24,9 @@ from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from egosim_jax.io.untrusted import quote_text
+from egosim_jax.io.untrusted import quote, quote_text
 from egosim_jax.serving import wire
-from egosim_jax.serving.errors import RequestError, as_request_error
+from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.service import Service
 from egosim_jax.types import InputError
 
@@ -53,22 +54,19 @@ class Guard:
             return await _refuse(error, scope, receive, send)
         if scope["type"] == "websocket":
             return await self._app(scope, receive, send)
-        try:
-            await self._app(scope, self._bounded(receive), send)
-        except _TooLargeError:
-            await _refuse(_too_large(self._limit), scope, receive, send)
+        await self._app(scope, self._bounded(receive), send)
 
     def _check(self, connection: HTTPConnection) -> None:
         headers, path = connection.headers, connection.scope["path"]  # url contains the Host header
         host, origin = headers.get("host", ""), headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and _address(origin).netloc != host:
             raise RequestError(
                 403,
                 "wrong_origin",
                 "The request comes from a page of another origin, which may not use this server. "
                 "Use a client of your own.",
             )
-        if self._token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        if self._token is None and not is_loopback(_address(f"//{host}").hostname or ""):
             raise RequestError(
                 403,
                 "wrong_host",
@@ -78,7 +76,7 @@ class Guard:
         if self._token is not None and path not in OPEN_PATHS:
             scheme, _, given = headers.get("authorization", "").partition(" ")
             valid = hmac.compare_digest(given.strip().encode(), self._token.encode())
-            if scheme not in ("Bearer", "Api-Key") or not valid:
+            if scheme.lower() not in ("bearer", "api-key") or not valid:
                 raise RequestError(
                     401,
                     "wrong_token",
@@ -97,14 +95,19 @@ class Guard:
             message = await receive()
             total += len(message.get("body", b""))
             if total > self._limit:
-                raise _TooLargeError
+                raise HTTPException(413)
             return message
 
         return bounded
 
 
-class _TooLargeError(Exception):
-    pass
+def _address(url: str) -> SplitResult:
+    try:
+        return urlsplit(url)
+    except ValueError:
+        raise RequestError(
+            400, "invalid", f"{quote(url)} in Host or Origin is not a valid address. Send one."
+        ) from None
 
 
 def _too_large(limit: int) -> RequestError:
@@ -147,10 +150,6 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
     app = FastAPI(title="egosim_jax", version=service.describe()["version"])
     app.add_middleware(Guard, token=token)
 
-    @app.exception_handler(RequestError)
-    async def refused(_: Any, error: RequestError) -> JSONResponse:
-        return _response(error)
-
     @app.exception_handler(RequestValidationError)
     async def invalid(_: Any, error: RequestValidationError) -> JSONResponse:
         found = error.errors()[0]
@@ -161,14 +160,20 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
         )
 
     @app.exception_handler(HTTPException)
-    async def unknown(_: Any, error: HTTPException) -> JSONResponse:
+    async def refused(_: Any, error: HTTPException) -> JSONResponse:
+        if error.status_code == 413:
+            return _response(_too_large(wire.MAX_BYTES))
+        code = "unknown_path" if error.status_code in (404, 405) else "invalid"
         message = f"{error.detail}: /openapi.json lists the paths and methods of this server."
-        return _response(RequestError(error.status_code, "unknown_path", message))
+        return _response(RequestError(error.status_code, code, message))
 
     async def call(name: str, fields: dict[str, Any]) -> JSONResponse:
         """Reply to a request of HTTP."""
         with service.active():
-            reply = await service.handle({**_from_json(fields), "request": name})
+            try:
+                reply = await service.handle({**_from_json(fields), "request": name})
+            except Exception as error:
+                return _response(service.refused(error))
             return JSONResponse(wire.to_json(reply))
 
     @app.get("/healthz", summary="The process is up")
@@ -237,9 +242,7 @@ def _from_json(fields: dict[str, Any]) -> dict[str, Any]:
     try:
         return {**fields, "episode": base64.b64decode(episode, validate=True)}
     except binascii.Error as error:
-        raise as_request_error(InputError("episode must be the bytes of a .zip in Base64.")) from (
-            error
-        )
+        raise InputError("episode must be the bytes of a .zip in Base64.") from error
 
 
 async def _converse(socket: WebSocket, service: Service) -> None:
@@ -267,8 +270,7 @@ async def _reply(socket: WebSocket, service: Service, data: bytes | None) -> Non
             raise InputError("The message is text: it must be binary, packed as MessagePack.")
         reply = await service.handle(wire.unpack(data, limit=wire.MAX_BYTES))
     except Exception as error:
-        found = as_request_error(error)
-        await socket.send_text(json.dumps(found.body()))
+        await socket.send_text(json.dumps(service.refused(error).body()))
         return
     await socket.send_bytes(wire.pack(reply))
 
@@ -293,17 +295,34 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
 
-def serve(service: Service, *, host: str, port: int, token: str | None, ready: Any = None) -> None:
-    """Serve until SIGTERM or Ctrl-C; `ready` is called with the port that is listened on."""
+def bind(host: str, port: int, *, token: str | None) -> socket.socket:
+    """Return a socket that is bound to an address and listens once it is served; 0 is a free port.
+
+    Raises `InputError` if the port is in use, or for another address than the loopback's without a
+    token.
+    """
     if not is_loopback(host) and not token:
         raise InputError(
             f"{host} can be reached from other machines: the server needs a token to listen on it. "
             "Set EGOSIM_TOKEN, or listen on 127.0.0.1. (--host)"
         )
+    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        raise InputError(
+            f"{host}:{port} cannot be listened on ({error.strerror}): address and port must be "
+            "of this machine and free. Choose another port, 0 for any free one. (--port)"
+        ) from error
+    return bound
+
+
+def serve(service: Service, bound: socket.socket, *, token: str | None, ready: Any = None) -> None:
+    """Serve until SIGTERM or Ctrl-C; `ready` is called with the port that is listened on."""
     config = uvicorn.Config(
         make_app(service, token=token),
-        host=host,
-        port=port,
         log_level="warning",
         access_log=False,
         ws="websockets-sansio",
@@ -316,11 +335,11 @@ def serve(service: Service, *, host: str, port: int, token: str | None, ready: A
     server = _Server(config, service)
 
     async def run() -> None:
-        listening = asyncio.create_task(server.serve())
-        while not server.started and not listening.done():
+        running = asyncio.create_task(server.serve([bound]))
+        while not server.started and not running.done():
             await asyncio.sleep(0.02)
         if server.started and ready is not None:
-            ready(server.servers[0].sockets[0].getsockname()[1])
-        await listening
+            ready(bound.getsockname()[1])
+        await running
 
     asyncio.run(run())

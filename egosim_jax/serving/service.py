@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator, Mapping
+import traceback
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib import metadata
 from typing import Any, TypeVar
 
@@ -74,12 +76,13 @@ class Service:
                 self._active -= 1
                 self._quiet.notify_all()
 
-    async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply to a request. Raises `RequestError`."""
-        try:
-            return await self._handle(message)
-        except Exception as error:
-            raise as_request_error(error) from error
+    def refused(self, error: Exception) -> RequestError:
+        """Count the error of a request and return it for the client; log a defect of the server."""
+        found = as_request_error(error)
+        if found is not error and found.code == "internal":
+            traceback.print_exception(error)
+        self.store.metrics.refused.labels(found.code).inc()
+        return found
 
     def drain(self, timeout_s: float) -> bool:
         """Refuse new work; return True when no request is under way any more."""
@@ -87,14 +90,15 @@ class Service:
         with self._quiet:
             return self._quiet.wait_for(lambda: not self._active, timeout_s)
 
-    async def _handle(self, message: Any) -> dict[str, Any]:
+    async def handle(self, message: Any) -> dict[str, Any]:
+        """Return the reply to a request. Raises what `refused` returns for the client."""
         name, request = _parsed(message)
         observe = _observe(request.get("observe", ["frames"]))
         store = self.store
         if name == "status":
             return self.status(request)
         if name == "create":
-            session = await self._thread(lambda: store.create(request))
+            session = await self._wait(store.submit(lambda: store.create(request)))
             low, high = session.actions.bounds
             spec = {**vars_of(session.actions), "names": list(session.actions.names)}
             reply = await self._reply(session, session.result, observe)
@@ -142,11 +146,8 @@ class Service:
                 "timeout",
                 f"The request has taken more than {timeout:g} s, the longest that a client waits: "
                 "it continues. Ask for the status, or send the same step_id again.",
-                retry_after_s=timeout,
+                retry_after_s=1.0,
             ) from None
-
-    async def _thread(self, run: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(None, run)
 
     async def _reply(
         self, session: Session, result: Result, observe: tuple[str, ...]
@@ -166,7 +167,8 @@ class Service:
             found["state"] = {name: getattr(result.state, name) for name in names}
         if "depth" in observe:
             simulator = session.backend.simulator(session.now)
-            view = await self._thread(lambda: view_of(simulator, result.state, result.camera))
+            render = partial(view_of, simulator, result.state, result.camera)
+            view = await self._wait(self.store.submit(render, bounded=False))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
 
@@ -193,7 +195,7 @@ def _parsed(message: Any) -> tuple[str, Mapping[str, Any]]:
 
 def _observe(names: Any) -> tuple[str, ...]:
     given = names if isinstance(names, list | tuple) else [names]
-    if unknown := [name for name in given if name not in OBSERVATIONS]:
+    if unknown := [n for n in given if not (isinstance(n, str) and n in OBSERVATIONS)]:
         raise InputError(
             f"observe has {quote(unknown[0])}: it must be a list of {', '.join(OBSERVATIONS)}."
         )

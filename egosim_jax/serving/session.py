@@ -2,6 +2,7 @@
 
     session.json              settings; closed.json once it is closed and kept
     starts/N/                 start after committed step N, where a reset or load chose one
+    starts/first/             first start, if a reset before the first step has replaced it in 0
     steps/N/request.json      row of each frame, prompt and hash of a step's request
     steps/N/action.npz        cameras and joints; the step is accepted when both are there
     steps/N/rollout/          journal, clip and state (rollout.py)
@@ -25,12 +26,12 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from egosim_jax.env.actions import ActionSpec
+from egosim_jax.env.actions import ActionSpec, numbers
 from egosim_jax.env.backends import Backend
 from egosim_jax.env.batching import announced
 from egosim_jax.env.chunks import Chunk, last_camera, make_chunk, validity, view_of
 from egosim_jax.env.start import Start
-from egosim_jax.episode import Episode, check_action, load_action, save_action
+from egosim_jax.episode import check_action, load_action, save_action
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import quote, quote_path, read_json
@@ -41,6 +42,7 @@ from egosim_jax.types import Action, Cameras, InputError, SceneState
 
 SETTINGS, CLOSED = "session.json", "closed.json"
 INFO, REQUEST, ACTION = "info.json", "request.json", "action.npz"
+FIRST = "first"
 
 
 @no_type_check
@@ -81,7 +83,12 @@ class Session:
     @classmethod
     def create(cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start) -> Session:
         """Write the folder of a new session and open it; after an error there is no folder."""
-        settings = {"actions": vars_of(actions), "video": backend.video, "seed": start.seed}
+        settings = {
+            "actions": vars_of(actions),
+            "video": backend.video,
+            "seed": start.seed,
+            "world": backend.identity(),
+        }
         try:
             start.save(folder / "starts" / "0")
             write_json(folder / SETTINGS, settings)
@@ -272,9 +279,17 @@ class Session:
         """Continue from another start; step numbers continue. A refused one changes nothing."""
         result = self._opening(start)
         self._drop(self.committed + 1)
+        first = self.folder / "starts" / FIRST
+        if not self.committed and not first.exists():
+            self.first().save(first)
         start.save(self.folder / "starts" / str(self.committed))
         self.now, self.result = start, result
         return result
+
+    def first(self) -> Start:
+        """Return the start with which the session was created."""
+        first = self.folder / "starts" / FIRST
+        return Start.load(first if first.exists() else self.folder / "starts" / "0")
 
     @property
     def saved(self) -> list[str]:
@@ -309,16 +324,6 @@ class Session:
         """Return the row of each frame of a committed step."""
         return np.array(read_json(self._step(number) / REQUEST)["rows"], float)
 
-    def episode(self) -> Episode:
-        """Return the steps since the last reset as an episode."""
-        *_, (start, steps) = self.runs()
-        return Episode(
-            state=start.state,
-            actions=tuple(map(self.action, steps)),
-            fps=self.backend.video.fps,
-            first_frame=start.first_frame,
-        )
-
 
 def settings_of(folder: Path) -> dict[str, Any]:
     """Return the settings of a session's folder. Raises `InputError` if they are damaged."""
@@ -329,16 +334,26 @@ def settings_of(folder: Path) -> dict[str, Any]:
     return settings
 
 
+def check_world(folder: Path, backend: Backend) -> None:
+    """Raise `InputError` if a session was recorded in another world, which cannot continue it."""
+    recorded = settings_of(folder).get("world")
+    if not isinstance(recorded, dict):  # of a version that did not record it
+        return
+    for name, value in backend.identity().items():
+        if recorded.get(name) != value:
+            raise InputError(
+                f"The {name} of the session is {quote(recorded.get(name))}, of this server "
+                f"{quote(value)}: they must be equal. Start egosim serve with the options that it "
+                "was made with, or create a new session."
+            )
+
+
 def request_hash(rows: object, prompt: str | None) -> str:
-    """Return the hash by which a repeated request is recognized; of no numbers, none."""
-    return fingerprint((np.asarray(rows, float), prompt)) if _is_numbers(rows) else ""
+    """Return the hash by which a repeated request is recognized.
 
-
-def _is_numbers(rows: object) -> bool:
-    try:
-        return np.asarray(rows).dtype.kind in "biuf"
-    except ValueError:
-        return False
+    Raises `InputError` for rows that are no numbers.
+    """
+    return fingerprint((numbers(rows), prompt))
 
 
 def vars_of(actions: ActionSpec) -> dict[str, Any]:
@@ -368,13 +383,16 @@ def spec_of(fields: Mapping[str, Any]) -> ActionSpec:
             "The actions need sides, a list of 'left' and 'right', camera, true or false, "
             "workspace_m, two corners of three numbers in meters, and camera_reach, two numbers."
         )
-    numbers: Any = {
+    bounds: Any = {
         "workspace_m": tuple(tuple(map(float, corner)) for corner in corners),
         "camera_reach": tuple(map(float, reach)),
     }
     layout: Any = given["layout"]
-    return ActionSpec(layout=layout, sides=tuple(given["sides"]), camera=given["camera"], **numbers)
+    return ActionSpec(layout=layout, sides=tuple(given["sides"]), camera=given["camera"], **bounds)
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:
-    return np.shape(value) if _is_numbers(value) else None
+    try:
+        return numbers(value).shape
+    except InputError:
+        return None

@@ -13,9 +13,11 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, TypeVar
 
+from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import Backend
 from egosim_jax.env.start import Start, check_size
 from egosim_jax.episode import Episode
@@ -23,14 +25,24 @@ from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import quote
 from egosim_jax.serving.errors import RequestError, as_request_error
 from egosim_jax.serving.metrics import Metrics
-from egosim_jax.serving.session import CLOSED, SETTINGS, Result, Session, request_hash, spec_of
-from egosim_jax.types import InputError, check_counts, check_seed
+from egosim_jax.serving.session import (
+    CLOSED,
+    SETTINGS,
+    Result,
+    Session,
+    check_world,
+    request_hash,
+    spec_of,
+)
+from egosim_jax.types import InputError, check_counts
 
 T = TypeVar("T")
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 """Names of sessions and of what is saved."""
 UNFINISHED = re.compile(r"starts|\.session\..*")
 """Names that a crash during the creation of a session leaves in its folder."""
+MOST_SEED = 2**63 - 1_000_000
+"""Largest seed of a session, so that those of its steps are valid, too."""
 REMOVED = ".removed-{}"
 """Name of the folder of a session while it is removed."""
 
@@ -68,6 +80,7 @@ class Store:
         self.sessions: dict[str, Session] = {}
         self.damaged: dict[str, str] = {}
         self.draining = False
+        self._reserved: set[str] = set()
         self._changing = threading.Lock()
         self._queued = 0
         self._threads = ThreadPoolExecutor(limits.threads, thread_name_prefix="step")
@@ -81,6 +94,7 @@ class Store:
             shutil.rmtree(path, ignore_errors=True)
         for path in sorted(self.folder.glob(f"*/{SETTINGS}")):
             try:
+                check_world(path.parent, self.backend)
                 session = Session(path.parent, self.backend)
                 number = session.committed + 1
                 key = (number, session.request(number)) if session.pending else None
@@ -90,7 +104,7 @@ class Store:
                 continue
             self.sessions[session.id] = session
             if key is not None:
-                session.flight = key, self.submit(session, session.finish, bounded=False)
+                session.flight = key, self.submit(session.finish, changes=session, bounded=False)
         self.metrics.sessions.set(len(self.sessions))
 
     def close(self) -> None:
@@ -121,44 +135,65 @@ class Store:
         """Create a session of a seed or episode, with the id that is asked for or a new one."""
         self._check_open()
         actions = spec_of(_mapping(request.get("actions", {}), "actions"))
-        start = self._start(request, actions)
-        name = request.get("session", secrets.token_hex(8))
+        name = check_name(request.get("session", secrets.token_hex(8)), "session")
+        folder = self._reserve(name)
+        try:
+            start = self._start(request, actions)
+            session = Session.create(folder, self.backend, actions, start)
+            with self._changing:
+                self.sessions[name] = session
+                self.metrics.sessions.set(len(self.sessions))
+        finally:
+            with self._changing:
+                self._reserved.remove(name)
+        return session
+
+    def _reserve(self, name: str) -> Path:
+        """Return the folder of a new session, which nobody else can create meanwhile."""
         with self._changing:
-            if len(self.sessions) >= self.limits.sessions:
+            count = len(self.sessions.keys() | self._reserved)
+            if count >= self.limits.sessions:
                 raise RequestError(
                     429,
                     "too_many_sessions",
-                    f"{len(self.sessions)} sessions are open, the most of this server is "
+                    f"{count} sessions are open, the most of this server is "
                     f"{self.limits.sessions}. Close one, or try again later.",
                     retry_after_s=5.0,
                 )
-            folder = self.folder / check_name(name, "session")
-            if folder.is_dir() and all(UNFINISHED.fullmatch(p.name) for p in folder.iterdir()):
+            folder = self.folder / name
+            taken = name in self.sessions or name in self._reserved
+            if not taken and folder.is_dir() and _is_unfinished(folder):
                 shutil.rmtree(folder)
-            if name in self.sessions or folder.exists():
+            if taken or folder.exists():
                 raise RequestError(
                     409,
                     "session_exists",
                     f"There is a session {quote(name)} already: choose another id, or none for a "
                     "new one.",
                 )
-            session = Session.create(folder, self.backend, actions, start)
-            self.sessions[session.id] = session
-            self.metrics.sessions.set(len(self.sessions))
-        return session
+            self._reserved.add(name)
+        return folder
 
-    def _start(self, request: Mapping[str, Any], actions: Any) -> Start:
-        """Return the start that a request chooses: `seed`, or the bytes of an `episode`."""
-        seed, prompt = request.get("seed", 0), request.get("prompt")
-        if isinstance(seed, bool) or not isinstance(seed, int):
-            raise InputError(f"seed is {quote(seed)}: it must be a whole number from 0.")
-        check_seed(seed, name="seed")
-        if prompt is not None and not (isinstance(prompt, str) and len(prompt) <= 2000):
-            raise InputError(f"prompt is {quote(prompt)}: it must be a text of at most 2000.")
+    def _start(
+        self,
+        request: Mapping[str, Any],
+        actions: ActionSpec,
+        default: Callable[[], Start] | None = None,
+    ) -> Start:
+        """Return the start that a request chooses: `seed`, or the bytes of an `episode`.
+
+        Without either it is the default, by default that of seed 0.
+        """
+        prompt = _prompt(request)
+        seed = 0 if (chosen := request.get("seed")) is None else _whole(chosen, "seed")
+        if not 0 <= seed <= MOST_SEED:
+            raise InputError(f"seed is {quote(seed)}: it must be from 0 to {MOST_SEED}.")
         if (data := request.get("episode")) is not None:
             if not isinstance(data, bytes):
                 raise InputError(f"episode is {quote(data)}: it must be the bytes of a .zip.")
             start = Start.of(Episode.from_bytes(data), seed=seed)
+        elif chosen is None and default is not None:
+            start = default()
         else:
             start = self.backend.start(seed, actions)
         check_size(start, self.backend.video)
@@ -167,14 +202,12 @@ class Store:
     def step(self, request: Mapping[str, Any]) -> Future[Result]:
         """Queue a step of a session."""
         session = self.get(request.get("session"))
-        step_id, prompt = request.get("step_id"), request.get("prompt")
-        if isinstance(step_id, bool) or not isinstance(step_id, int) or step_id < 1:
+        step_id, prompt = _whole(request.get("step_id"), "step_id"), _prompt(request)
+        if step_id < 1:
             raise InputError(
-                f"step_id is {quote(step_id)}: it must be a whole number, one more than the last "
-                f"committed step. Send {session.committed + 1}."
+                f"step_id is {step_id}: it must be one more than the last committed step. Send "
+                f"{session.committed + 1}."
             )
-        if prompt is not None and not (isinstance(prompt, str) and len(prompt) <= 2000):
-            raise InputError(f"prompt is {quote(prompt)}: it must be a text of at most 2000.")
         if step_id > self.limits.steps:
             raise RequestError(
                 429,
@@ -190,8 +223,8 @@ class Store:
             return flight[1]  # a client that vanished and came back waits for its step
         run = partial(session.step, step_id, rows, prompt)
         if step_id <= session.committed:
-            return self.submit(session, run, exclusive=False)
-        future = self.submit(session, run)
+            return self.submit(run)
+        future = self.submit(run, changes=session)
         session.flight = key, future
         return future
 
@@ -200,11 +233,9 @@ class Store:
         session = self.get(request.get("session"))
 
         def run() -> Result:
-            if "seed" not in request and "episode" not in request:
-                return session.restart(Start.load(session.folder / "starts" / "0"))
-            return session.restart(self._start(request, session.actions))
+            return session.restart(self._start(request, session.actions, session.first))
 
-        return self.submit(session, run)
+        return self.submit(run, changes=session)
 
     def save(self, request: Mapping[str, Any]) -> Future[str]:
         """Queue the saving of a session under a name."""
@@ -223,12 +254,12 @@ class Store:
             session.save(str(name))
             return str(name)
 
-        return self.submit(session, run)
+        return self.submit(run, changes=session)
 
     def load(self, request: Mapping[str, Any]) -> Future[Result]:
         """Queue the return of a session to what it has saved."""
         session, name = self.get(request.get("session")), request.get("name")
-        return self.submit(session, lambda: session.load(check_name(name, "name")))
+        return self.submit(lambda: session.load(check_name(name, "name")), changes=session)
 
     def remove(self, request: Mapping[str, Any]) -> Future[str]:
         """Queue the end of a session, and the removal of its folder unless `keep` is true."""
@@ -250,24 +281,24 @@ class Store:
             shutil.rmtree(removed, ignore_errors=True)
             return session.id
 
-        return self.submit(session, run)
+        return self.submit(run, changes=session)
 
     def submit(
         self,
-        session: Session,
         run: Callable[[], T],
         *,
-        exclusive: bool = True,
+        changes: Session | None = None,
         bounded: bool = True,
     ) -> Future[T]:
-        """Run a request of a session in a thread; a `bounded` one is refused if the queue is full.
+        """Run a request in a thread.
 
-        Of the `exclusive` ones, which change the session, another one must not be under way.
+        A `bounded` one is refused if the queue is full or the server ends, one that `changes` a
+        session if another such one is under way.
         """
-        self._check_open()
+        if bounded:
+            self._check_open()
         with self._changing:
             if bounded and self._queued >= self.limits.queue:
-                self.metrics.refused.labels("queue_full").inc()
                 raise RequestError(
                     429,
                     "queue_full",
@@ -275,20 +306,19 @@ class Store:
                     f"{self.limits.queue}. Send it again later.",
                     retry_after_s=1.0,
                 )
-            if exclusive and not session.busy.acquire(blocking=False):
-                self.metrics.refused.labels("session_busy").inc()
+            if changes is not None and not changes.busy.acquire(blocking=False):
                 raise RequestError(
                     409,
                     "session_busy",
-                    f"Session {session.id} has a request under way: one at a time can change it. "
+                    f"Session {changes.id} has a request under way: one at a time can change it. "
                     "Wait for its reply, then send this one again.",
                     retry_after_s=0.5,
                 )
             self._queued += 1
             self.metrics.queued.set(self._queued)
-        return self._threads.submit(self._run, session, run, exclusive)
+        return self._threads.submit(self._run, run, changes)
 
-    def _run(self, session: Session, run: Callable[[], T], exclusive: bool) -> T:
+    def _run(self, run: Callable[[], T], changes: Session | None) -> T:
         then = time.monotonic()
         try:
             return run()
@@ -296,12 +326,11 @@ class Store:
             found = as_request_error(error)
             if found.code == "internal":
                 traceback.print_exc()
-            self.metrics.refused.labels(found.code).inc()
             raise found from error
         finally:
-            if exclusive:
-                session.flight = None
-                session.busy.release()
+            if changes is not None:
+                changes.flight = None
+                changes.busy.release()
             with self._changing:
                 self._queued -= 1
                 self.metrics.queued.set(self._queued)
@@ -326,6 +355,24 @@ def check_name(name: object, what: str) -> str:
             "with a letter or digit."
         )
     return name
+
+
+def _is_unfinished(folder: Path) -> bool:
+    return all(UNFINISHED.fullmatch(path.name) for path in folder.iterdir())
+
+
+def _whole(value: object, what: str) -> int:
+    """Return a whole number, also one of NumPy's."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InputError(f"{what} is {quote(value)}: it must be a whole number.")
+    return int(value)
+
+
+def _prompt(request: Mapping[str, Any]) -> str | None:
+    prompt = request.get("prompt")
+    if prompt is not None and not (isinstance(prompt, str) and len(prompt) <= 2000):
+        raise InputError(f"prompt is {quote(prompt)}: it must be a text of at most 2000.")
+    return prompt
 
 
 def _mapping(value: object, what: str) -> Mapping[str, Any]:

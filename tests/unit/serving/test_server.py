@@ -1,5 +1,6 @@
 """The server over its sockets, in this process."""
 
+import asyncio
 import http.client as http_client
 import json
 import threading
@@ -17,7 +18,7 @@ from egosim_jax.serving import wire
 from egosim_jax.serving.client import Client
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.metrics import Metrics
-from egosim_jax.serving.server import Guard, _Server, serve
+from egosim_jax.serving.server import Guard, _Server, bind, make_app, serve
 from egosim_jax.serving.service import Service
 from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
@@ -35,8 +36,8 @@ def run(folder, token=None):
         ports.append(port)
         ready.set()
 
-    options = {"host": "127.0.0.1", "port": 0, "token": token, "ready": note}
-    thread = threading.Thread(target=serve, args=(service,), kwargs=options, daemon=True)
+    args, options = (service, bind("127.0.0.1", 0, token=token)), {"token": token, "ready": note}
+    thread = threading.Thread(target=serve, args=args, kwargs=options, daemon=True)
     thread.start()
     assert ready.wait(30)
     return service, ports[0], thread
@@ -125,7 +126,11 @@ def test_health_and_metrics(server):
 
 @pytest.mark.parametrize(
     ("headers", "status"),
-    [({"Origin": "http://evil.example"}, 403), ({"Host": "evil.example"}, 403)],
+    [
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "http://["}, 400),
+        ({"Host": "evil.example"}, 403),
+    ],
 )
 def test_pages_of_other_origins_are_refused(server, headers, status):
     _, port = server
@@ -151,12 +156,30 @@ def test_a_body_too_large_or_no_json_is_refused(server):
         assert json.loads(http(port, path, fields)[1])["code"] == code
 
 
+def test_a_body_that_grows_too_large_is_refused(server):
+    sent = []
+
+    async def receive():
+        return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": "/sessions", "headers": headers}
+    asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
+    assert sent[0]["status"] == 413
+    assert json.loads(sent[1]["body"])["code"] == "too_large"
+
+
 def test_text_and_damaged_messages_are_refused_and_the_connection_stays(server):
     _, port = server
     with Client(f"ws://127.0.0.1:{port}") as client:
         for data in ("text", b"\xc1", wire.pack([1]), wire.pack({"request": "fly"})):
             client._socket.send(data)
             assert json.loads(client._socket.recv())["status"] == 422
+        with pytest.raises(RequestError, match="observe has"):
+            client.request("create", observe=[np.zeros(2)])
         with pytest.raises(RequestError, match="no field 'seeds'"):
             client.request("create", seeds=3)
         assert client.request("status")["draining"] is False
@@ -168,6 +191,7 @@ def test_a_token_is_asked_for(tmp_path):
     assert http(port, "/sessions")[0] == 401
     assert http(port, "/sessions", Authorization="Bearer wrong")[0] == 401
     assert http(port, "/sessions", Authorization=f"Api-Key {TOKEN}")[0] == 200
+    assert http(port, "/sessions", Authorization=f"bearer {TOKEN}")[0] == 200
     with Client(f"ws://127.0.0.1:{port}", token=TOKEN) as client:
         assert client.request("status")["sessions"] == {}
     service.store.close()
@@ -201,9 +225,27 @@ def interrupt():
     raise KeyboardInterrupt
 
 
-def test_another_address_needs_a_token(server):
+def test_another_address_needs_a_token():
     with pytest.raises(InputError, match="needs a token"):
-        serve(server[0], host="0.0.0.0", port=0, token=None)  # noqa: S104
+        bind("0.0.0.0", 0, token=None)  # noqa: S104
+
+
+def test_a_port_in_use_is_refused(server):
+    with pytest.raises(InputError, match="Choose another port"):
+        bind("127.0.0.1", server[1], token=None)
+
+
+def test_a_defect_is_logged_and_counted(server, monkeypatch, capsys):
+    service, port = server
+
+    def fail(request):
+        raise OSError("no space")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(service, "status", fail)
+        assert http(port, "/sessions")[0] == 500
+    assert "no space" in capsys.readouterr().err
+    assert b'egosim_refused_total{code="internal"} 1.0' in http(port, "/metrics")[1]
 
 
 def test_sigterm_drains_then_ends(tmp_path):

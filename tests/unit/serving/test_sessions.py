@@ -8,6 +8,7 @@ import pytest
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.true_world import TrueWorld
+from egosim_jax.episode import Episode
 from egosim_jax.serving import session as session_module
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.metrics import Metrics
@@ -170,6 +171,48 @@ def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
     again.close()
 
 
+def test_rows_of_text_or_huge_numbers_are_refused(store):
+    made = store.create({"seed": 3})
+    for actions in ([["0.1"] * 7], [[10**400] * 7]):
+        with pytest.raises(InputError, match="must be rows of numbers"):
+            step(store, made, 1, actions)
+    assert not made.pending
+    assert step(store, made, np.int64(1)).step_id == 1
+
+
+def test_a_reset_returns_to_the_first_start_and_takes_a_prompt(store):
+    made = store.create({"seed": 3, "session": "one", "prompt": "Wave."})
+    store.reset({"session": "one", "seed": 4}).result()
+    assert made.now.seed == 4
+    store.reset({"session": "one", "episode": None}).result()
+    assert (made.now.seed, made.now.prompt) == (3, "Wave.")
+    store.reset({"session": "one", "prompt": "Clap."}).result()
+    assert (made.now.seed, made.now.prompt) == (3, "Clap.")
+    assert Session(made.folder, store.backend).now.prompt == "Clap."
+
+
+def test_a_session_is_not_continued_in_another_world(store):
+    step(store, store.create({"session": "one"}), 1)
+    store.close()
+    again = Store(store.folder, painted("classical"), Limits(), Metrics())
+    with pytest.raises(RequestError, match="perception of the session is 'None', of this server"):
+        again.get("one")
+    again.close()
+
+
+def test_a_session_that_is_created_counts_before_it_is_there(store, monkeypatch):
+    store.limits = Limits(sessions=1)
+    create = Session.create
+
+    def during(*args):
+        with pytest.raises(RequestError, match="1 sessions are open"):
+            store.create({"session": "two"})
+        return create(*args)
+
+    monkeypatch.setattr(Session, "create", during)
+    assert store.create({"session": "one"}).id == "one"
+
+
 def test_a_reset_and_a_load_continue_the_step_numbers(store):
     session = store.create({"seed": 3})
     first = step(store, session, 1)
@@ -190,8 +233,13 @@ def test_an_episode_of_a_session_can_be_simulated_again(store):
     session = store.create({"seed": 3})
     for number in (1, 2):
         step(store, session, number)
-    episode = session.episode()
-    assert len(episode.actions) == 2
+    ((start, steps),) = session.runs()
+    episode = Episode(
+        state=start.state,
+        actions=tuple(map(session.action, steps)),
+        fps=VIDEO.fps,
+        first_frame=start.first_frame,
+    )
     created = store.create({"seed": 3, "episode": episode.to_bytes()})
     assert created.result.info["state_sha256"] == session.result.info["state_sha256"]
 
@@ -200,13 +248,16 @@ def test_an_episode_of_a_session_can_be_simulated_again(store):
     ("request_", "message"),
     [
         ({"session": "../x"}, "letters, digits"),
-        ({"seed": -1}, "whole number"),
+        ({"seed": -1}, "must be from 0"),
         ({"seed": "7"}, "whole number"),
         ({"actions": {"layout": "feet"}}, "no action layout"),
         ({"actions": {"fingers": 5}}, "no setting 'fingers'"),
         ({"actions": {"workspace_m": [[0, 0, 0], [0, 0, "x"]]}}, "workspace_m"),
         ({"episode": b"PK"}, "not a readable zip"),
         ({"prompt": 5}, "must be a text"),
+        ({"seed": 2**63 - 1}, "must be from 0"),
+        ({"actions": {"camera": True, "camera_reach": [float("nan"), 1]}}, "reach of the camera"),
+        ({"actions": {"sides": ["right", "right"]}}, "one of each"),
     ],
 )
 def test_an_invalid_session_is_refused_and_not_made(store, request_, message):
