@@ -9,7 +9,12 @@ from jaxtyping import UInt8
 
 from egosim_jax.data.clips import write_clips
 from egosim_jax.rendering import Renderer, jitted
-from egosim_jax.types import Action, SceneState, Triplet
+from egosim_jax.rendering.hand_mesh import pose_hands
+from egosim_jax.rendering.mesh import MovingMesh
+from egosim_jax.rendering.mesh_reference import draw_scene
+from egosim_jax.state.ply import has_triangles, read_triangles
+from egosim_jax.state.snapshot import load, read_ply
+from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, check_video
 
 
 def write_conditions(
@@ -38,3 +43,63 @@ def write_conditions(
         first_frame=view.frames[0] if first_frame is None else first_frame,
     )
     return write_clips(Path(folder), [triplet], fps=fps, append=True)
+
+
+Static = tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"]]
+"""Video of a static scene, and its mask: 255 where the scene was not observed."""
+
+
+def static_of(
+    scene: Path, cameras: Cameras, *, renderer: Renderer = jitted, point_px: int = 2
+) -> Static:
+    """Return the video of a static scene: a state's folder, or a PLY of points or triangles."""
+    if scene.suffix == ".ply" and has_triangles(scene):
+        state = read_ply(scene)
+        return draw_scene(state.points_m, read_triangles(scene), state.colors, cameras)
+    state = read_ply(scene) if scene.suffix == ".ply" else load(scene)
+    view = renderer.render(state, cameras, point_px=point_px)
+    return view.frames, view.mask
+
+
+def repeated(target: UInt8[np.ndarray, "f h w 3"]) -> Static:
+    """Return the static video of a fixed camera: the first frame, repeated.
+
+    Hands that the first frame shows stay in it, as in DWM's data of TASTE-Rob.
+    """
+    return np.repeat(target[:1], len(target), axis=0), np.zeros(target.shape[:3], np.uint8)
+
+
+def static_triplet(
+    action: Action,
+    static: Static,
+    *,
+    video_id: str,
+    meshes: MovingMesh | None = None,
+    target: UInt8[np.ndarray, "f h w 3"] | None = None,
+    renderer: Renderer = jitted,
+) -> Triplet:
+    """Return a triplet of DWM: a static scene, hand meshes along the action, and the ground truth.
+
+    The meshes are those of the action's keypoints, which have a left hand before a right one,
+    unless others are given. Raises `InputError` if lengths or sizes disagree.
+    """
+    cameras = action.cameras
+    shape = len(cameras.world_from_camera), cameras.height, cameras.width
+    check_video("The static video", static[0], shape)
+    if target is not None:
+        check_video("The recorded video", target, shape)
+    mesh = pose_hands(action.joints_m) if meshes is None else meshes
+    if len(mesh.vertices_m) != shape[0]:
+        raise InputError(
+            f"The hands have {len(mesh.vertices_m)} frames, the cameras {shape[0]}: both must have "
+            "one for each frame. (--mano-poses)"
+        )
+    return Triplet(
+        video_id=video_id,
+        prompt=action.prompt,
+        prior=static[0],
+        mask=static[1],
+        hands=renderer.draw_mesh(mesh, cameras)[0],
+        first_frame=static[0][0],
+        target=target,
+    )

@@ -31,6 +31,7 @@ from egosim_jax.conditioning.posterior import STD
 from egosim_jax.conditioning.posterior import posterior as moments_of
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.manifest import MANIFEST, read_manifest
+from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.generator import Inputs, batches, targets_of
@@ -319,8 +320,12 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
 
     Compares config, video and the packing of the mask with the manifest in `shards`, and the hashes
     of the encoders with those of the weights folder, in which only the VAE is required; without a
-    folder, hashes are not compared.
+    folder, hashes are not compared. Of a mixture, every part is checked.
     """
+    if (shards / MIXTURE).is_file():
+        for part in read_mixture(shards):
+            check_encoders(part, config, weights)
+        return
     manifest = read_manifest(shards)
     encoders = manifest.provenance.get("encoders")
     if manifest.kind != "latents" or not isinstance(encoders, Mapping) or "vae" not in encoders:

@@ -27,6 +27,7 @@ from jax.experimental import multihost_utils
 
 from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.data.loader import Loader, make_loader
+from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.run import open_folder
@@ -65,7 +66,7 @@ def train(
     settings = {"task": task, "training": training, "weights": digests}
     mutable = [*resume_mutable("training"), *numerics_only(task, "task")]
     open_folder(out, settings, mutable=mutable)
-    mesh, source = make_mesh(training.mesh), ShardReader(data)
+    mesh, source = make_mesh(training.mesh), open_shards(data)
     programs = Programs.of(task, training, mesh)
     if weights is None and jax.tree.leaves(programs.frozen):
         raise InputError("Frozen weights cannot be random: give a weights folder. (--weights)")
@@ -113,7 +114,7 @@ class Run:
         task: Task,
         training: TrainConfig,
         programs: Programs,
-        source: ShardReader,
+        source: ShardReader | Mixture,
         out: Path,
         stack: ExitStack,
     ):
@@ -207,7 +208,7 @@ class Run:
         self.watchdog.rest()
         with (
             self.clock.phase("validate"),
-            closing(self._batches(ShardReader(shards), "validate")) as batches,
+            closing(self._batches(open_shards(shards), "validate")) as batches,
         ):
             rows = [
                 jax.device_get(
@@ -265,7 +266,7 @@ class Run:
         )
         return jax.jit(create, out_shardings=sharding, donate_argnums=0)(loaded)
 
-    def _batches(self, source: ShardReader, use: Use = "train") -> Loader:
+    def _batches(self, source: ShardReader | Mixture, use: Use = "train") -> Loader:
         return make_batches(source, self.task, self.training, self.sharding, use)
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
@@ -276,7 +277,11 @@ class Run:
 
 
 def make_batches(
-    source: ShardReader, task: Task, training: TrainConfig, sharding: Any, use: Use = "train"
+    source: ShardReader | Mixture,
+    task: Task,
+    training: TrainConfig,
+    sharding: Any,
+    use: Use = "train",
 ) -> Loader:
     """Return an iterator over this process's shard of each batch.
 

@@ -13,7 +13,7 @@ import tyro
 from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
-from egosim_jax.cli.triplets import Align, ToDwm
+from egosim_jax.cli.triplets import Align, Mix, Static, ToDwm
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
 from egosim_jax.types import WAN_GRID, VideoGrid, VideoSpec, check_counts
@@ -52,6 +52,13 @@ class Pack:
     For small models, whose training step is shorter than decoding."""
     num_frames: int = 61
     """With a size, number of frames to store of each clip, from the first."""
+    resampling: Literal["first", "stride", "linspace", "rate"] = "first"
+    """With a size, the frames to take.
+
+    first: without gaps; stride: as many frames apart as fit, as DWM's loader; linspace: from
+    the first to the last, as DWM's encoder; rate: at about --fps, as the evaluation of DWM."""
+    fps: int = 8
+    """With --resampling rate, frame rate of the model."""
     shard_megabytes: int = 256
     """Maximum size of a shard file in MiB."""
     overwrite: bool = False
@@ -78,6 +85,7 @@ class Pack:
             overwrite=self.overwrite,
             decoding=self.decoding,
             grid=_grid(self.config),
+            resampling=self.resampling,
         )
         problems = [problem for problem in track(progress, "packing", total=len(items)) if problem]
         for problem in problems:
@@ -88,7 +96,8 @@ class Pack:
     def _spec(self) -> VideoSpec | None:
         if self.size is None:
             return None
-        spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1])
+        rate = {"fps": self.fps} if self.resampling == "rate" else {}
+        spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1], **rate)
         _grid(self.config).check(spec)
         return spec
 
@@ -333,7 +342,9 @@ class Data:
         | Annotated[Look, tyro.conf.subcommand("look")]
         | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Stats, tyro.conf.subcommand("stats")]
+        | Annotated[Static, tyro.conf.subcommand("static")]
         | Annotated[Align, tyro.conf.subcommand("align")]
+        | Annotated[Mix, tyro.conf.subcommand("mix")]
         | Annotated[ToDwm, tyro.conf.subcommand("to-dwm")]
     )
 

@@ -1,12 +1,95 @@
-"""`egosim data align` and `to-dwm`: triplets of a static scene, hands and the recorded video."""
+"""`egosim data static`, `align`, `mix` and `to-dwm`: triplets of static scenes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
+
+if TYPE_CHECKING:
+    from egosim_jax.rendering.mesh import MovingMesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Static:
+    """Make a triplet of DWM: a static scene, hand meshes, and the recorded video if there is one.
+
+    The scene is rendered along the cameras of the action, or is the first frame of the recorded
+    video, repeated, if the camera is fixed. The files are those of `data pack`; other clips of the
+    folder keep their rows in metadata.csv. Prints its path.
+    """
+
+    action: Path
+    """File of cameras and hands, .npz or .json as of `episode make`; hands left before right."""
+    out: Path
+    """Folder of the triplet and of metadata.csv."""
+    video_id: str
+    """Id of the triplet."""
+    height: int
+    """Rows of a frame in pixels, that the intrinsics are of."""
+    width: int
+    """Columns of a frame in pixels."""
+    scene: Path | None = None
+    """Folder of a state, or a .ply of colored points or triangles; none for a fixed camera."""
+    video: Path | None = None
+    """Recorded video, of the length and size of the action."""
+    prompt: str | None = None
+    """Caption, instead of that in the file."""
+    mano_poses: Path | None = None
+    """.npz of the hands as global_orient, hand_pose, translation_m and betas of MANO.
+
+    They replace the meshes of the keypoints."""
+    mano_right: Path | None = None
+    """MANO_RIGHT.pkl from mano.is.tue.mpg.de, which is read without executing it."""
+    mano_left: Path | None = None
+    """MANO_LEFT.pkl; without it, left hands are mirrored right ones."""
+    add_mean: bool = False
+    """Take the poses of MANO as relative to its mean pose."""
+    fps: int = 8
+    """Frame rate of the videos in frames per second."""
+
+    def run(self) -> int:
+        """Read, render and write."""
+        from egosim_jax.cli.episode import read_action
+        from egosim_jax.conditions import repeated, static_of, static_triplet
+        from egosim_jax.data.clips import write_clips
+        from egosim_jax.io.video import read_video
+        from egosim_jax.types import InputError
+
+        action = read_action(self.action, height=self.height, width=self.width, prompt=self.prompt)
+        target = None if self.video is None else read_video(self.video).frames
+        if self.scene is not None:
+            static = static_of(self.scene, action.cameras)
+        elif target is not None:
+            static = repeated(target)
+        else:
+            raise InputError(
+                "There is no scene: give one, or the video of a fixed camera, whose first frame is "
+                "repeated. (--scene, --video)"
+            )
+        triplet = static_triplet(
+            action, static, video_id=self.video_id, meshes=self._meshes(), target=target
+        )
+        print(write_clips(self.out, [triplet], fps=self.fps, append=True))
+        return ExitCode.DONE
+
+    def _meshes(self) -> MovingMesh | None:
+        from egosim_jax.rendering.mano import mano_hands, read_mano, read_poses
+        from egosim_jax.types import InputError
+
+        if self.mano_poses is None and self.mano_right is None and self.mano_left is None:
+            return None
+        if self.mano_poses is None or self.mano_right is None:
+            raise InputError(
+                "Hands of MANO need its model and their poses: give both. (--mano-right, "
+                "--mano-poses)"
+            )
+        left = None if self.mano_left is None else read_mano(self.mano_left)
+        poses, right = read_poses(self.mano_poses), read_mano(self.mano_right)
+        return mano_hands(right, poses, left=left, add_mean=self.add_mean)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,4 +180,36 @@ class ToDwm:
         count = min(len(reader), self.limit or len(reader))
         triplets = track(islice(read_triplets(reader), count), "writing", total=count)
         print(write_folders(self.out, triplets, name=self.name, fps=self.fps))
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mix:
+    """Mix shards by weight for training, such as rendered and recorded ones. Prints the folder.
+
+    The folder holds only the names of the others and their weights; training reads it as
+    `--latents`.
+    """
+
+    shards: tuple[Path, ...]
+    """Folders of shards, with records of one kind and size."""
+    out: Path
+    """Folder of the mixture."""
+    weights: tuple[float, ...] = ()
+    """Share of each folder in the training samples; its number of records if not given."""
+
+    def run(self) -> int:
+        """Check the folders and write the mixture."""
+        from egosim_jax.data.mixing import write_mixture
+        from egosim_jax.data.shards import ShardReader
+        from egosim_jax.types import InputError
+
+        weights = self.weights or tuple(float(len(ShardReader(part))) for part in self.shards)
+        if len(weights) != len(self.shards) or len({*self.shards}) < len(self.shards):
+            raise InputError(
+                f"{len(weights)} weights for {len(self.shards)} folders: give one for each, and "
+                "every folder once. (--weights, --shards)"
+            )
+        write_mixture(self.out, dict(zip(self.shards, weights, strict=True)))
+        print(self.out)
         return ExitCode.DONE

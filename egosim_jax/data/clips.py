@@ -24,7 +24,13 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax.data.metadata import MASK_NAME, SAFE_IDS, ClipFiles, csv_rows, is_safe_id
-from egosim_jax.data.transforms import fit_length, resize_image, resize_mask
+from egosim_jax.data.transforms import (
+    Resampling,
+    fit_length,
+    resample,
+    resize_image,
+    resize_mask,
+)
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text, read_bytes
@@ -121,10 +127,12 @@ def check_clip(
     start: int = 0,
     policy: Policy = "strict",
     grid: VideoGrid = WAN_GRID,
+    resampling: Resampling = "first",
 ) -> list[str]:
     """List the problems that would make `load_triplet` fail, without decoding the videos.
 
-    Each problem names the metadata row and the file. Without a `spec` every length is accepted.
+    Each problem names the metadata row and the file. Without a `spec` every length is accepted; if
+    frames are taken at intervals, every one that has enough.
     """
     problems = []
     probed: dict[str, VideoInfo] = {}
@@ -140,7 +148,8 @@ def check_clip(
     except InputError as error:
         problems.append(str(error))
     if policy == "strict":
-        problems += _length_problems(probed, start + (spec.frames if spec else 1), grid)
+        taken = {name: _taken(info, spec, resampling) for name, info in probed.items()}
+        problems += _length_problems(probed, taken, start + (spec.frames if spec else 1), grid)
         problems += _size_problems(sizes, grid.spatial_stride * grid.patch)
     return [f"{files.row} ({files.video_id}): {problem}" for problem in problems]
 
@@ -153,13 +162,20 @@ def load_triplet(
     policy: Policy = "strict",
     decoding: Decoding = "accurate",
     grid: VideoGrid = WAN_GRID,
+    resampling: Resampling = "first",
 ) -> Triplet:
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
-    The CLIP image is that of the clip for every window. Raises `InputError` with the problems of
-    `check_clip`, or naming a damaged video.
+    Another `resampling` takes them from all frames, and has no `start`. The CLIP image is that of
+    the clip for every window. Raises `InputError` with the problems of `check_clip`, or naming a
+    damaged video.
     """
-    problems = check_clip(files, spec, start=start, policy=policy, grid=grid)
+    if start and resampling != "first":
+        raise InputError(
+            f"Frames taken by the rule {resampling} are of the whole clip: it must start at 0, not "
+            f"{start}. (--resampling)"
+        )
+    problems = check_clip(files, spec, start=start, policy=policy, grid=grid, resampling=resampling)
     if problems:
         raise InputError(listing(problems))
     arrays: dict[str, np.ndarray] = {
@@ -168,14 +184,16 @@ def load_triplet(
     for name, path in _videos(files, policy).items():
         fit = _fit_mask if name == "mask" else resize_image
         try:
-            frames = read_video(
+            video = read_video(
                 path,
                 start=start,
-                stop=start + spec.frames,
+                stop=start + spec.frames if resampling == "first" else None,
                 decoding=decoding,
                 damage=DAMAGE[policy],
                 each=partial(fit, height=spec.height, width=spec.width),
-            ).frames
+            )
+            step = int(video.fps / spec.fps)
+            frames = video.frames[resample(len(video.frames), spec.frames, resampling, step=step)]
         except InputError as error:
             raise InputError(f"{files.row} ({files.video_id}): {error}") from error
         if len(frames) < spec.frames:
@@ -216,12 +234,22 @@ def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
     return videos
 
 
-def _length_problems(probed: dict[str, VideoInfo], needed: int, grid: VideoGrid) -> list[str]:
+def _taken(info: VideoInfo, spec: VideoSpec | None, resampling: Resampling) -> int:
+    """Return the number of frames of a video that can be taken."""
+    if spec is None or resampling == "first":
+        return info.frames
+    step = int(info.fps / spec.fps)
+    return len(resample(info.frames, spec.frames, resampling, step=step))
+
+
+def _length_problems(
+    probed: dict[str, VideoInfo], taken: dict[str, int], needed: int, grid: VideoGrid
+) -> list[str]:
     counts = {name: info.frames for name, info in probed.items()}
     if len(set(counts.values())) > 1:
         return [f"the frame counts disagree: {_table(counts)}. (--lenient repeats or cuts)"]
     problems = []
-    for count in set(counts.values()):
+    for count in set(taken.values()):
         try:
             grid.check_frames(count, what="a clip", fix="--lenient cuts or repeats frames")
         except InputError as error:

@@ -7,6 +7,9 @@ positions for any number of processes. Worker processes share the positions in t
 
 A record that cannot be read is skipped, counted in `Loader.skipped` under its file and position,
 and replaced by the next one; more than `Loader.MAX_BAD` different ones stop the run.
+
+Of a mixture, position k is of the part whose share is furthest behind its weight, so that any long
+stretch of the sequence has the proportions of the weights.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import numpy as np
 from absl import flags
 
 from egosim_jax.data.manifest import Manifest
+from egosim_jax.data.mixing import Mixture
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.untrusted import listing
 from egosim_jax.types import InputError
@@ -38,7 +42,7 @@ Transform = grain.transforms.RandomMap | grain.transforms.Map | Callable[[Exampl
 
 
 def make_loader(
-    source: ShardReader,
+    source: ShardReader | Mixture,
     *,
     batch_size: int,
     seed: int,
@@ -54,8 +58,8 @@ def make_loader(
     A process gets `batch_size / process_count` examples of each batch. `transform` maps a record's
     arrays to an example, with random numbers if it is a `RandomMap`; examples also get `record`,
     their index in the source. Without `repeat` the iterator ends after one pass and drops an
-    incomplete last batch. `workers` processes prepare examples; 0 prepares them in threads of this
-    process.
+    incomplete last batch; the weights of a mixture do not matter then. `workers` processes prepare
+    examples; 0 prepares them in threads of this process.
     """
     if batch_size < 1 or batch_size % process_count:
         raise InputError(
@@ -66,12 +70,12 @@ def make_loader(
         raise InputError(
             f"{source.folder} holds {len(source)} records, fewer than one batch of {batch_size}."
         )
-    positions = grain.MapDataset.range(len(source)).seed(seed)
-    if shuffle:
-        positions = positions.shuffle()
-    full_batches = slice(len(source) // batch_size * batch_size)
-    positions = positions.repeat() if repeat else positions[full_batches]
-    examples = positions.random_map(_Read(source, transform))
+    mixed = isinstance(source, Mixture) and repeat
+    positions = _mixed(source, seed, shuffle) if mixed else _positions(source, seed, shuffle)
+    if not mixed:
+        full_batches = slice(len(source) // batch_size * batch_size)
+        positions = positions.repeat() if repeat else positions[full_batches]
+    examples = positions.random_map(_Read(source, transform), seed=seed if mixed else None)
     mine = examples[process_index::process_count]
     stream = mine.to_iter_dataset(
         grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=2 * _THREADS)
@@ -93,7 +97,26 @@ def make_loader(
         "shuffle": shuffle,
         "repeat": repeat,
     }
+    if isinstance(source, Mixture):
+        contract["weights"] = list(source.weights)
     return Loader(iter(batches), contract, skipped)
+
+
+def _positions(source: ShardReader | Mixture, seed: int, shuffle: bool) -> grain.MapDataset:
+    """Return one pass over the records of a source."""
+    positions = grain.MapDataset.range(len(source)).seed(seed)
+    return positions.shuffle() if shuffle else positions
+
+
+def _mixed(source: Mixture, seed: int, shuffle: bool) -> grain.MapDataset:
+    """Return endless passes over each part, in proportion to their weights."""
+    passes, start = [], 0
+    for number, part in enumerate(source.parts):
+        own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+        positions = grain.MapDataset.range(start, start + len(part)).seed(own)
+        passes.append((positions.shuffle() if shuffle else positions).repeat())
+        start += len(part)
+    return grain.MapDataset.mix(passes, list(source.weights))
 
 
 class Loader(grain.DatasetIterator):
@@ -163,7 +186,7 @@ class _Bad:
 class _Read(grain.transforms.RandomMap):
     """A transform from the index of a record to an example."""
 
-    source: ShardReader
+    source: ShardReader | Mixture
     transform: Transform
 
     def random_map(self, element: int, rng: np.random.Generator) -> Any:

@@ -12,7 +12,7 @@ from egosim_jax.data.clips import check_clip, encoded_first_frame, load_triplet
 from egosim_jax.data.metadata import ClipFiles, check_presence
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.data.transforms import decode_record, video_shape
+from egosim_jax.data.transforms import Resampling, decode_record, video_shape
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import listing, read_bytes
 from egosim_jax.io.video import Decoding
@@ -32,15 +32,24 @@ def pack(
     overwrite: bool = False,
     decoding: Decoding = "accurate",
     grid: VideoGrid = WAN_GRID,
+    resampling: Resampling = "first",
 ) -> Iterator[str | None]:
     """Write the shards of clips: decoded at `spec`, or as their source files without one.
 
-    Clips must fit the latent `grid`. Yields, after each clip, why it was skipped, or None. Raises
-    `InputError` if all were skipped, or if another process writes to the same folder.
+    Clips must fit the latent `grid`; with a `spec`, `resampling` takes their frames. Yields, after
+    each clip, why it was skipped, or None. Raises `InputError` if all were skipped, or if another
+    process writes to the same folder.
     """
     failed = 0
     check_presence(items)
     decoded = {} if spec is None else {"decoding": decoding}
+    if resampling != "first":
+        if spec is None:
+            raise InputError(
+                f"Source files are packed as they are: frames taken by the rule {resampling} need "
+                "a size. (--size, --resampling)"
+            )
+        decoded["resampling"] = resampling
     shards = ShardWriter(
         out,
         kind="frames" if spec else "videos",
@@ -55,7 +64,7 @@ def pack(
             problem = None
             try:
                 if spec:
-                    record = decoded_record(files, spec, decoding, grid)
+                    record = decoded_record(files, spec, decoding, grid, resampling)
                 else:
                     record = encoded_record(files, grid)
                 writer.add(record.arrays, record.metadata)
@@ -97,9 +106,11 @@ def decoded_record(
     spec: VideoSpec,
     decoding: Decoding = "accurate",
     grid: VideoGrid = WAN_GRID,
+    resampling: Resampling = "first",
 ) -> Record:
-    """Return a record of a clip's first `spec.frames` frames, after the strict checks."""
-    return triplet_record(load_triplet(files, spec, decoding=decoding, grid=grid))
+    """Return a record of a clip's `spec.frames` frames, after the strict checks."""
+    triplet = load_triplet(files, spec, decoding=decoding, grid=grid, resampling=resampling)
+    return triplet_record(triplet)
 
 
 def triplet_record(triplet: Triplet) -> Record:

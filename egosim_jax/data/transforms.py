@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import grain
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from PIL import Image
 
 from egosim_jax.io.video import Decoding, decode_image, decode_video, probe_encoded
 from egosim_jax.types import InputError, VideoSpec
 
+Resampling = Literal["first", "stride", "linspace", "rate"]
+"""Rule by which frames of a clip are taken (`resample`)."""
 COLORS = ("target", "prior", "hands")
 """Names of the color videos of a record."""
 
@@ -42,6 +44,26 @@ def resize_mask(
 ) -> UInt8[np.ndarray, "f height width"]:
     """Resize every frame of a mask with BILINEAR; edges become gray levels."""
     return _resize_all(mask, height, width, Image.Resampling.BILINEAR)
+
+
+def resample(count: int, frames: int, rule: Resampling, *, step: int = 1) -> Int[np.ndarray, " n"]:
+    """Return the frames of a clip of `count` that are taken, at most `frames`.
+
+    first      the first ones, without gaps
+    stride     every (count // frames)-th from the first: DWM's loader of videos
+    linspace   from the first to the last, at equal distances and rounded; DWM's encoder of latents,
+               which repeats frames of a clip that is too short
+    rate       every `step`-th from the first: the evaluation behind DWM's tables, whose step is the
+               clip's frame rate through 8, rounded down
+    """
+    match rule:
+        case "linspace":
+            return np.rint(np.linspace(0, count - 1, frames)).astype(int)
+        case "stride":
+            step = max(1, count // frames)
+        case "first":
+            step = 1
+    return np.arange(0, count, max(1, step))[:frames]
 
 
 def fit_length(frames: UInt8[np.ndarray, "f ..."], count: int) -> UInt8[np.ndarray, "g ..."]:

@@ -31,7 +31,7 @@ def read_pickled_arrays(path: Path, *, sha256: str) -> dict[str, np.ndarray]:
     try:
         if digest(data) != sha256:
             raise RefusedError(f"its SHA-256 is {digest(data)}, not {sha256}")
-        found = flatten(_NumPy(data).run(), _Array)
+        found = flatten(NumPyInterpreter(data).run(), PickledArray)
         return {name: array.values() for name, array in found.items()}
     except (ValueError, struct.error) as error:
         reason = str(error) if isinstance(error, RefusedError) else quote_text(str(error))
@@ -49,8 +49,8 @@ class _DType(Opaque):
 
 
 @dataclass
-class _Array(Opaque):
-    """Array, which its state fills."""
+class PickledArray(Opaque):
+    """NumPy array of a pickle, which its state fills."""
 
     filled: np.ndarray | None = None
 
@@ -61,8 +61,8 @@ class _Array(Opaque):
         return self.filled
 
 
-class _NumPy(Interpreter):
-    """Interpreter that adds NumPy's arrays, as NumPy writes them at protocols 2 to 4."""
+class NumPyInterpreter(Interpreter):
+    """Pickle interpreter that adds NumPy's arrays, as NumPy writes them at protocols 2 to 4."""
 
     allowed = Interpreter.allowed | {
         "numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct",
@@ -78,7 +78,7 @@ class _NumPy(Interpreter):
                 "numpy.core.multiarray._reconstruct" | "numpy._core.multiarray._reconstruct",
                 (Name("numpy.ndarray"), (0,), b"b"),
             ):
-                return _Array()
+                return PickledArray()
             case ("numpy.dtype", (str(code), bool(), bool())) if code in DTYPES:
                 return _DType(code)
             case ("numpy.dtype", (code, *_)):
@@ -91,9 +91,12 @@ class _NumPy(Interpreter):
         match (target, state):
             case (_DType(), (int(), "<" | "|", None, None, None, int(), int(), int())):
                 pass
-            case (_Array(filled=None), (int(), tuple(shape), _DType(code), bool(by_column), data)):
+            case (
+                PickledArray(filled=None),
+                (int(), tuple(shape), _DType(code), bool(by_column), data),
+            ):
                 target.filled = _filled(shape, np.dtype(f"<{code}"), by_column, data)
-            case (_DType(), _) | (_Array(), _):
+            case (_DType(), _) | (PickledArray(), _):
                 raise RefusedError("one of its arrays has an unsupported state")
             case _:
                 super().set_state(target, state)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, transform
 from egosim_jax.rendering.mesh import AMBIENT, DIFFUSE, MovingMesh, vertex_normals
 from egosim_jax.rendering.skeleton import NEAR_M
-from egosim_jax.types import Cameras
+from egosim_jax.types import Cameras, InputError
 
 
 def draw_mesh(
@@ -27,6 +27,44 @@ def draw_mesh(
         if given.any():
             _draw(picture[frame], depth[frame], vertices, mesh, given, rays)
     return picture, depth
+
+
+def draw_scene(
+    vertices_m: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    colors: UInt8[np.ndarray, "v 3"],
+    cameras: Cameras,
+) -> tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"]]:
+    """Draw a scene in the colors of its vertices, without light, along a camera path.
+
+    Returns the picture and the mask: 255, and black, where no triangle is seen. Raises `InputError`
+    if the first frame shows none.
+    """
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(vertices_m.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32))
+    )
+    shape = len(cameras.world_from_camera), cameras.height, cameras.width
+    picture, mask = np.zeros((*shape, 3), np.uint8), np.full(shape, 255, np.uint8)
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    for frame, pose in enumerate(cameras.world_from_camera):
+        ways = rays @ pose[:3, :3].T
+        both = np.concatenate([pose[:3, 3] + NEAR_M * ways, ways], axis=-1).astype(np.float32)
+        hits = scene.cast_rays(o3d.core.Tensor(both))
+        seen = np.isfinite(hits["t_hit"].numpy())
+        u, v = hits["primitive_uvs"].numpy()[seen].T
+        corners = colors[triangles[hits["primitive_ids"].numpy()[seen]]]
+        share = np.stack([1 - u - v, u, v], axis=1)
+        picture[frame][seen] = np.rint(np.einsum("nk,nkc->nc", share, corners))
+        mask[frame][seen] = 0
+    if mask[0].all():
+        raise InputError(
+            f"None of the {len(triangles)} triangles of the scene is seen in the first frame: the "
+            "camera must look at the scene, in the same world coordinates."
+        )
+    return picture, mask
 
 
 def _draw(

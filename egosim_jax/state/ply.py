@@ -43,6 +43,8 @@ class _Element:
     fields: list[tuple[str, str]] = field(default_factory=list)
     """Names and dtypes of the properties; for a list, those of its length."""
     lists: bool = False
+    items: str = ""
+    """Dtype of the items of its last list."""
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -71,6 +73,52 @@ def read_points(path: Path) -> np.ndarray:
             raise InputError(f"{name} is not a readable PLY file: {quote_text(str(error))}.") from (
                 error
             )
+
+
+def has_triangles(path: Path) -> bool:
+    """Return whether a PLY file has faces."""
+    with open_regular(path) as file:
+        try:
+            return any(e.name == "face" and e.count > 0 for e in _header(file)[1])
+        except ValueError as error:
+            raise InputError(
+                f"{quote_path(path)} is not a readable PLY file: {quote_text(str(error))}."
+            ) from error
+
+
+def read_triangles(path: Path) -> np.ndarray:
+    """Return the triangles of a binary PLY file, `t 3`: vertex indices of the element `face`.
+
+    Raises `InputError` if there are none, or other polygons, or further properties of faces.
+    """
+    name = quote_path(path)
+    points = read_points(path)
+    with open_regular(path) as file:
+        order, elements = _header(file)
+        data = file.read(MAX_BYTES)
+    number = next((k for k, e in enumerate(elements) if e.name == "face"), None)
+    faces = None if number is None else elements[number]
+    alone = faces is not None and faces.lists and len(faces.fields) == 1
+    if order == "=" or faces is None or not alone or faces.count < 1:
+        raise InputError(
+            f"{name} has no triangles that can be read: it must be binary, with an element face "
+            "of one list of vertex indices. Save the mesh as binary PLY without further properties "
+            "of faces."
+        )
+    start = sum(
+        e.count * np.dtype([(n, t) for n, t in e.fields]).itemsize for e in elements[:number]
+    )
+    layout = np.dtype([("count", order + faces.fields[0][1]), ("v", order + faces.items, 3)])
+    if faces.items[0] == "f" or len(data) < start + faces.count * layout.itemsize:
+        raise InputError(f"{name} is damaged: it has fewer than {faces.count:,} triangles.")
+    rows = np.frombuffer(data, layout, count=faces.count, offset=start)
+    triangles = rows["v"].astype(np.int64)
+    if (rows["count"] != 3).any() or not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise InputError(
+            f"{name} has faces that are not triangles of its {len(points):,} vertices. Triangulate "
+            "the mesh."
+        )
+    return triangles
 
 
 def write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -112,7 +160,7 @@ def _header(file: io.BufferedReader) -> tuple[str, list[_Element]]:
                 {length, kind} <= _TYPES.keys() and elements and _TYPES[length][0] != "f"
             ):
                 elements[-1].fields.append((name, _TYPES[length]))
-                elements[-1].lists = True
+                elements[-1].lists, elements[-1].items = True, _TYPES[kind]
                 properties += 1
             case _:
                 raise ValueError(f"its header has the line {quote(line)}")

@@ -8,7 +8,7 @@ from egosim_jax.data.dwm import write_folders
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.pack import pack, read_triplets
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.data.transforms import decode_record
+from egosim_jax.data.transforms import decode_record, resample
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
@@ -121,6 +121,31 @@ def test_videos_are_packed_without_a_mask_and_written_again(root, tmp_path):
 
 def clips_list(root):
     return root / "dataset_files" / "train.txt"
+
+
+def test_rules_of_resampling_are_those_of_dwm():
+    assert resample(100, 49, "first").tolist() == list(range(49))
+    assert resample(190, 49, "stride").tolist() == list(range(0, 147, 3))
+    assert resample(278, 49, "rate", step=3).tolist() == list(range(0, 147, 3))
+    assert resample(60, 5, "rate", step=0).tolist() == [0, 1, 2, 3, 4]
+    assert resample(9, 5, "linspace").tolist() == [0, 2, 4, 6, 8]
+    assert resample(8, 5, "linspace").tolist() == [0, 2, 4, 5, 7]  # half to even, as torch.round
+    assert resample(3, 5, "linspace").tolist() == [0, 0, 1, 2, 2]
+
+
+def test_frames_are_taken_at_intervals(root):
+    clip = read_metadata(clips_list(root))[0]
+    for path in (clip.prior, clip.hands, clip.target):
+        write_video(path, make_triplet("a").target.repeat(3, axis=0)[:14], 8)
+    taken = load_triplet(clip, SPEC, resampling="linspace")
+    assert near(taken.target[2], make_triplet("a").target[2])
+    assert near(taken.target[4], make_triplet("a").target[4])
+    with pytest.raises(InputError, match="14 frames cannot be encoded"):
+        load_triplet(clip, SPEC)
+    with pytest.raises(InputError, match="fewer than the 17"):
+        load_triplet(clip, VideoSpec(frames=17, height=32, width=48), resampling="stride")
+    with pytest.raises(InputError, match="need a size"):
+        list(pack([clip], out=root / "x", spec=None, provenance={}, resampling="rate"))
 
 
 def test_triplets_without_a_recorded_video_are_refused(tmp_path):

@@ -1,0 +1,239 @@
+"""Hands of MANO (Romero et al. 2017) from the user's own model file, which is not ours to ship.
+
+With shape b, rotations R_0 ... R_15 of the wrist and 15 joints given as axis times angle, and the
+model's arrays, the vertices are
+
+    s = v_template + shapedirs b            joints j = J_regressor s
+    p = s + posedirs (R_1 - I, ..., R_15 - I)
+    v = sum over joints k of weights_k (G_k (p - j_k) + g_k) + translation
+
+where G_k, g_k chain the rotations from the wrist to joint k: G_k = G_parent R_k and g_k = G_parent
+(j_k - j_parent) + g_parent, with g_0 = j_0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.pickled_models import read_model
+from egosim_jax.io.untrusted import quote_path
+from egosim_jax.rendering.mesh import HAND_COLORS, MovingMesh, Side, join_meshes
+from egosim_jax.types import InputError
+
+JOINTS, BETAS = 16, 10
+"""Number of joints, the wrist included, and of coefficients of the shape."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Mano:
+    """Hand model of one side."""
+
+    v_template: Float[np.ndarray, "v 3"]
+    """Vertices of the mean shape in meters."""
+    shapedirs: Float[np.ndarray, "v 3 10"]
+    """Displacement of the vertices for each coefficient of the shape."""
+    posedirs: Float[np.ndarray, "v 3 135"]
+    """Displacement of the vertices for each entry of the joints' rotations."""
+    j_regressor: Float[np.ndarray, "16 v"]
+    """Weights of the vertices in the joints."""
+    weights: Float[np.ndarray, "v 16"]
+    """Share of each joint in the motion of each vertex."""
+    parents: tuple[int, ...]
+    """Parent of each joint after the wrist, which is joint 0."""
+    triangles: Int[np.ndarray, "t 3"]
+    """Vertex indices of each triangle."""
+    hands_mean: Float[np.ndarray, " 45"]
+    """Mean pose, which some data give their poses relative to."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, parents, triangles, and that all values are finite."""
+        count = len(self.v_template)
+        shapes = {
+            "v_template": (count, 3), "shapedirs": (count, 3, BETAS),
+            "posedirs": (count, 3, 9 * (JOINTS - 1)), "j_regressor": (JOINTS, count),
+            "weights": (count, JOINTS), "hands_mean": (3 * (JOINTS - 1),),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if np.shape(value) != shape or not np.isfinite(value).all():
+                raise InputError(
+                    f"{name} of the hand model has shape {np.shape(value)}: it must be finite and "
+                    f"{shape} for {count} vertices, as in MANO. (--mano-right, --mano-left)"
+                )
+        if len(self.parents) != JOINTS - 1 or any(
+            not 0 <= parent <= number for number, parent in enumerate(self.parents)
+        ):
+            raise InputError(
+                f"The joints of the hand model have the parents {self.parents}: each must come "
+                "after its parent. (--mano-right, --mano-left)"
+            )
+        if not 0 <= self.triangles.min() <= self.triangles.max() < count:
+            raise InputError(
+                f"Triangles of the hand model name vertices up to {self.triangles.max()}: there "
+                f"are {count}. (--mano-right, --mano-left)"
+            )
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class ManoPoses:
+    """Poses of n hands along a clip, in the world."""
+
+    global_orient: Float[np.ndarray, "f n 3"]
+    """Rotation of the wrist, axis times angle in radians; NaN where a hand is missing."""
+    hand_pose: Float[np.ndarray, "f n 45"]
+    """Rotations of the joints, axis times angle in radians."""
+    translation_m: Float[np.ndarray, "f n 3"]
+    """Translation of the vertices in meters."""
+    betas: Float[np.ndarray, "n 10"]
+    """Coefficients of the shapes."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, and that a hand of a frame is given completely or not at all."""
+        frames, hands = (
+            np.shape(self.global_orient)[:2] if np.ndim(self.global_orient) == 3 else (0, 0)
+        )
+        shapes = {
+            "global_orient": (frames, hands, 3), "hand_pose": (frames, hands, 45),
+            "translation_m": (frames, hands, 3), "betas": (hands, BETAS),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if np.shape(getattr(self, name)) != shape or 0 in shape:
+                raise InputError(
+                    f"{name} of the hands has shape {np.shape(getattr(self, name))}: it must be "
+                    f"{shape} for {frames} frames of {hands} hands. (--mano-poses)"
+                )
+        rows = [self.global_orient, self.hand_pose, self.translation_m]
+        finite = np.isfinite(np.concatenate(rows, axis=-1))
+        broken = ~finite.all(axis=-1) & finite.any(axis=-1)
+        if broken.any() or not np.isfinite(self.betas).all():
+            frame, hand = np.argwhere(broken)[0].tolist() if broken.any() else (0, 0)
+            raise InputError(
+                f"Hand {hand} of frame {frame} has parameters that are not finite and others that "
+                "are: give all of a hand, or NaN for all where it is missing. (--mano-poses)"
+            )
+
+    @property
+    def given(self) -> np.ndarray:
+        """Hands that are given, `f n`."""
+        return np.isfinite(self.global_orient).all(axis=-1)
+
+
+def read_mano(path: Path) -> Mano:
+    """Read MANO_RIGHT.pkl or MANO_LEFT.pkl. Raises `InputError` if it is not such a file."""
+    arrays = read_model(path)
+    names = (
+        "v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f",
+        "hands_mean",
+    )  # fmt: skip
+    if missing := [name for name in names if name not in arrays]:
+        raise InputError(
+            f"{quote_path(path)} has no {', '.join(missing)}: it is not a hand model of MANO. Give "
+            "MANO_RIGHT.pkl or MANO_LEFT.pkl of mano.is.tue.mpg.de. (--mano-right, --mano-left)"
+        )
+    table, triangles = arrays["kintree_table"], arrays["f"]
+    if table.shape != (2, JOINTS) or triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise InputError(
+            f"{quote_path(path)} has joints {table.shape} and triangles {triangles.shape}: they "
+            f"must be (2, {JOINTS}) and (t, 3). (--mano-right, --mano-left)"
+        )
+    given = {name: arrays[name].astype(float) for name in names[:3]}
+    return Mano(
+        **given,
+        j_regressor=arrays["J_regressor"].astype(float),
+        weights=arrays["weights"].astype(float),
+        parents=tuple(int(parent) for parent in table[0, 1:]),
+        triangles=triangles.astype(np.int64),
+        hands_mean=arrays["hands_mean"].astype(float),
+    )
+
+
+def read_poses(path: Path) -> ManoPoses:
+    """Read the poses of hands from an npz with the fields of `ManoPoses`."""
+    names = ("global_orient", "hand_pose", "translation_m", "betas")
+    arrays = read_arrays(path, {}, others=names, packed=True)
+    return ManoPoses(**{name: arrays[name].astype(float) for name in names})
+
+
+def mano_hands(
+    right: Mano, poses: ManoPoses, *, left: Mano | None = None, add_mean: bool = False
+) -> MovingMesh:
+    """Return the meshes of a left and a right hand, in this order, in the colors of their sides.
+
+    Without a model of the left hand its poses are those of a right one that is mirrored in x, as
+    HaMeR estimates them. `add_mean` is for poses relative to the mean pose. Raises `InputError` for
+    another number of hands.
+    """
+    if poses.global_orient.shape[1] != 2:
+        raise InputError(
+            f"The poses have {poses.global_orient.shape[1]} hands: there must be 2, left before "
+            "right; a missing one has NaN. (--mano-poses)"
+        )
+    sides: tuple[Side, Side] = ("left", "right")
+    models = (left or right, right)
+    meshes = []
+    for number, (side, model) in enumerate(zip(sides, models, strict=True)):
+        vertices = _pose(model, poses, number, add_mean)
+        mirrored = side == "left" and left is None
+        meshes.append(
+            MovingMesh(
+                vertices_m=vertices * [-1, 1, 1] if mirrored else vertices,
+                triangles=model.triangles[:, ::-1] if mirrored else model.triangles,
+                colors=np.tile(HAND_COLORS[side], (len(model.v_template), 1)),
+            )
+        )
+    return join_meshes(meshes)
+
+
+def _pose(model: Mano, poses: ManoPoses, hand: int, add_mean: bool) -> Float[np.ndarray, "f v 3"]:
+    """Return the vertices of one hand, NaN where it is missing."""
+    given = poses.given[:, hand]
+    vertices = np.full((len(given), *model.v_template.shape), np.nan)
+    if given.any():
+        pose = poses.hand_pose[given, hand] + (model.hands_mean if add_mean else 0.0)
+        turns = np.concatenate([poses.global_orient[given, hand], pose], axis=-1)
+        posed = skin(model, poses.betas[hand], turns.reshape(-1, JOINTS, 3))
+        vertices[given] = posed + poses.translation_m[given, hand, None]
+    return vertices
+
+
+def skin(
+    model: Mano, betas: Float[np.ndarray, " 10"], turns: Float[np.ndarray, "f 16 3"]
+) -> Float[np.ndarray, "f v 3"]:
+    """Return the vertices for a shape and the rotations of the joints, axis times angle."""
+    shaped = model.v_template + model.shapedirs @ betas
+    joints = model.j_regressor @ shaped
+    rotations = rotations_of(turns)
+    bend = (rotations[:, 1:] - np.eye(3)).reshape(len(turns), -1)
+    posed = shaped + np.einsum("vcp,fp->fvc", model.posedirs, bend)
+    chained = [rotations[:, 0]]
+    places = [np.broadcast_to(joints[0], (len(turns), 3))]
+    for number, parent in enumerate(model.parents, start=1):
+        step = joints[number] - joints[parent]
+        places.append(np.einsum("fcd,d->fc", chained[parent], step) + places[parent])
+        chained.append(chained[parent] @ rotations[:, number])
+    vertices = np.zeros_like(posed)
+    for number in range(JOINTS):
+        moved = (posed - joints[number]) @ chained[number].swapaxes(-1, -2)
+        vertices += model.weights[:, number, None] * (moved + places[number][:, None])
+    return vertices
+
+
+def rotations_of(turns: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Return the rotation matrices of axes times angles in radians (Rodrigues' formula)."""
+    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(turns, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    small = angle < 1e-8
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 1.0, np.sin(safe) / safe)
+    second = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
+    return np.eye(3) + first * cross + second * (cross @ cross)
