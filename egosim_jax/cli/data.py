@@ -13,7 +13,7 @@ import tyro
 from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
-from egosim_jax.cli.triplets import Align, Mix, Static, ToDwm
+from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
 from egosim_jax.types import WAN_GRID, VideoGrid, VideoSpec, check_counts
@@ -345,6 +345,7 @@ class Data:
         | Annotated[Static, tyro.conf.subcommand("static")]
         | Annotated[Align, tyro.conf.subcommand("align")]
         | Annotated[Mix, tyro.conf.subcommand("mix")]
+        | Annotated[FromCaches, tyro.conf.subcommand("from-caches")]
         | Annotated[ToDwm, tyro.conf.subcommand("to-dwm")]
     )
 

@@ -213,3 +213,38 @@ class Mix:
         write_mixture(self.out, dict(zip(self.shards, weights, strict=True)))
         print(self.out)
         return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromCaches:
+    """Make latents shards of DWM's caches of moments and embeddings. Prints the folder.
+
+    The first clip is encoded as well and compared with its caches, which are refused if they are of
+    another VAE or text encoder.
+    """
+
+    config: str
+    """Name of the model."""
+    weights: Path
+    """Folder of weights with the VAE and the text encoder that the caches were made with."""
+    metadata: Path
+    """List of DWM, .txt."""
+    out: Path
+    """Folder of the latents shards."""
+    limit: int | None = None
+    """Maximum number of clips."""
+
+    def run(self) -> int:
+        """Check the first clip, then read cache after cache."""
+        from egosim_jax import configs
+        from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.train.cached import shard_caches
+
+        clips = select(read_metadata(self.metadata), limit=self.limit)
+        model = configs.get(self.config).at(self.weights)
+        for _ in track(
+            shard_caches(model, self.weights, clips, out=self.out), "reading", total=len(clips)
+        ):
+            pass
+        print(self.out)
+        return ExitCode.DONE

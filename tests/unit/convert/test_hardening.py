@@ -15,12 +15,12 @@ import torch
 from safetensors.numpy import save_file
 
 from egosim_jax.convert.detect import detect
-from egosim_jax.convert.pth import read_pth
 from egosim_jax.convert.rules import Rule, assign
 from egosim_jax.convert.source import sources
 from egosim_jax.io import mapped, weights
 from egosim_jax.io import pickled as pickle_reader
 from egosim_jax.io.mapped import read_metadata, read_safetensors
+from egosim_jax.io.pth import read_pth
 from egosim_jax.types import InputError
 
 SECONDS, MEBIBYTES, CHARACTERS = 10, 700, 2000

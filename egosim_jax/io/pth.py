@@ -1,4 +1,4 @@
-"""Read PyTorch's `.pth` files without PyTorch and without executing their pickles.
+"""Read and write PyTorch's `.pth` files without PyTorch and without executing their pickles.
 
 A `.pth` is a zip archive of uncompressed entries: `NAME/data.pkl`, a pickle of dictionaries, lists
 and references to tensors, and `NAME/data/KEY`, the bytes of each storage. To the interpreter of
@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from egosim_jax.convert.archive import read_entries
+from egosim_jax.io.archive import read_entries
+from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.mapped import (
     CODES,
     MOST_AXES,
@@ -69,6 +71,36 @@ def read_pth(path: Path) -> dict[str, Tensor]:
             "supported, as torch.save writes state dicts. Save the weights again as such, or "
             "better as safetensors."
         ) from error
+
+
+def write_pth(path: Path, array: np.ndarray) -> None:
+    """Write one tensor as `torch.save` does, for `torch.load` with `weights_only`; atomically."""
+    kinds = {dtype: kind for kind, dtype in STORAGES.items()}
+    kind, array = kinds[array.dtype.name], np.ascontiguousarray(array)
+    strides = [step // array.dtype.itemsize for step in array.strides]
+    storage = b"(" + _text("storage") + f"ctorch\n{kind}\n".encode() + _text("0") + _text("cpu")
+    storage += _number(array.size) + b"tQ"
+    ordered = b"ccollections\nOrderedDict\n)R"
+    arguments = storage + _number(0) + _numbers(array.shape) + _numbers(strides) + b"\x89" + ordered
+    program = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + arguments + b"tR."
+    entries = {
+        "data.pkl": program, "byteorder": b"little", "data/0": array.tobytes(), "version": b"3\n",
+    }  # fmt: skip
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(zipfile.ZipInfo(f"archive/{name}"), content)
+
+
+def _text(value: str) -> bytes:
+    return b"X" + struct.pack("<I", len(value)) + value.encode()
+
+
+def _number(value: int) -> bytes:
+    return b"\x8a\x08" + struct.pack("<q", value)
+
+
+def _numbers(values: Iterable[int]) -> bytes:
+    return b"(" + b"".join(map(_number, values)) + b"t"
 
 
 class _Torch(Interpreter):

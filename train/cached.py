@@ -1,0 +1,79 @@
+"""Latents shards from DWM's caches, which replace the encoding of all clips but the first.
+
+The first clip is encoded from its videos as well. So the caches are shown to be of the given VAE
+and text encoder, and what does not depend on the clip, as the embeddings of the empty prompt, is
+known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.conditioning.posterior import STD
+from egosim_jax.data.clips import load_triplet
+from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.moments import cache_of, check_alike, read_moments, read_tensor
+from egosim_jax.data.pack import clip_metadata
+from egosim_jax.data.shards import ShardWriter
+from egosim_jax.io.weights import hashes
+from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.train.encode import Encoding, mask_of
+from egosim_jax.types import InputError
+
+VIDEOS = ("target", "prior", "hands")
+
+
+def shard_caches(
+    config: ModelConfig, folder: Path, clips: Sequence[ClipFiles], *, out: Path
+) -> Iterator[str]:
+    """Write the latents shards of clips from their caches; yield the id of each.
+
+    `folder` holds the weights. Raises `InputError` for a model that does not draw latents, and for
+    caches of another shape or of other weights.
+    """
+    if config.posterior != "sampled" or config.encoders == "joint":
+        raise InputError(
+            f"{config.name} does not train on cached moments: it must draw latents from them and "
+            "have frozen encoders, as dwm_cogvideox_5b. Encode the videos. (--config)"
+        )
+    networks = Networks.load(config, folder, only=config.cached_networks)
+    triplet = load_triplet(clips[0], config.video, grid=config.grid)
+    (first,) = Encoding(config, networks)([triplet])
+    provenance: dict[str, Any] = {
+        "config": config.name,
+        "encoders": hashes(folder, only=config.cached_networks),
+        "source": "caches",
+        "mask": mask_of(config),
+    }
+    with ShardWriter(
+        out, kind="latents", spec=config.video, grid=config.grid, provenance=provenance
+    ) as writer:
+        for number, files in enumerate(clips):
+            arrays = _arrays(files, first, networks.vae)
+            if number == 0:
+                for name in (*VIDEOS, "text"):
+                    check_alike(_cache(files, name), arrays[name], first[name])
+            writer.add(arrays, {**clip_metadata(files), "start": 0})
+            yield files.video_id
+
+
+def _arrays(files: ClipFiles, first: Mapping[str, np.ndarray], codec: Any) -> dict[str, np.ndarray]:
+    """Return the arrays of a clip: those of the caches, and the others of the first clip."""
+    arrays = dict(first)
+    for name in VIDEOS:
+        mean, logvar = read_moments(_cache(files, name), first[name].shape)
+        center = np.asarray(codec.normalize(mean))
+        deviation = np.asarray(codec.normalize(mean + np.exp(logvar / 2))) - center
+        arrays |= {name: center, f"{name}{STD}": deviation}
+    arrays["text"] = read_tensor(_cache(files, "text"), first["text"].shape)
+    return {name: array.astype(first[name].dtype) for name, array in arrays.items()}
+
+
+def _cache(files: ClipFiles, array: str) -> Path:
+    if files.target is None:
+        raise InputError(f"{files.row}: it has no recorded video, next to which its caches are.")
+    return cache_of(files.target, array)
