@@ -118,7 +118,7 @@ class Align:
         import sys
 
         from rich.console import Console
-        from rich.table import Table
+        from rich.table import Column, Table
 
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.io.run import write_json
@@ -126,7 +126,15 @@ class Align:
         from egosim_jax.types import InputError
 
         clips = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
-        table = Table("clip", "right px", "down px", "PSNR dB", "inside", "aligned", "gain")
+        table = Table(
+            Column("clip", overflow="fold"),
+            "right px",
+            "down px",
+            "PSNR dB",
+            "inside",
+            "aligned",
+            "gain",
+        )
         found = {}
         for files in track(clips, "aligning", total=len(clips)):
             try:

@@ -55,7 +55,7 @@ def near(video, other, most=8):
 
 
 def test_a_state_gives_the_triplet_of_its_clip(clip, action, tmp_path, capsys):
-    save(clip.state, tmp_path / "state")
+    save(tmp_path / "state", clip.state)
     write_video(tmp_path / "clip.mp4", clip.frames, 8)
     command = Static(
         action=action,
