@@ -25,6 +25,7 @@ from jax.experimental import multihost_utils
 
 from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.conditioning.video import to_uint8
+from egosim_jax.data.mixing import Mixture
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.generator import denoise
@@ -169,7 +170,7 @@ class SkipMonitor:
     An update is checked while the next one runs, so that the devices never wait for the host.
     """
 
-    def __init__(self, source: ShardReader):
+    def __init__(self, source: ShardReader | Mixture):
         self.source = source
         self._last: tuple[int, Mapping[str, jax.Array], np.ndarray] | None = None
 

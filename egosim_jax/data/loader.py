@@ -71,8 +71,10 @@ def make_loader(
             f"{source.folder} holds {len(source)} records, fewer than one batch of {batch_size}."
         )
     mixed = isinstance(source, Mixture) and repeat
-    positions = _mixed(source, seed, shuffle) if mixed else _positions(source, seed, shuffle)
-    if not mixed:
+    if isinstance(source, Mixture) and repeat:
+        positions = _mixed(source, seed, shuffle)
+    else:
+        positions = _positions(source, seed, shuffle)
         full_batches = slice(len(source) // batch_size * batch_size)
         positions = positions.repeat() if repeat else positions[full_batches]
     examples = positions.random_map(_Read(source, transform), seed=seed if mixed else None)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -68,10 +68,11 @@ class _Model(NumPyInterpreter):
     """Interpreter that adds strings of Python 2, arrays of chumpy and sparse matrices."""
 
     allowed = NumPyInterpreter.allowed | {ARRAY, SELECT} | SPARSE | NEW | OBJECT | SETS
-    actions = NumPyInterpreter.actions | {
+    actions: ClassVar = {
+        **NumPyInterpreter.actions,
         "SHORT_BINSTRING": NumPyInterpreter.push,
         "BINSTRING": NumPyInterpreter.push,
-        "NEWOBJ": lambda interpreter, _: interpreter._call(None),
+        "NEWOBJ": NumPyInterpreter._call,
     }
 
     def called(self, name: str, arguments: tuple) -> Any:
@@ -131,10 +132,11 @@ def _required(state: dict[str, Any], name: str) -> np.ndarray:
 def _from_columns(state: dict[str, Any]) -> np.ndarray:
     """Return the dense matrix of compressed columns."""
     values, rows, starts = (_required(state, name) for name in ("data", "indices", "indptr"))
-    shape = state.get("_shape")
-    valid = isinstance(shape, tuple) and len(shape) == 2 and all(type(n) is int for n in shape)
-    if not valid or min(shape) < 1 or shape[0] * shape[1] > MOST_DENSE:
-        raise RefusedError(f"a sparse matrix has the shape {quote_text(str(shape))}")
+    match state.get("_shape"):
+        case (int(height), int(width)) if min(height, width) >= 1 and height * width <= MOST_DENSE:
+            shape = height, width
+        case other:
+            raise RefusedError(f"a sparse matrix has the shape {quote_text(str(other))}")
     counts = np.diff(starts)
     if len(starts) != shape[1] + 1 or starts[0] != 0 or (counts < 0).any():
         raise RefusedError("a sparse matrix has invalid columns")

@@ -123,7 +123,7 @@ class ManoPoses:
     @property
     def given(self) -> np.ndarray:
         """Hands that are given, `f n`."""
-        return np.isfinite(self.global_orient).all(axis=-1)
+        return np.asarray(np.isfinite(self.global_orient).all(axis=-1))
 
 
 def read_mano(path: Path) -> Mano:

@@ -18,7 +18,7 @@ from egosim_jax.train.encode import check_encoders, encode_shards
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
 pytestmark = pytest.mark.slow
-SPEC = VideoSpec(frames=5, height=32, width=48, fps=8)
+SPEC = VideoSpec(frames=9, height=32, width=48, fps=8)
 MODEL = dataclasses.replace(
     configs.get("dwm_tabletop"), encoders="frozen", posterior="sampled", video=SPEC
 )
@@ -26,8 +26,8 @@ MODEL = dataclasses.replace(
 
 def make_triplet(number):
     rng = np.random.default_rng(number)
-    prior, hands, target = rng.integers(0, 256, (3, 5, 32, 48, 3)).astype(np.uint8)
-    mask = np.zeros((5, 32, 48), np.uint8)
+    prior, hands, target = rng.integers(0, 256, (3, 9, 32, 48, 3)).astype(np.uint8)
+    mask = np.zeros((9, 32, 48), np.uint8)
     return Triplet(
         video_id=f"home/{number}",
         prompt=f"take cup {number}",
