@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from egosim_jax.conditioning.posterior import STD
@@ -66,8 +67,9 @@ def _arrays(files: ClipFiles, first: Mapping[str, np.ndarray], codec: Any) -> di
     arrays = dict(first)
     for name in VIDEOS:
         mean, logvar = read_moments(_cache(files, name), first[name].shape)
-        center = np.asarray(codec.normalize(mean))
-        deviation = np.asarray(codec.normalize(mean + np.exp(logvar / 2))) - center
+        above = mean + np.exp(logvar / 2)
+        center, upper = (np.asarray(codec.normalize(jnp.asarray(x))) for x in (mean, above))
+        deviation = upper - center
         arrays |= {name: center, f"{name}{STD}": deviation}
     arrays["text"] = read_tensor(_cache(files, "text"), first["text"].shape)
     return {name: array.astype(first[name].dtype) for name, array in arrays.items()}
