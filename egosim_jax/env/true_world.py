@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import ClassVar
@@ -31,7 +33,7 @@ from egosim_jax.types import (
 from egosim_jax.worlds.tabletop import TabletopClip, World, opening, to_ground_truth
 
 REMEMBERED = 256
-"""Worlds that are kept, so that an episode is not executed from its start at each step."""
+"""Last used worlds that are kept, so that an episode is not executed from its start each time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +43,9 @@ class TrueWorld:
     needs_past: ClassVar[bool] = True
     video: VideoSpec
     """Length, size and rate of the clips."""
+    _changing: threading.Lock = field(
+        default_factory=threading.Lock, init=False, repr=False, compare=False
+    )
     _worlds: OrderedDict[str, World] = field(
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
@@ -77,21 +82,26 @@ class TrueWorld:
         for action in start.past:
             key = hashlib.sha256(f"{key} {fingerprint(action)}".encode()).hexdigest()
             keys.append(key)
-        known = max((n for n, name in enumerate(keys) if name in self._worlds), default=None)
-        if known is None:
+        known, world = self._last_known(keys)
+        if world is None:
             scene = opening(start.seed, spec=self.video, kind=kind)[0]
-            world, known = self._keep(keys[0], World(scene=scene, seed=start.seed)), 0
-        else:
-            world = self._worlds[keys[known]]
-        for name, action in zip(keys[known + 1 :], start.past[known:], strict=True):
-            world = self._keep(name, world.move(action)[1])
+            world = World(scene=scene, seed=start.seed)
+        for action in start.past[known:]:
+            world = world.move(action)[1]
+        with self._changing:
+            self._worlds[keys[-1]] = world
+            self._worlds.move_to_end(keys[-1])
+            while len(self._worlds) > REMEMBERED:
+                self._worlds.popitem(last=False)
         return world
 
-    def _keep(self, key: str, world: World) -> World:
-        self._worlds[key] = world
-        while len(self._worlds) > REMEMBERED:
-            self._worlds.popitem(last=False)
-        return world
+    def _last_known(self, keys: Sequence[str]) -> tuple[int, World | None]:
+        """Return how many actions led to the last world that is kept, and that world."""
+        with self._changing:
+            for known in reversed(range(len(keys))):
+                if (world := self._worlds.get(keys[known])) is not None:
+                    return known, world
+        return 0, None
 
 
 @dataclass(kw_only=True)

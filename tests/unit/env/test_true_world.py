@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.env import ActionSpec
+from egosim_jax.env import ActionSpec, true_world
 from egosim_jax.env.rewards import MoveObject
 from egosim_jax.env.single import WorldEnv
 from egosim_jax.env.true_world import TrueWorld
@@ -62,6 +62,17 @@ def test_a_start_of_the_past_continues_to_the_same_state():
             env.reset(options={"start": middle})
         hashes.append(env.chunk_step(rows[::-1][:4])[-1]["state_sha256"])
     assert hashes[0] == hashes[1]
+
+
+def test_the_worlds_that_were_used_last_are_kept(monkeypatch):
+    monkeypatch.setattr(true_world, "REMEMBERED", 2)
+    world = TrueWorld(video=VIDEO)
+    starts = [world.start(seed, JOINTS) for seed in (1, 2, 3)]
+    kept = world.after(starts[0], "human")
+    for start in (starts[1], starts[0], starts[2]):
+        world.after(start, "human")
+    assert world.after(starts[0], "human") is kept
+    assert len(world._worlds) == 2
 
 
 def test_a_state_of_elsewhere_is_refused():
