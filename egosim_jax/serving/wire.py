@@ -24,6 +24,8 @@ LISTED = 512
 """Most numbers of an array that JSON has as a list."""
 MAX_DEPTH = 16
 """Deepest nesting of a message."""
+MAX_ITEMS = 200_000
+"""Most items of all lists and maps of a message from a client."""
 
 
 def pack(value: Any) -> bytes:
@@ -42,8 +44,27 @@ def unpack(data: bytes, *, limit: int | None = None) -> Any:
 
     if limit is not None and len(data) > limit:
         raise InputError(f"The message has {len(data):,} bytes: it may have at most {limit:,}.")
+    items, longest = 0, -1 if limit is None else MAX_ITEMS
+
+    def counted(value: Any) -> Any:
+        nonlocal items
+        items += 1 + len(value)
+        if limit is not None and items > MAX_ITEMS:
+            raise InputError(
+                f"The message has more than {MAX_ITEMS:,} items in its lists and maps, the most "
+                "that is read. Send NumPy arrays instead of lists."
+            )
+        return value
+
     try:
-        value = msgpack.unpackb(data, object_hook=_unpacked, strict_map_key=True)
+        value = msgpack.unpackb(
+            data,
+            object_hook=lambda value: _unpacked(counted(value)),
+            list_hook=counted,
+            strict_map_key=True,
+            max_array_len=longest,
+            max_map_len=longest,
+        )
     except InputError:
         raise
     except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError) as error:

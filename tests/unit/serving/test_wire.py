@@ -43,6 +43,16 @@ def test_what_is_not_messagepack_is_refused(data):
         wire.unpack(data, limit=wire.MAX_BYTES)
 
 
+@pytest.mark.parametrize("item", [b"\x80", b"\x90", b"\xa1x"])
+def test_a_message_of_too_many_items_is_refused(item):
+    lists = b"\xdd\x00\x01\x00\x00" + item * (1 << 16)
+    with pytest.raises(InputError, match="more than 200,000 items"):
+        wire.unpack(b"\x94" + lists * 4, limit=wire.MAX_BYTES)
+    assert len(wire.unpack(b"\x94" + lists * 4)) == 4
+    with pytest.raises(InputError, match="max_array_len"):
+        wire.unpack(b"\xdd\x00\xff\xff\xff" * 3, limit=wire.MAX_BYTES)
+
+
 def test_a_large_message_is_refused_by_its_size():
     with pytest.raises(InputError, match="at most 10"):
         wire.unpack(bytes(11), limit=10)
