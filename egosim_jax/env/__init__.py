@@ -3,8 +3,8 @@
     env = gymnasium.make("egosim_jax/Tabletop-v0")
     envs = gymnasium.make_vec("egosim_jax/Tabletop-v0", num_envs=8)
 
-An action is a row of numbers (`actions.py`); `chunk_step` takes as many rows as a clip has frames.
-Needs the extra `env`.
+An action is a row of numbers (`actions.py`); `env.unwrapped.chunk_step` takes as many rows as a
+clip has frames. Needs the extra `env`.
 """
 
 from __future__ import annotations

@@ -74,7 +74,12 @@ class Start:
         )
 
     def save(self, folder: Path) -> None:
-        """Write the folder, complete or absent."""
+        """Write the folder, complete or absent. Raises `InputError` for a past too long to read."""
+        if len(self.past) > MAX_CLIPS:
+            raise InputError(
+                f"The start has {len(self.past)} past actions: at most {MAX_CLIPS} are read again. "
+                "Save one after fewer steps, or reset before."
+            )
         with atomic_folder(folder) as temporary:
             snapshot.save(temporary / "state", self.state)
             if self.first_frame is not None:

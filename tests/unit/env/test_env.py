@@ -1,5 +1,7 @@
 """Gymnasium environments of a painted world: no model, no compilation."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -94,6 +96,15 @@ def test_a_start_is_saved_and_loaded_whole(tmp_path):
     for one in (env, again):
         one.unwrapped.chunk_step(ahead(env))
     np.testing.assert_array_equal(env.unwrapped.running.frames(), again.unwrapped.running.frames())
+
+
+def test_a_past_too_long_to_be_read_is_not_saved(tmp_path):
+    env = make().unwrapped
+    env.reset(seed=3)
+    action = env.running.chunk(ahead(env)).action
+    with pytest.raises(InputError, match="1001 past actions"):
+        replace(env.running.now, past=(action,) * 1001).save(tmp_path / "start")
+    assert not (tmp_path / "start").exists()
 
 
 def test_moving_an_object_is_rewarded_by_its_distance():
