@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, no_type_check
+from typing import Any, TypeVar, cast, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,13 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.image import clip_pixels
-from egosim_jax.conditioning.posterior import EncodingNoise, add_pixel_noise, draw, posterior
+from egosim_jax.conditioning.posterior import (
+    EncodingNoise,
+    NormalizedCodec,
+    add_pixel_noise,
+    draw,
+    posterior,
+)
 from egosim_jax.conditioning.video import to_model, to_uint8
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
@@ -134,7 +140,7 @@ def encode_condition(
     noise = noise or EncodingNoise()
     if inputs.seeds is None and noise != EncodingNoise():
         raise InputError("A random encoding needs seeds: give each triplet one. (seeds)")
-    keys = () if inputs.seeds is None else (_keys(inputs.seeds, 2), _keys(inputs.seeds, 3))
+    keys: Any = () if inputs.seeds is None else (_keys(inputs.seeds, 2), _keys(inputs.seeds, 3))
 
     def encode(video: Array | None, *, std: float = 0.0, drawn: bool = False) -> Array | None:
         if video is None:
@@ -143,7 +149,7 @@ def encode_condition(
         if std:
             pixels = add_pixel_noise(pixels, std, keys[0])
         if drawn:
-            return draw(*posterior(networks.vae, pixels), keys[1])
+            return draw(*posterior(cast(NormalizedCodec, networks.vae), pixels), keys[1])
         return networks.vae.encode(pixels)
 
     embed = replicate_params(networks.text)

@@ -137,7 +137,7 @@ class ModelConfig:
 
     def _image_sizes(self) -> list[tuple[str, int | None, str, int | None]]:
         """Return the widths of the image tokens, which must agree."""
-        given = self.image and self.image.dim
+        given = None if self.image is None else self.image.dim
         if self.zero_image_tokens is None:
             return [("dit.image_dim", self.dit.image_dim, "image.dim", given)]
         check_counts({"zero_image_tokens": self.zero_image_tokens})

@@ -300,7 +300,7 @@ class FromTabletop(FromScratch):
     rollout_clips: int = 4
     """Clips of each of these scenes."""
     twins: bool | None = None
-    """True: static twins and hands as meshes, as DWM is conditioned on, of people alone."""
+    """True: static twins and hands as meshes, as DWM is conditioned on, of human hands alone."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` for rollouts without a model that makes them, or of static twins."""

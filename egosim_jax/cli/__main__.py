@@ -46,7 +46,7 @@ Commands = (
 
 
 PROGRAMS = {"train": "egosim_jax.train.__main__", "convert": "egosim_jax.convert.__main__"}
-"""Subcommands that are programs of their own, imported only when they are called."""
+"""Subcommands that are separate programs, imported only when they are called."""
 
 START = """\
 egosim: an egocentric world simulator in JAX
@@ -60,7 +60,7 @@ egosim: an egocentric world simulator in JAX
   egosim doctor                   devices, versions, extras, and what fits
 
 egosim --help describes all commands, egosim COMMAND --help the options of one."""
-"""What `egosim` alone prints."""
+"""Page that `egosim` alone prints."""
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from egosim_jax.io.untrusted import quote_path, read_bytes
 from egosim_jax.types import InputError
@@ -73,7 +73,7 @@ def read_spiece(path: Path) -> Tokenizer:
     return tokenizer
 
 
-def fields(data: bytes) -> Iterator[tuple[int, bytes | int]]:
+def fields(data: bytes) -> Iterator[tuple[int, Any]]:
     """Yield number and value of each field of a protocol buffer: an integer, or bytes.
 
     Raises `ValueError` if it ends in a field, or has a wire type that is not known.

@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -156,7 +157,7 @@ class Training:
 
     def _encoded_as(self, kind: Base | Hands) -> ModelConfig:
         """Return a model that reads the latents of a kind."""
-        if kind in BASES:
+        if kind == "inpaint" or kind == "image":
             return self.base_model(kind)
         return VARIANTS["adaln_frame"].model(self.config, kind) if kind == "poses" else self.config
 
@@ -185,7 +186,7 @@ class Training:
                 base,
                 Widening(base=BASES[variant.base], layout=variant.layout, input_layer="patch"),
             )
-            weights.save(folder / "dit.safetensors", networks.dit)
+            weights.save(folder / "dit.safetensors", cast(nnx.Module, networks.dit))
             weights.link_others(folder, base)
         return folder
 
@@ -252,8 +253,8 @@ def widen(networks: Networks, base: Path, widening: Widening) -> None:
 
 def _clips(source: ShardReader) -> Iterator[Triplet]:
     for record in source:
-        names = {name: str(record.metadata[name]) for name in ("video_id", "prompt")}
-        yield Triplet(**names, **record.arrays)
+        named: dict[str, Any] = {n: str(record.metadata[n]) for n in ("video_id", "prompt")}
+        yield Triplet(**{**named, **record.arrays})
 
 
 def changed(clip: Triplet, kind: Base | Hands, events: TabletopClip | None = None) -> Triplet:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from jaxtyping import Float32
@@ -73,7 +73,7 @@ class Variant:
 
 def with_layout(config: ModelConfig, layout: ChannelLayout, name: str) -> ModelConfig:
     """Return a model of other input channels under another name."""
-    dit: CogVideoXDiTConfig = replace(config.dit, in_channels=layout.channels)
+    dit = replace(cast(CogVideoXDiTConfig, config.dit), in_channels=layout.channels)
     return replace(config, name=f"{config.name}_{name}", dit=dit, layout=layout)
 
 

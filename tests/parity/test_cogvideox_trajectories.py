@@ -118,7 +118,7 @@ def ours(solver, denoise, x, keys):
 
 
 def step_noises(keys, shape, dtype):
-    """What `integrate` draws at each step."""
+    """Return the noise that `integrate` draws at each step."""
     fold = jax.vmap(jax.random.fold_in, in_axes=(0, None))
     draw = jax.vmap(lambda key: jax.random.normal(key, shape[1:], dtype))
     return [np.array(draw(fold(keys, i))) for i in range(STEPS)]

@@ -1,4 +1,4 @@
-"""A killed server resumes its sessions; clients go on, also OpenPI's from its own environment.
+"""A killed server resumes its sessions; clients continue, also OpenPI's from its own environment.
 
     python -m venv openpi && openpi/bin/pip install openpi-client typing_extensions
     OPENPI_PYTHON=openpi/bin/python pytest -m slow tests/system/test_serving.py
@@ -112,7 +112,7 @@ def drive(kind, port, *, until=None):
 
 
 def kill_and_continue(kind, command, folder):
-    """Kill the server in mid step, go on; the same without a kill; the steps of both."""
+    """Kill the server in mid step, continue; the same without a kill; the steps of both."""
     server = Server(folder / "killed", command)
     clients, threads, before = drive(kind, server.port, until=2)
     time.sleep(0.3)

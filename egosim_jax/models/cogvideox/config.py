@@ -131,8 +131,9 @@ class CogVideoXDiTConfig:
         return self.dim // self.heads
 
     @property
-    def image_dim(self) -> None:
-        """Width of the image encoder's tokens: the model has no image branch."""
+    def image_dim(self) -> int | None:
+        """Width of the image encoder's tokens; None: the model has no image branch."""
+        return None
 
     @property
     def condition_channels(self) -> int:

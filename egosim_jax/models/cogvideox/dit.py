@@ -91,19 +91,7 @@ class Modulation(nnx.Module):
 
 
 def modulate(
-    x: Float[Array, "b n d"],
-    shift: Float[
-        Array,
-        (
-            b  # n d
-        ),
-    ],
-    scale: Float[
-        Array,
-        (
-            b  # n d
-        ),
-    ],
+    x: Float[Array, "b n d"], shift: Float[Array, "b _ d"], scale: Float[Array, "b _ d"]
 ) -> Float[Array, "b n d"]:
     """Scale and shift normalized tokens."""
     return x * (1 + scale) + shift

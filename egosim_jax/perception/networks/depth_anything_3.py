@@ -31,7 +31,7 @@ MIN_VIEWS = 2
 
 @dataclass(frozen=True)
 class _DepthAnything3(Network):
-    """What depth and cameras by Depth Anything 3 share."""
+    """Common part of depth and cameras by Depth Anything 3."""
 
     needs: ClassVar[str] = "Depth Anything 3 (depth-anything/DA3*)"
     packages: ClassVar[tuple[str, ...]] = ("torch", "torchvision", "depth_anything_3")
