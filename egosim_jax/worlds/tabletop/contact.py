@@ -40,7 +40,7 @@ from egosim_jax.worlds.tabletop.support import (
 
 PAD_M = 0.012
 """Fingertips touch a surface within this distance: the radius of a finger, and its compliance."""
-FIRM_M = 0.006
+FIRM_M = 0.0005
 """A closing hand holds a body when both fingertips are this near, or touch it and get no nearer."""
 BETWEEN_M = (0.001, 0.003)
 """A body is between fingertips if their middle is so deep in it, or so much deeper than they."""
@@ -88,6 +88,8 @@ class Contact:
     """Hand, joint and body of joints inside bodies that they do not push."""
     closing: frozenset[int] = field(default_factory=frozenset)
     """Hands that closed in the last step."""
+    released: frozenset[tuple[int, str]] = field(default_factory=frozenset)
+    """Hand and name of bodies that a hand released and has not left yet."""
 
     def holder(self, name: str) -> Grasp | None:
         """Return the grasp that moves a body."""
@@ -170,6 +172,12 @@ def _step(
     contact = _follow(contact, here_m, kind, ranks)
     for hand in hands:
         contact = _grasp(contact, int(hand), last_m[hand], here_m[hand], kind)
+    released = {
+        (hand, name)
+        for hand, name in contact.released
+        if _contact(contact.scene, contact.scene.body(name), here_m[hand])[1] <= LEAVE_M[1]
+    }
+    contact = replace(contact, released=frozenset(released))
     for hand in hands:
         contact = _push(contact, int(hand), here_m[hand], kind, ranks)
     if ranks:
@@ -195,7 +203,8 @@ def _let_go(contact: Contact, grasps: list[Grasp], joints_m: np.ndarray | None =
         if any(other.name == grasp.name for other in kept):
             continue
         scene = settle(scene, body.name) if moves(body) else _rest(scene, body)
-    return replace(contact, scene=scene, grasps=kept, pressing=frozenset(pressing))
+    left = contact.released | {(grasp.hand, grasp.name) for grasp in grasps}
+    return replace(contact, scene=scene, grasps=kept, pressing=frozenset(pressing), released=left)
 
 
 def _rest(scene: Scene, body: Body) -> Scene:
@@ -275,17 +284,13 @@ def _grasp(
         before, deep = _contact(contact.scene, body, last_m)
         here, depth = _contact(contact.scene, body, here_m)
         firm = here <= FIRM_M or (before <= PAD_M and here >= before)
+        firm &= (hand, body.name) not in contact.released or depth <= deep  # not if it leaves
         if firm and min(deep, depth) < deepest:
             deepest, chosen = min(deep, depth), body.name
     if chosen is None:
         return contact
-    world_from_part = contact.scene.first_part_pose(chosen)
-    grasp = Grasp(
-        hand=hand,
-        name=chosen,
-        part_from_hand=invert(world_from_part) @ frame_of(here_m, kind),
-        gap_m=gap,
-    )
+    pose = invert(contact.scene.first_part_pose(chosen)) @ frame_of(here_m, kind)
+    grasp = Grasp(hand=hand, name=chosen, part_from_hand=pose, gap_m=gap)
     return replace(contact, grasps=(*contact.grasps, grasp))
 
 
