@@ -60,6 +60,7 @@ class Marked:
             object_ids=np.full((5, 48, 80), 99, np.int32),
         ),
         draw_hands=reference.draw_hands,
+        draw_mesh=reference.draw_mesh,
     )
 
     def __call__(self, view, action, first_frame, seed):
