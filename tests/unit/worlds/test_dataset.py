@@ -54,6 +54,7 @@ class OwnStates:
         return [None for _ in clips]
 
 
+@pytest.mark.slow
 def test_priors_are_rendered_from_the_states_that_are_asked_for(tmp_path):
     own, true = tmp_path / "own", tmp_path / "true"
     config = DatasetConfig(seeds=(5,), clips=2, spec=SPEC, kind="human")
@@ -66,6 +67,7 @@ def test_priors_are_rendered_from_the_states_that_are_asked_for(tmp_path):
         list(make_shards(config, out=own, workers=1, states=OwnStates(2)))
 
 
+@pytest.mark.slow
 def test_every_fourth_mixed_scene_has_a_robot(tmp_path):
     config = DatasetConfig(seeds=(7, 8, 9), clips=1, spec=SPEC, kind="mixed")
     list(make_shards(config, out=tmp_path, workers=1))

@@ -287,6 +287,7 @@ def test_a_body_moves_smoothly_and_ends_at_its_goal(verb, kind):
         assert moments[-1].scene.openings[intent.name] == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_a_body_under_another_is_neither_taken_nor_opened():
     """After stacking, the lower body is never a target, except that a drawer may slide."""
     checked = 0
