@@ -155,23 +155,15 @@ drawn at each update. One H100 takes 4 clips at a time, in 57 GiB of its 75 (`--
 eight devices 7 each, with `--training.grad-accum-steps 7` one at a time.
 """
 
-DWM_WAN_14B = FineTuning(
+DWM_WAN_14B = replace(
+    DWM_COGVIDEOX_5B,
     config="dwm_wan_14b",
-    rank=64,
-    times="uniform",
-    training=TrainConfig(
+    training=replace(
+        DWM_COGVIDEOX_5B.training,
         steps=5000,
         batch_size=8,
         grad_accum_steps=8,
-        optimizer=OptimizerConfig(
-            learning_rate=1e-4,
-            warmup_steps=100,
-            schedule="cosine_restarts",
-            weight_decay=0.01,
-        ),
-        save_every=500,
-        validate_every=500,
-        sample_every=500,
+        optimizer=replace(DWM_COGVIDEOX_5B.training.optimizer, b2=OptimizerConfig.b2),
     ),
 )
 r"""DWM's training on Wan 2.1 Fun V1.1 14B InP, widened from 36 to 52 channels.

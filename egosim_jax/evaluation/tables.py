@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Literal
 
@@ -64,31 +65,17 @@ _EGOSIM_PROTOCOL = Protocol(size="target", lengths="common")
 _DWM_PROTOCOL = Protocol(size="target", lengths="common", frame_0=True)
 
 
-def _egosim_table(title: str, groups: Mapping[str, str], published: Mapping[str, Figures]) -> Table:
-    return Table(
-        title=title,
-        shown=_EGOSIM_SHOWN,
-        group="dataset",
-        groups=groups,
-        protocol=_EGOSIM_PROTOCOL,
-        lpips="alex",
-        published=published,
-        source=EGOSIM,
-    )
-
-
-def _dwm_table(title: str, groups: Mapping[str, str], published: Mapping[str, Figures]) -> Table:
-    return Table(
-        title=title,
-        shown=_DWM_SHOWN,
-        group="dataset",
-        groups=groups,
-        protocol=_DWM_PROTOCOL,
-        lpips="vgg",
-        published=published,
-        source=DWM,
-    )
-
+_egosim_table = partial(
+    Table,
+    shown=_EGOSIM_SHOWN,
+    group="dataset",
+    protocol=_EGOSIM_PROTOCOL,
+    lpips="alex",
+    source=EGOSIM,
+)
+_dwm_table = partial(
+    Table, shown=_DWM_SHOWN, group="dataset", protocol=_DWM_PROTOCOL, lpips="vgg", source=DWM
+)
 
 _SINGLE = {
     "egodex": {
@@ -109,17 +96,19 @@ _SETS = {
 }
 TABLES = {
     "egosim": _egosim_table(
-        "EgoSim: single clips", {"egodex": "EgoDex", "egovid": "EgoVid"}, _SINGLE
+        title="EgoSim: single clips",
+        groups={"egodex": "EgoDex", "egovid": "EgoVid"},
+        published=_SINGLE,
     ),
     "egosim_continuous": _egosim_table(
-        "EgoSim: continuous generation, two clips of 61 frames",
-        {"egodex": "EgoDex"},
-        {"egodex": {"EgoSim continuous": _egosim(19.165, 0.835, 0.220, 10.943, 0.0017)}},
+        title="EgoSim: continuous generation, two clips of 61 frames",
+        groups={"egodex": "EgoDex"},
+        published={"egodex": {"EgoSim continuous": _egosim(19.165, 0.835, 0.220, 10.943, 0.0017)}},
     ),
     "egosim_ablation": _egosim_table(
-        "EgoSim: without trajectory and without mask",
-        {"egodex": "EgoDex"},
-        {
+        title="EgoSim: without trajectory and without mask",
+        groups={"egodex": "EgoDex"},
+        published={
             "egodex": {
                 "EgoSim": _SINGLE["egodex"]["EgoSim"],
                 "without trajectory": _egosim(23.380, 0.845, 0.244),
@@ -128,20 +117,22 @@ TABLES = {
         },
     ),
     "egosim_robot": _egosim_table(
-        "EgoSim: transfer to a robot",
-        {"agibot": "AgiBot"},
-        {
+        title="EgoSim: transfer to a robot",
+        groups={"agibot": "AgiBot"},
+        published={
             "agibot": {
                 "EgoSim, pre-trained on humans": _egosim(18.670),
                 "EgoSim, not pre-trained": _egosim(15.180),
             }
         },
     ),
-    "egosim_few_shot": _egosim_table("EgoSim: a few clips of EgoCap", {"egocap": "EgoCap"}, {}),
+    "egosim_few_shot": _egosim_table(
+        title="EgoSim: a few clips of EgoCap", groups={"egocap": "EgoCap"}
+    ),
     "dwm_1": _dwm_table(
-        "DWM: Table 1",
-        _SETS,
-        {
+        title="DWM: Table 1",
+        groups=_SETS,
+        published={
             "synthetic_dynamic": {
                 "CVX SDEdit": _dwm(19.424, 0.675, 0.464, 0.257),
                 "CVX-Fun, fine-tuned": _dwm(20.541, 0.767, 0.370, 0.175),
@@ -161,9 +152,9 @@ TABLES = {
         },
     ),
     "dwm_2": _dwm_table(
-        "DWM: Table 2, data sets of the training",
-        _SETS,
-        {
+        title="DWM: Table 2, data sets of the training",
+        groups=_SETS,
+        published={
             name: {"TRUMANS alone": alone, "TRUMANS and TASTE-Rob": both}
             for name, alone, both in (
                 (
@@ -185,9 +176,9 @@ TABLES = {
         },
     ),
     "dwm_3": _dwm_table(
-        "DWM: Table 3, conditioning on hands",
-        {"synthetic_dynamic": _SETS["synthetic_dynamic"]},
-        {
+        title="DWM: Table 3, conditioning on hands",
+        groups={"synthetic_dynamic": _SETS["synthetic_dynamic"]},
+        published={
             "synthetic_dynamic": {
                 "AdaLN, global": _dwm(21.962, 0.806, 0.306, 0.127),
                 "AdaLN, per frame": _dwm(22.789, 0.827, 0.288, 0.110),
@@ -197,9 +188,9 @@ TABLES = {
         },
     ),
     "dwm_4": _dwm_table(
-        "DWM: Table 4, initial weights, by training step",
-        {"synthetic_dynamic": _SETS["synthetic_dynamic"]},
-        {
+        title="DWM: Table 4, initial weights, by training step",
+        groups={"synthetic_dynamic": _SETS["synthetic_dynamic"]},
+        published={
             "synthetic_dynamic": {
                 f"{name}, step {1000 * number}": {"dreamsim": value}
                 for name, values in (

@@ -33,7 +33,7 @@ from egosim_jax.experiments.tabletop import over_seeds, summarize_runs
 from egosim_jax.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder, write_json
-from egosim_jax.metrics.report import paired_difference, print_table
+from egosim_jax.metrics.report import paired_differences, print_table
 from egosim_jax.progress import track
 from egosim_jax.types import InputError, check_counts
 
@@ -167,13 +167,7 @@ def _differences(by_scene: Mapping[str, Sequence[Mapping[str, float]]]) -> Table
     """Return how DWM differs from each other method on the same scenes, by measure."""
     ours = by_scene[REFERENCE]
     return {
-        name: {
-            measure: paired_difference(
-                [scores[measure] for scores in ours], [scores[measure] for scores in scenes]
-            )
-            for measure in MEASURES
-            if measure in ours[0]
-        }
+        name: paired_differences(ours, scenes, [m for m in MEASURES if m in ours[0]])
         for name, scenes in by_scene.items()
         if name != REFERENCE
     }

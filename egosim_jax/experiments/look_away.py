@@ -24,7 +24,7 @@ from egosim_jax.geometry import invert, rotation_z, transform
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import read_json
 from egosim_jax.metrics import region
-from egosim_jax.metrics.report import paired_difference, print_table, summarize
+from egosim_jax.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.metrics.update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.perception import registry
 from egosim_jax.progress import track
@@ -126,13 +126,9 @@ def run(settings: LookAway) -> None:
 def _report(out: Path, seeds: list[int], scores: Mapping[str, list[dict[str, float]]]) -> None:
     table = {row: summarize(found, MEASURES) for row, found in scores.items()}
     differences = {
-        f"{case}: {method}": {
-            measure: paired_difference(
-                [score[measure] for score in scores[f"{case}: {method}"]],
-                [score[measure] for score in scores[f"{case}: no update"]],
-            )
-            for measure in MEASURES
-        }
+        f"{case}: {method}": paired_differences(
+            scores[f"{case}: {method}"], scores[f"{case}: no update"], MEASURES
+        )
         for case in CASES
         for method in METHODS
         if METHODS[method]

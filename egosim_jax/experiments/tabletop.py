@@ -25,7 +25,7 @@ from egosim_jax.experiments.scenes import (
 )
 from egosim_jax.generator import Generator
 from egosim_jax.io.run import write_json
-from egosim_jax.metrics.report import paired_difference, print_table, summarize
+from egosim_jax.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.progress import track
 from egosim_jax.types import Kind, VideoSpec, check_counts
 
@@ -147,13 +147,7 @@ def differences_from(
     """Return how each method differs from a reference on the same scenes, by measure."""
     start = by_scene[reference]
     return {
-        name: {
-            measure: paired_difference(
-                [scores[measure] for scores in scenes], [scores[measure] for scores in start]
-            )
-            for measure in MEASURES
-            if measure in start[0]
-        }
+        name: paired_differences(scenes, start, [m for m in MEASURES if m in start[0]])
         for name, scenes in by_scene.items()
         if name != reference
     }

@@ -52,6 +52,20 @@ def summarize(
     return summary
 
 
+def paired_differences(
+    scores: Sequence[Mapping[str, float]],
+    reference: Sequence[Mapping[str, float]],
+    measures: Iterable[str],
+) -> dict[str, dict[str, float]]:
+    """Return `paired_difference` of each measure between two methods on the same scenes."""
+    return {
+        measure: paired_difference(
+            [found[measure] for found in scores], [found[measure] for found in reference]
+        )
+        for measure in measures
+    }
+
+
 def paired_difference(
     values: Sequence[float],
     reference: Sequence[float],

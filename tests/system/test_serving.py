@@ -21,7 +21,10 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 STEPS = 4
-NEEDS_OPENPI = pytest.mark.skipif("OPENPI_PYTHON" not in os.environ, reason="no OPENPI_PYTHON")
+NEEDS_OPENPI = pytest.mark.skipif(
+    "OPENPI_PYTHON" not in os.environ,
+    reason="no OPENPI_PYTHON: it needs numpy < 2",
+)
 
 OURS = """
 import sys

@@ -67,7 +67,7 @@ class Object:
     place_m: tuple[float, float] | None = None
     """Position x and y of its center in meters; that of the body below if `on` is given."""
     on: str | None = None
-    """Name of the body that it stands on, which precedes it; the table if not given."""
+    """Name of the supporting body, which precedes it; the table if not given."""
     turn_degrees: float = 0.0
     """Rotation about the vertical in degrees; furniture is not turned."""
     width_m: float | None = None

@@ -77,7 +77,10 @@ def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
     np.testing.assert_array_equal(rows, actions)
 
 
-@pytest.mark.skipif("LEROBOT_PYTHON" not in os.environ, reason="no LEROBOT_PYTHON")
+@pytest.mark.skipif(
+    "LEROBOT_PYTHON" not in os.environ,
+    reason="no LEROBOT_PYTHON: lerobot pins other versions",
+)
 def test_lerobots_own_loader_reads_the_same(folder, tmp_path):
     export.to_lerobot(export.open_sessions(folder), tmp_path / "set")
     command = [os.environ["LEROBOT_PYTHON"], "-c", LOADED, str(tmp_path / "set"), "found.npz"]
