@@ -210,11 +210,17 @@ class Episode:
             return _read(folder)
 
 
-def check_action(action: Action, *, state: SceneState, fps: int) -> None:
-    """Raise `InputError` for too fast a camera, joints in another order, a scene out of sight."""
+def check_action(action: Action, *, state: SceneState, fps: int, continued: bool = False) -> None:
+    """Raise `InputError` for too fast a camera, joints in another order, a scene out of sight.
+
+    The first camera must see the scene; of an action that is `continued` the last one, too, which
+    is the first of the next action.
+    """
     _check_speed(action.cameras, fps)
     _check_order(action)
-    _check_scene(state, action.cameras)
+    _check_scene(state, action.cameras, 0)
+    if continued:
+        _check_scene(state, action.cameras, -1)
 
 
 def _check_equal(action: Action, first: Action) -> None:
@@ -291,19 +297,20 @@ def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
     return bool(alike and (palm > 1.4 * first).all() and first.sum() > last.sum())
 
 
-def _check_scene(state: SceneState, cameras: Cameras) -> None:
-    """Raise `InputError` unless the first camera sees points at distances of meters."""
-    local = transform(invert(cameras.world_from_camera[0]), state.points_m.astype(float))
+def _check_scene(state: SceneState, cameras: Cameras, frame: int) -> None:
+    """Raise `InputError` unless the camera of a frame sees points at distances of meters."""
+    local = transform(invert(cameras.world_from_camera[frame]), state.points_m.astype(float))
     inside = pixels_of(cameras, local)[2]
+    which = "last" if frame else "first"
     if not inside.any():
         raise InputError(
-            f"its first camera sees none of the {len(local)} points of the state: state and "
+            f"its {which} camera sees none of the {len(local)} points of the state: state and "
             "cameras must be in one world frame (OpenCV axes, world_from_camera), in meters."
         )
     median = float(np.median(local[inside, 2]))
     if not DEPTH_M[0] <= median <= DEPTH_M[1]:
         raise InputError(
-            f"the points that its first camera sees are {median:.4g} m away (median): it must be "
+            f"the points that its {which} camera sees are {median:.4g} m away (median): it must be "
             f"from {DEPTH_M[0]} to {DEPTH_M[1]} m. Convert the state to meters."
         )
 

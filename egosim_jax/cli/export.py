@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +20,7 @@ class Export:
 
     lerobot: a dataset of version 3.0, an episode for each stretch between resets. shards: a clip
     for each step, whose target is the generated clip. rerun: OUT/SESSION.rrd of each session, for
-    `egosim view`. Prints what was written.
+    `egosim view`. A damaged session is reported and skipped (exit code 3). Prints OUT.
     """
 
     sessions: Annotated[Path, tyro.conf.Positional]
@@ -46,7 +47,9 @@ class Export:
 
         if self.to == "lerobot":
             check_new(self.out)
-        found = export.open_sessions(self.sessions, self.session)
+        found, damaged = export.open_sessions(self.sessions, self.session)
+        for name, problem in damaged.items():
+            print(f"skipped session {name}: {problem}", file=sys.stderr)
         if self.to == "lerobot":
             export.to_lerobot(found, self.out)
         elif self.to == "shards":
@@ -54,7 +57,5 @@ class Export:
         else:
             for session in found:
                 export.to_rerun(session, self.out / f"{session.id}.rrd")
-                print(self.out / f"{session.id}.rrd")
-            return ExitCode.DONE
         print(self.out)
-        return ExitCode.DONE
+        return ExitCode.PARTIAL if damaged else ExitCode.DONE

@@ -56,6 +56,8 @@ class Serve:
     """Most steps that run at the same time."""
     max_steps: int = 10_000
     """Most steps of a session."""
+    connections: int = 256
+    """Most connections of clients; further ones are refused with status 503."""
     step_timeout: float = 120.0
     """Longest time in seconds that a client waits for a step, which continues without it."""
 
@@ -75,10 +77,11 @@ class Serve:
         token = os.environ.get(TOKEN, "").strip() or None
         with bind(self.host, self.port, token=token) as bound:
             service = self._service()
+            finished = True
             try:
-                serve(service, bound, token=token, ready=self._ready)
+                finished = serve(service, bound, token=token, ready=self._ready)
             finally:
-                service.store.close()
+                service.store.close(at_once=not finished)
         return ExitCode.DONE
 
     def _service(self) -> Service:
@@ -93,6 +96,7 @@ class Serve:
             queue=self.queue,
             threads=self.threads,
             steps=self.max_steps,
+            connections=self.connections,
             step_timeout_s=self.step_timeout,
         )
         share_with_jax()

@@ -89,7 +89,19 @@ def start_of(
                 state = state if isinstance(state, SceneState) else snapshot.load(Path(state))
                 start = replace(start, state=state, first_frame=None)
     check_size(start, backend.video)
+    if start.row is not None:
+        _check_row(start.row, spec)
     return start if prompt is None else replace(start, prompt=str(prompt))
+
+
+def _check_row(row: np.ndarray, spec: ActionSpec) -> None:
+    try:
+        spec.check(np.asarray(row)[None], most=1)
+    except InputError as error:
+        raise InputError(
+            f"The row of the start is none of this environment: {error} Make the start with the "
+            "same ActionSpec, or without a row. (start)"
+        ) from error
 
 
 class Running:
@@ -119,7 +131,7 @@ class Running:
         chunk = make_chunk(
             self.actions, rows, start=self.now, frames=video.frames, prompt=prompt, hide=True
         )
-        check_action(chunk.action, state=self.now.state, fps=video.fps)
+        check_action(chunk.action, state=self.now.state, fps=video.fps, continued=True)
         return chunk
 
     def simulate(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:

@@ -17,15 +17,29 @@ from egosim_jax.serving import wire
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.types import InputError
 
+REPEATABLE = ("step", "reset", "save", "load", "status")
+"""Requests that have the same effect when they are sent again after a timeout."""
+
 
 class Client:
     """Connection to a server, for one thread."""
 
-    def __init__(self, address: str, *, token: str | None = None, timeout_s: float = 600.0):
-        """Connect to an address such as ws://127.0.0.1:8000."""
+    def __init__(
+        self,
+        address: str,
+        *,
+        token: str | None = None,
+        timeout_s: float = 600.0,
+        patience_s: float = 600.0,
+    ):
+        """Connect to an address such as ws://127.0.0.1:8000.
+
+        A request waits `timeout_s` for its reply, and is sent again for `patience_s` while the
+        server is full or the session busy.
+        """
         import websockets.sync.client
 
-        self._timeout_s = timeout_s
+        self._timeout_s, self._patience_s = timeout_s, patience_s
         headers = {"Authorization": f"Bearer {token}"} if token else None
         self._connection = websockets.sync.client.connect(
             address.replace("http", "ws", 1) if address.startswith("http") else address,
@@ -66,6 +80,18 @@ class Client:
         If it is interrupted, or waits too long, the connection is closed: connect and attach again.
         """
         message = wire.pack({"request": kind, **fields})
+        until = time.monotonic() + self._patience_s
+        while True:
+            try:
+                return self._ask(message)
+            except RequestError as error:
+                wait = error.retry_after_s
+                again = error.status in (409, 429) or (error.status == 504 and kind in REPEATABLE)
+                if wait is None or not again or time.monotonic() + wait > until:
+                    raise
+            time.sleep(wait)
+
+    def _ask(self, message: bytes) -> dict[str, Any]:
         try:
             self._socket.send(message)
             reply = self._received()
@@ -96,29 +122,20 @@ class RemoteSession:
         self.step_id: int = reply["step_id"]
         """Last committed step."""
 
-    def step(self, rows: np.ndarray, *, patience_s: float = 600.0, **fields: Any) -> dict[str, Any]:
-        """Make the next step; wait for `patience_s` while the server is full or busy."""
-        until = time.monotonic() + patience_s
+    def step(self, rows: np.ndarray, **fields: Any) -> dict[str, Any]:
+        """Make the next step."""
         rows = np.asarray(rows, float)
-        while True:
-            try:
-                reply = self._client.request(
-                    "step", session=self.id, step_id=self.step_id + 1, actions=rows, **fields
-                )
-            except RequestError as error:
-                wait = error.retry_after_s
-                if wait is None or error.status == 503 or time.monotonic() + wait > until:
-                    raise
-                time.sleep(wait)
-                continue
-            if (reply["session"], reply["step_id"]) != (self.id, self.step_id + 1):
-                raise InputError(
-                    f"The reply is step {reply['step_id']} of session {reply['session']}, not step "
-                    f"{self.step_id + 1} of {self.id}: a client is for one thread. Give each "
-                    "thread its own."
-                )
-            self.step_id = reply["step_id"]
-            return reply
+        reply = self._client.request(
+            "step", session=self.id, step_id=self.step_id + 1, actions=rows, **fields
+        )
+        if (reply["session"], reply["step_id"]) != (self.id, self.step_id + 1):
+            raise InputError(
+                f"The reply is step {reply['step_id']} of session {reply['session']}, not step "
+                f"{self.step_id + 1} of {self.id}: a client is for one thread. Give each "
+                "thread its own."
+            )
+        self.step_id = reply["step_id"]
+        return reply
 
     def reset(self, **fields: Any) -> dict[str, Any]:
         """Continue from a `seed` or `episode`; without one from the first start."""

@@ -16,7 +16,7 @@ from egosim_jax.io.untrusted import quote_path
 from egosim_jax.rendering import get
 from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.recording import Recording
-from egosim_jax.serving.session import CLOSED, SETTINGS, Session, settings_of
+from egosim_jax.serving.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
 from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 
 
@@ -31,11 +31,12 @@ class _Unavailable:
         raise InputError("A recorded session cannot be continued here: use egosim serve.")
 
 
-def open_sessions(folder: Path, names: Sequence[str] = ()) -> list[Session]:
-    """Return the sessions of a server's folder, or those of some ids, with at least one step.
+def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session], dict[str, str]]:
+    """Return the sessions of a server's folder with at least one step, and what is damaged.
 
-    These are the open ones and those that were closed and kept.
-    Raises `InputError` if there are none, or for an id that is not there.
+    These are the open ones and those that were closed and kept. A damaged one does not keep the
+    others from being read. Raises `InputError` if no session is left, for an id of `names` that is
+    not there, and if a session that is named is damaged.
     """
     paths = sorted({p.parent for name in (SETTINGS, CLOSED) for p in folder.glob(f"[!.]*/{name}")})
     known = {path.name: path for path in paths}
@@ -44,15 +45,26 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> list[Session]:
             f"{quote_path(folder)} has no session {missing[0][:40]!r}; it has {len(known)}: "
             f"{', '.join(list(known)[:10]) or 'none'}. (--session)"
         )
-    chosen = [known[name] for name in names] or paths
-    sessions = [Session(path, _recorded(path)) for path in chosen]
-    found = [session for session in sessions if session.committed]
+    found, damaged = [], {}
+    for path in [known[name] for name in names] or paths:
+        try:
+            session = Session(path, _recorded(path))
+            session.check()
+        except DAMAGE as error:
+            if names:
+                raise InputError(
+                    f"Session {path.name} cannot be exported: {error} Export others. (--session)"
+                ) from error
+            damaged[path.name] = str(error)
+        else:
+            found += [session] if session.committed else []
     if not found:
         raise InputError(
-            f"{quote_path(folder)} has no session with a committed step: name the folder of "
-            "egosim serve. (SESSIONS)"
+            f"{quote_path(folder)} has no readable session with a committed step"
+            f"{f', and {len(damaged)} damaged ones' if damaged else ''}: name the folder of egosim "
+            "serve. (SESSIONS)"
         )
-    return found
+    return found, damaged
 
 
 def _recorded(path: Path) -> GeneratedWorld:

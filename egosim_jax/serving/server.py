@@ -8,146 +8,61 @@ has the same requests as JSON. All that is refused has a status, a code and a me
 from __future__ import annotations
 
 import asyncio
-import hmac
-import ipaddress
 import json
 import socket
 import threading
 from typing import Annotated, Any
-from urllib.parse import SplitResult, urlsplit
 
 import uvicorn
-from fastapi import Body, FastAPI, Path, WebSocket, WebSocketDisconnect
+from fastapi import Depends, FastAPI, Path, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, PlainTextResponse
 from starlette.exceptions import HTTPException
-from starlette.requests import HTTPConnection
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from egosim_jax.io.untrusted import quote, quote_text
 from egosim_jax.serving import wire
+from egosim_jax.serving.connections import BoundedProtocol
 from egosim_jax.serving.errors import RequestError
+from egosim_jax.serving.guard import Guard, is_loopback, response, too_large, too_slow
 from egosim_jax.serving.service import Service
 from egosim_jax.types import InputError
 
-OPEN_PATHS = ("/healthz", "/readyz")
-"""Paths that need no token."""
 DRAIN_S = 300.0
 """Longest time that a shutdown waits for the requests that are under way."""
-Fields = Annotated[dict[str, Any], Body(description="Fields of the request; see docs/serving.md.")]
+BODY = {
+    "requestBody": {
+        "description": "Fields of the request; see docs/serving.md.",
+        "content": {"application/json": {"schema": {"type": "object"}}},
+        "required": True,
+    }
+}
+"""Description of the body of a request, which is not read by FastAPI: its size is bounded first."""
 SessionId = Annotated[str, Path(description="Id that create has returned.")]
 
 
-class Guard:
-    """ASGI middleware that checks token, origin and size before a request is read."""
-
-    def __init__(self, app: ASGIApp, *, token: str | None, limit: int = wire.MAX_BYTES):
-        self._app, self._token, self._limit = app, token, limit
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or refuse it."""
-        if scope["type"] not in ("http", "websocket"):
-            return await self._app(scope, receive, send)
-        try:
-            self._check(HTTPConnection(scope))
-        except RequestError as error:
-            return await _refuse(error, scope, receive, send)
-        if scope["type"] == "websocket":
-            return await self._app(scope, receive, send)
-        await self._app(scope, self._bounded(receive), send)
-
-    def _check(self, connection: HTTPConnection) -> None:
-        headers, path = connection.headers, connection.scope["path"]  # url contains the Host header
-        host, origin = headers.get("host", ""), headers.get("origin")
-        if origin is not None and _address(origin).netloc != host:
-            raise RequestError(
-                403,
-                "wrong_origin",
-                "The request comes from a page of another origin, which may not use this server. "
-                "Use a client of your own.",
-            )
-        if self._token is None and not is_loopback(_address(f"//{host}").hostname or ""):
-            raise RequestError(
-                403,
-                "wrong_host",
-                "The host of the request is not this machine: without a token, the server is used "
-                "as localhost or 127.0.0.1 only.",
-            )
-        if self._token is not None and path not in OPEN_PATHS:
-            scheme, _, given = headers.get("authorization", "").partition(" ")
-            valid = hmac.compare_digest(given.strip().encode(), self._token.encode())
-            if scheme.lower() not in ("bearer", "api-key") or not valid:
-                raise RequestError(
-                    401,
-                    "wrong_token",
-                    "The token is missing or wrong: send the header Authorization: Bearer TOKEN, "
-                    "or give openpi-client the token as api_key.",
-                )
-        size = headers.get("content-length", "0")
-        if not size.isdecimal() or int(size) > self._limit:
-            raise _too_large(self._limit)
-
-    def _bounded(self, receive: Receive) -> Receive:
-        total = 0
-
-        async def bounded() -> Message:
-            nonlocal total
-            message = await receive()
-            total += len(message.get("body", b""))
-            if total > self._limit:
-                raise HTTPException(413)
-            return message
-
-        return bounded
-
-
-def _address(url: str) -> SplitResult:
-    try:
-        return urlsplit(url)
-    except ValueError:
+async def _fields(request: Request) -> dict[str, Any]:
+    """Return the fields of a JSON body, unpacked in a thread."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
         raise RequestError(
-            400, "invalid", f"{quote(url)} in Host or Origin is not a valid address. Send one."
-        ) from None
+            415,
+            "invalid",
+            f"The body is {quote(kind)}: its Content-Type must be application/json. Send JSON.",
+        )
+    return await asyncio.to_thread(wire.unpack_json, await request.body())
 
 
-def _too_large(limit: int) -> RequestError:
-    return RequestError(
-        413,
-        "too_large",
-        f"The message is larger than {limit:,} bytes, the most that is read. Send fewer rows or a "
-        "smaller episode.",
-    )
-
-
-async def _refuse(error: RequestError, scope: Scope, receive: Receive, send: Send) -> None:
-    if scope["type"] == "websocket" and "websocket.http.response" not in scope.get(
-        "extensions", {}
-    ):
-        await receive()
-        await send({"type": "websocket.close", "code": 1008, "reason": error.code})
-        return
-    response = _response(error)
-    await response(scope, receive, send)
-
-
-def _response(error: RequestError) -> JSONResponse:
-    headers = {}
-    if error.retry_after_s is not None:
-        headers["Retry-After"] = str(max(1, round(error.retry_after_s)))
-    return JSONResponse(error.body(), status_code=error.status, headers=headers)
-
-
-def is_loopback(host: str) -> bool:
-    """Return True if a host is this machine's loopback."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+Fields = Annotated[dict[str, Any], Depends(_fields)]
 
 
 def make_app(service: Service, *, token: str | None = None) -> FastAPI:
     """Return the application of a service; without a token it is used from this machine only."""
-    app = FastAPI(title="egosim_jax", version=service.describe()["version"])
+    app = FastAPI(
+        title="egosim_jax",
+        version=service.describe()["version"],
+        docs_url=None,  # its pages run scripts of another server
+        redoc_url=None,
+    )
     app.add_middleware(Guard, token=token)
 
     @app.exception_handler(RequestValidationError)
@@ -155,26 +70,31 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
         found = error.errors()[0]
         place = quote_text(".".join(map(str, found["loc"])))
         what = quote_text(str(found["msg"]))
-        return _response(
-            RequestError(422, "invalid", f"{place}: {what}. The body must be a JSON object.")
-        )
+        return response(RequestError(422, "invalid", f"{place}: {what}. Correct it."))
+
+    @app.exception_handler(InputError)
+    async def unreadable(_: Any, error: InputError) -> JSONResponse:
+        return response(service.refused(error))
 
     @app.exception_handler(HTTPException)
     async def refused(_: Any, error: HTTPException) -> JSONResponse:
         if error.status_code == 413:
-            return _response(_too_large(wire.MAX_BYTES))
+            return response(too_large(wire.MAX_BYTES))
+        if error.status_code == 408:
+            return response(too_slow())
         code = "unknown_path" if error.status_code in (404, 405) else "invalid"
         message = f"{error.detail}: /openapi.json lists the paths and methods of this server."
-        return _response(RequestError(error.status_code, code, message))
+        return response(RequestError(error.status_code, code, message))
 
-    async def call(name: str, fields: dict[str, Any]) -> JSONResponse:
+    async def call(name: str, fields: dict[str, Any]) -> Response:
         """Reply to a request of HTTP."""
         with service.active():
             try:
                 reply = await service.handle({**_from_json(fields), "request": name})
             except Exception as error:
-                return _response(service.refused(error))
-            return JSONResponse(wire.to_json(reply))
+                return response(service.refused(error))
+            data = await asyncio.to_thread(wire.pack_json, reply)
+            return Response(data, media_type="application/json")
 
     @app.get("/healthz", summary="The process is up")
     async def healthz() -> PlainTextResponse:
@@ -195,19 +115,19 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
         return JSONResponse(service.describe())
 
     @app.get("/sessions", summary="Sessions and their committed steps")
-    async def sessions() -> JSONResponse:
+    async def sessions() -> Response:
         return await call("status", {})
 
-    @app.post("/sessions", summary="Create a session")
-    async def create(fields: Fields) -> JSONResponse:
+    @app.post("/sessions", summary="Create a session", openapi_extra=BODY)
+    async def create(fields: Fields) -> Response:
         return await call("create", fields)
 
     @app.get("/sessions/{session}", summary="Status of a session")
-    async def status(session: SessionId) -> JSONResponse:
+    async def status(session: SessionId) -> Response:
         return await call("status", {"session": session})
 
     @app.delete("/sessions/{session}", summary="Close a session and remove its files")
-    async def close(session: SessionId, keep: bool = False) -> JSONResponse:
+    async def close(session: SessionId, keep: bool = False) -> Response:
         return await call("close", {"session": session, "keep": keep})
 
     for name, summary in {
@@ -226,8 +146,10 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
 
 
 def _add(app: FastAPI, name: str, summary: str, call: Any) -> None:
-    @app.post(f"/sessions/{{session}}/{name}", summary=summary, operation_id=name)
-    async def run(session: SessionId, fields: Fields) -> JSONResponse:
+    path = f"/sessions/{{session}}/{name}"
+
+    @app.post(path, summary=summary, operation_id=name, openapi_extra=BODY)
+    async def run(session: SessionId, fields: Fields) -> Response:
         return await call(name, {**fields, "session": session})
 
 
@@ -268,11 +190,12 @@ async def _reply(socket: WebSocket, service: Service, data: bytes | None) -> Non
     try:
         if data is None:
             raise InputError("The message is text: it must be binary, packed as MessagePack.")
-        reply = await service.handle(wire.unpack(data, limit=wire.MAX_BYTES))
+        message = await asyncio.to_thread(wire.unpack, data, limit=wire.MAX_BYTES)
+        reply = await asyncio.to_thread(wire.pack, await service.handle(message))
     except Exception as error:
         await socket.send_text(json.dumps(service.refused(error).body()))
         return
-    await socket.send_bytes(wire.pack(reply))
+    await socket.send_bytes(reply)
 
 
 class _Server(uvicorn.Server):
@@ -319,12 +242,17 @@ def bind(host: str, port: int, *, token: str | None) -> socket.socket:
     return bound
 
 
-def serve(service: Service, bound: socket.socket, *, token: str | None, ready: Any = None) -> None:
-    """Serve until SIGTERM or Ctrl-C; `ready` is called with the port that is listened on."""
+def serve(service: Service, bound: socket.socket, *, token: str | None, ready: Any = None) -> bool:
+    """Serve until SIGTERM or Ctrl-C; `ready` is called with the port that is listened on.
+
+    Returns False if a second signal has ended it before the requests under way were done.
+    """
     config = uvicorn.Config(
         make_app(service, token=token),
         log_level="warning",
         access_log=False,
+        http=BoundedProtocol,
+        limit_concurrency=service.store.limits.connections + 1,
         ws="websockets-sansio",
         ws_max_size=wire.MAX_BYTES,
         ws_ping_interval=30.0,
@@ -343,3 +271,4 @@ def serve(service: Service, bound: socket.socket, *, token: str | None, ready: A
         await running
 
     asyncio.run(run())
+    return not server.force_exit

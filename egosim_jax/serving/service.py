@@ -17,9 +17,10 @@ import numpy as np
 
 from egosim_jax.env.actions import LAYOUTS
 from egosim_jax.env.chunks import view_of
+from egosim_jax.env.specs import vars_of
 from egosim_jax.io.untrusted import quote
 from egosim_jax.serving.errors import RequestError, as_request_error
-from egosim_jax.serving.session import Result, Session, vars_of
+from egosim_jax.serving.session import Result, Session
 from egosim_jax.serving.store import Store
 from egosim_jax.types import InputError
 

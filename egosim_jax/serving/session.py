@@ -30,6 +30,7 @@ from egosim_jax.env.actions import ActionSpec, numbers
 from egosim_jax.env.backends import Backend
 from egosim_jax.env.batching import announced
 from egosim_jax.env.chunks import Chunk, last_camera, make_chunk, validity, view_of
+from egosim_jax.env.specs import spec_of, vars_of
 from egosim_jax.env.start import Start
 from egosim_jax.episode import check_action, load_action, save_action
 from egosim_jax.io.fingerprint import fingerprint
@@ -43,6 +44,8 @@ from egosim_jax.types import Action, Cameras, InputError, SceneState
 SETTINGS, CLOSED = "session.json", "closed.json"
 INFO, REQUEST, ACTION = "info.json", "request.json", "action.npz"
 FIRST = "first"
+DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
+"""Errors of reading a session whose files are damaged."""
 
 
 @no_type_check
@@ -159,7 +162,7 @@ class Session:
 
     def action(self, number: int) -> Action:
         """Return the action of a step that is on disk."""
-        request = read_json(self._step(number) / REQUEST)
+        request = self._request(number)
         return load_action(
             self._step(number) / ACTION,
             kind=self.actions.kind,
@@ -169,12 +172,20 @@ class Session:
 
     def request(self, number: int) -> str:
         """Return the hash of the request of a step that is on disk."""
-        return read_json(self._step(number) / REQUEST)["request"]
+        return self._request(number)["request"]
+
+    def _request(self, number: int) -> dict[str, Any]:
+        """Return the request of a step. Raises `InputError` if it is damaged."""
+        path = self._step(number) / REQUEST
+        found = read_json(path)
+        if not isinstance(found, dict) or not found.keys() >= {"prompt", "request", "rows"}:
+            raise InputError(f"{quote_path(path)} does not describe a step's request. Restore it.")
+        return found
 
     def repeat(self, number: int) -> Result:
         """Return the result of a committed step from its files."""
         folder, action = self._step(number), self.action(number)
-        request, clip = read_json(folder / REQUEST), folder / "rollout" / "clip_1"
+        request, clip = self._request(number), folder / "rollout" / "clip_1"
         info = read_json(folder / INFO)
         state = clip / "state"
         return Result(
@@ -208,7 +219,7 @@ class Session:
             )
         video, now = self.backend.video, self.now
         chunk = make_chunk(self.actions, rows, start=now, frames=video.frames, prompt=prompt)
-        check_action(chunk.action, state=now.state, fps=video.fps)
+        check_action(chunk.action, state=now.state, fps=video.fps, continued=True)
         self._accept(step_id, chunk, request)
         return self.finish()
 
@@ -256,7 +267,7 @@ class Session:
             (step,) = Rollout(simulator, folder / "rollout").run(
                 now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
             )
-        request = read_json(folder / REQUEST)
+        request = self._request(number)
         info = {
             **self._facts(step.state, number),
             "padded_frames": request["padded_frames"],
@@ -320,9 +331,17 @@ class Session:
                 steps = list(range(base + 1, end + 1))
                 yield Start.load(self.folder / "starts" / str(base)), steps
 
+    def check(self) -> None:
+        """Read all that an export takes of the session. Raises an error of `DAMAGE`."""
+        for start, steps in self.runs():
+            self.backend.simulator(start)
+            for number in steps:
+                self.repeat(number)
+                self.rows(number)
+
     def rows(self, number: int) -> Float[np.ndarray, "f d"]:
         """Return the row of each frame of a committed step."""
-        return np.array(read_json(self._step(number) / REQUEST)["rows"], float)
+        return np.array(self._request(number)["rows"], float)
 
 
 def settings_of(folder: Path) -> dict[str, Any]:
@@ -354,45 +373,3 @@ def request_hash(rows: object, prompt: str | None) -> str:
     Raises `InputError` for rows that are no numbers.
     """
     return fingerprint((numbers(rows), prompt))
-
-
-def vars_of(actions: ActionSpec) -> dict[str, Any]:
-    """Return the fields of an action spec as JSON."""
-    return {
-        "layout": actions.layout,
-        "sides": list(actions.sides),
-        "camera": actions.camera,
-        "workspace_m": [list(corner) for corner in actions.workspace_m],
-        "camera_reach": list(actions.camera_reach),
-    }
-
-
-def spec_of(fields: Mapping[str, Any]) -> ActionSpec:
-    """Return the action spec of a client or file. Raises `InputError` for what is not one."""
-    known = vars_of(ActionSpec())
-    if unknown := sorted(fields.keys() - known.keys()):
-        raise InputError(
-            f"The actions have no setting {quote(unknown[0])}: choose from {', '.join(known)}."
-        )
-    given = {**known, **fields}
-    corners, reach = given["workspace_m"], given["camera_reach"]
-    shapes = _shape(corners) == (2, 3) and _shape(reach) == (2,)
-    texts = isinstance(given["sides"], list) and all(isinstance(s, str) for s in given["sides"])
-    if not (shapes and texts and isinstance(given["camera"], bool)):
-        raise InputError(
-            "The actions need sides, a list of 'left' and 'right', camera, true or false, "
-            "workspace_m, two corners of three numbers in meters, and camera_reach, two numbers."
-        )
-    bounds: Any = {
-        "workspace_m": tuple(tuple(map(float, corner)) for corner in corners),
-        "camera_reach": tuple(map(float, reach)),
-    }
-    layout: Any = given["layout"]
-    return ActionSpec(layout=layout, sides=tuple(given["sides"]), camera=given["camera"], **bounds)
-
-
-def _shape(value: Any) -> tuple[int, ...] | None:
-    try:
-        return numbers(value).shape
-    except InputError:
-        return None

@@ -19,20 +19,21 @@ from typing import Any, TypeVar
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import Backend
+from egosim_jax.env.specs import spec_of
 from egosim_jax.env.start import Start, check_size
 from egosim_jax.episode import Episode
 from egosim_jax.io.atomic import lock_folder
-from egosim_jax.io.untrusted import quote
+from egosim_jax.io.untrusted import quote, quote_path
 from egosim_jax.serving.errors import RequestError, as_request_error
 from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.session import (
     CLOSED,
+    DAMAGE,
     SETTINGS,
     Result,
     Session,
     check_world,
     request_hash,
-    spec_of,
 )
 from egosim_jax.types import InputError, check_counts
 
@@ -61,6 +62,8 @@ class Limits:
     """Most steps of a session."""
     saved: int = 100
     """Most starts that a session saves."""
+    connections: int = 256
+    """Most connections of clients."""
     step_timeout_s: float = 120.0
     """Longest time that a request waits for its step, which continues without it."""
 
@@ -68,6 +71,7 @@ class Limits:
         """Raise `InputError` unless all are positive."""
         check_counts({"queue": self.queue, "threads": self.threads, "sessions": self.sessions})
         check_counts({"steps of a session": self.steps, "saved starts": self.saved})
+        check_counts({"connections": self.connections})
         if not self.step_timeout_s > 0:
             raise InputError(f"The timeout is {self.step_timeout_s} s: it must be positive.")
 
@@ -98,8 +102,8 @@ class Store:
                 session = Session(path.parent, self.backend)
                 number = session.committed + 1
                 key = (number, session.request(number)) if session.pending else None
-            except (InputError, OSError, ValueError, KeyError, TypeError, IndexError) as error:
-                self.damaged[path.parent.name] = str(error)
+            except DAMAGE as error:
+                self.damaged[path.parent.name] = str(self._for_client(error))
                 print(f"session {path.parent.name} is not resumed: {error}", file=sys.stderr)
                 continue
             self.sessions[session.id] = session
@@ -107,10 +111,13 @@ class Store:
                 session.flight = key, self.submit(session.finish, changes=session, bounded=False)
         self.metrics.sessions.set(len(self.sessions))
 
-    def close(self) -> None:
-        """Refuse new requests, wait for the steps that run or wait, then unlock the folder."""
+    def close(self, *, at_once: bool = False) -> None:
+        """Refuse new requests, wait for the steps that run or wait, then unlock the folder.
+
+        With `at_once` waiting ones are given up; those on disk are made when the store is opened.
+        """
         self.draining = True
-        self._threads.shutdown(wait=True)
+        self._threads.shutdown(wait=True, cancel_futures=at_once)
         self._lock.__exit__(None, None, None)
 
     def get(self, session_id: object) -> Session:
@@ -323,7 +330,7 @@ class Store:
         try:
             return run()
         except Exception as error:
-            found = as_request_error(error)
+            found = as_request_error(self._for_client(error))
             if found.code == "internal":
                 traceback.print_exc()
             raise found from error
@@ -335,6 +342,13 @@ class Store:
                 self._queued -= 1
                 self.metrics.queued.set(self._queued)
             self.metrics.seconds.observe(time.monotonic() - then)
+
+    def _for_client(self, error: Exception) -> Exception:
+        """Return an error that does not show a client where the server's files are."""
+        folder = f"{quote_path(self.folder)}/"
+        if isinstance(error, InputError) and folder in str(error):
+            return InputError(str(error).replace(folder, ""))
+        return error
 
     def _check_open(self) -> None:
         if self.draining:

@@ -1,4 +1,4 @@
-"""Messages in MessagePack with NumPy arrays, as OpenPI's clients and servers exchange them.
+"""Messages in MessagePack with NumPy arrays, as OpenPI's clients and servers exchange them; JSON.
 
 An array is a map of `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one of
 `__npgeneric__`, `data` and `dtype`; their keys are bytes. Nothing is unpickled: dtypes are numbers
@@ -8,6 +8,7 @@ only, and an array's size must be that of its data.
 from __future__ import annotations
 
 import base64
+import json
 import re
 from typing import Any
 
@@ -146,6 +147,32 @@ def _check_depth(value: Any) -> None:
         if not level:
             return
     raise InputError(f"The message is nested more than {MAX_DEPTH} levels deep.")
+
+
+def unpack_json(data: bytes) -> dict[str, Any]:
+    """Return the object of a JSON body, bounded as MessagePack is. Raises `InputError`."""
+    # each item follows a comma or opens a list or object: texts can only add to this bound
+    items = sum(data.count(mark) for mark in (b",", b"[", b"{"))
+    if items > MAX_ITEMS:
+        raise InputError(
+            f"The body has {items:,} commas and brackets: it may have at most {MAX_ITEMS:,}. Send "
+            "fewer rows, or use the websocket, which takes NumPy arrays."
+        )
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"The body is not JSON: {quote_text(str(error))}. It must be a JSON object."
+        ) from error
+    if not isinstance(value, dict):
+        raise InputError(f"The body is {quote(value)}: it must be a JSON object.")
+    _check_depth(value)
+    return value
+
+
+def pack_json(value: Any) -> bytes:
+    """Return the bytes of a reply in JSON."""
+    return json.dumps(to_json(value), allow_nan=False).encode()
 
 
 def to_json(value: Any) -> Any:

@@ -180,3 +180,12 @@ def test_a_seeded_vector_environment_repeats_its_later_resets():
         seeds.append([running.start.seed for running in envs.running])
     assert seeds[0] == seeds[1]
     assert seeds[0][0] == 3
+
+
+@pytest.mark.parametrize("row", [np.full(7, 9.0), np.full(7, np.nan), np.zeros(63)])
+def test_a_start_with_a_row_of_other_actions_is_refused(row):
+    env = make()
+    start = painted().start(3, ActionSpec())
+    env.reset(options={"start": replace(start, row=ActionSpec().rest)})
+    with pytest.raises(InputError, match="row of the start"):
+        env.reset(options={"start": replace(start, row=row)})

@@ -3,12 +3,15 @@
 import io
 import json
 import os
+import shutil
 import subprocess
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from egosim_jax.cli.export import Export
+from egosim_jax.command import ExitCode
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.parquet import read_columns
 from egosim_jax.serving import export
@@ -48,7 +51,7 @@ def folder(tmp_path_factory):
 
 def expected(folder):
     """Frames and actions of both episodes."""
-    (session,) = export.open_sessions(folder)
+    ((session,), _) = export.open_sessions(folder)
     frames, actions = [], []
     for _, steps in session.runs():
         for number in steps:
@@ -60,7 +63,7 @@ def expected(folder):
 
 
 def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
-    export.to_lerobot(export.open_sessions(folder), tmp_path / "set")
+    export.to_lerobot(export.open_sessions(folder)[0], tmp_path / "set")
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
     frames, actions = expected(folder)
     per_clip = VIDEO.frames - 1
@@ -82,7 +85,7 @@ def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
     reason="no LEROBOT_PYTHON: lerobot pins other versions",
 )
 def test_lerobots_own_loader_reads_the_same(folder, tmp_path):
-    export.to_lerobot(export.open_sessions(folder), tmp_path / "set")
+    export.to_lerobot(export.open_sessions(folder)[0], tmp_path / "set")
     command = [os.environ["LEROBOT_PYTHON"], "-c", LOADED, str(tmp_path / "set"), "found.npz"]
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": ""}
     subprocess.run(command, check=True, cwd=tmp_path, env=environment)
@@ -94,7 +97,7 @@ def test_lerobots_own_loader_reads_the_same(folder, tmp_path):
 
 
 def test_shards_have_a_clip_for_each_step(folder, tmp_path):
-    sessions = export.open_sessions(folder)
+    sessions, _ = export.open_sessions(folder)
     export.to_shards(sessions, tmp_path / "shards", grid=WAN_GRID)
     records = list(ShardReader(tmp_path / "shards"))
     assert [record.metadata["video_id"] for record in records] == ["one_1", "one_2", "one_3"]
@@ -103,19 +106,32 @@ def test_shards_have_a_clip_for_each_step(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_recording_is_written(folder, tmp_path):
-    export.to_rerun(export.open_sessions(folder)[0], tmp_path / "one.rrd")
+    export.to_rerun(export.open_sessions(folder)[0][0], tmp_path / "one.rrd")
     assert (tmp_path / "one.rrd").stat().st_size > 1000
 
 
 def test_an_unknown_session_is_refused(folder, tmp_path):
     with pytest.raises(InputError, match="no session 'two'"):
         export.open_sessions(folder, ["two"])
-    with pytest.raises(InputError, match="no session with a committed step"):
+    with pytest.raises(InputError, match="no readable session with a committed step"):
         export.open_sessions(tmp_path)
 
 
 def test_a_folder_with_files_is_not_replaced_by_a_dataset(folder, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty"):
-        export.to_lerobot(export.open_sessions(folder), tmp_path)
+        export.to_lerobot(export.open_sessions(folder)[0], tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("text", ["{", "{}"])
+def test_a_damaged_session_does_not_keep_the_others_from_export(folder, tmp_path, text, capsys):
+    copy = tmp_path / "sessions"
+    shutil.copytree(folder, copy)
+    shutil.copytree(folder / "one", copy / "bad")
+    (copy / "bad" / "steps" / "2" / "request.json").write_text(text)
+    assert Export(sessions=copy, out=tmp_path / "set").run() == ExitCode.PARTIAL
+    assert "skipped session bad: " in capsys.readouterr().err
+    assert json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["total_episodes"] == 2
+    with pytest.raises(InputError, match="Session bad cannot be exported"):
+        export.open_sessions(copy, ["bad"])

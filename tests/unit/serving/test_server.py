@@ -3,6 +3,7 @@
 import asyncio
 import http.client as http_client
 import json
+import socket
 import threading
 import urllib.error
 import urllib.request
@@ -14,11 +15,12 @@ from fastapi import FastAPI
 from starlette.datastructures import URL
 from starlette.requests import HTTPConnection
 
-from egosim_jax.serving import wire
+from egosim_jax.serving import connections, guard, wire
 from egosim_jax.serving.client import Client
 from egosim_jax.serving.errors import RequestError
+from egosim_jax.serving.guard import Guard
 from egosim_jax.serving.metrics import Metrics
-from egosim_jax.serving.server import Guard, _Server, bind, make_app, serve
+from egosim_jax.serving.server import _Server, bind, make_app, serve
 from egosim_jax.serving.service import Service
 from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
@@ -27,9 +29,9 @@ from tests.painted import painted
 TOKEN = "secret"  # noqa: S105
 
 
-def run(folder, token=None):
+def run(folder, token=None, limits=None):
     """A service, its port, and the thread that serves it."""
-    service = Service(Store(folder, painted(), Limits(), Metrics()), world="painted")
+    service = Service(Store(folder, painted(), limits or Limits(), Metrics()), world="painted")
     ports, ready = [], threading.Event()
 
     def note(port):
@@ -170,6 +172,78 @@ def test_a_body_that_grows_too_large_is_refused(server):
     asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
     assert sent[0]["status"] == 413
     assert json.loads(sent[1]["body"])["code"] == "too_large"
+
+
+def test_a_body_of_too_many_items_or_of_another_kind_is_refused(server):
+    _, port = server
+    for data, kind, status in (
+        (b"[" * 300_000, "application/json", 422),
+        (b'{"seed": ' + b"[" * 20 + b"]" * 20 + b"}", "application/json", 422),
+        (b"{}", "text/plain", 415),
+    ):
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{port}/sessions", data=data, headers={"Content-Type": kind}
+        )
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(request, timeout=60)  # noqa: S310 - of this machine
+        with refused.value as error:
+            found = json.loads(error.read())
+        assert (error.code, found["code"]) == (status, "invalid")
+
+
+def test_a_body_that_comes_too_slowly_is_refused(server, monkeypatch):
+    monkeypatch.setattr(guard, "BODY_S", 0.01)
+    sent = []
+
+    async def receive():
+        await asyncio.sleep(60)
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": "/sessions", "headers": headers}
+    asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
+    assert (sent[0]["status"], json.loads(sent[1]["body"])["code"]) == (408, "too_slow")
+
+
+def test_an_idle_connection_is_closed_and_one_above_the_limit_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(connections, "HEAD_S", 0.4)
+    service, port, _ = run(tmp_path, limits=Limits(connections=1))
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        status, body = http(port, "/healthz")
+        assert (status, json.loads(body)["code"]) == (503, "too_many_connections")
+        threading.Event().wait(0.5)
+        assert client.request("status")["sessions"] == {}
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as slow:
+        slow.sendall(b"GET / HTTP/1.1\r\nHost: ")
+        assert slow.recv(1) == b""
+    assert http(port, "/healthz")[0] == 200
+    service.store.close()
+
+
+def test_no_page_of_the_server_runs_scripts_of_another(server):
+    assert {http(server[1], path)[0] for path in ("/docs", "/redoc")} == {404}
+
+
+def test_a_client_waits_while_the_server_is_full(server, monkeypatch):
+    service, port = server
+    create, refusals = service.store.create, []
+
+    def full(request):
+        if len(refusals) < 2:
+            refusals.append(request)
+            raise RequestError(429, "too_many_sessions", "Full.", retry_after_s=0.01)
+        return create(request)
+
+    monkeypatch.setattr(service.store, "create", full)
+    with Client(f"ws://127.0.0.1:{port}", patience_s=10.0) as client:
+        client.create(seed=3).close()
+    assert len(refusals) == 2
+    refusals.clear()
+    hasty = Client(f"ws://127.0.0.1:{port}", patience_s=0.0)
+    with hasty, pytest.raises(RequestError, match="Full"):
+        hasty.create(seed=3)
 
 
 def test_text_and_damaged_messages_are_refused_and_the_connection_stays(server):

@@ -304,6 +304,37 @@ def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):
     (store.folder / "bad" / "steps" / "1" / "info.json").unlink()
     again = Store(store.folder, painted(), Limits(), Metrics())
     assert set(again.sessions) == {"good"}
-    with pytest.raises(RequestError, match="could not be resumed"):
+    with pytest.raises(
+        RequestError, match=r"could not be resumed: bad/starts/0/start\.json"
+    ) as shown:
         again.get("bad")
+    assert str(store.folder) not in str(shown.value)
     again.close()
+
+
+def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store):
+    made = store.create({"seed": 3})
+    store.save({"session": made.id, "name": "a"}).result()
+    (made.folder / "saved" / "a" / "start.json").write_text("{")
+    with pytest.raises(RequestError, match=r"start\.json") as refused:
+        store.load({"session": made.id, "name": "a"}).result()
+    assert (refused.value.status, str(store.folder) in str(refused.value)) == (422, False)
+    assert step(store, made, 1).step_id == 1
+
+
+def test_a_store_that_closes_at_once_gives_up_what_waits(tmp_path, monkeypatch):
+    store = Store(tmp_path, painted(pause=0.3), Limits(threads=1), Metrics())
+    one, two = (store.create({"session": name}) for name in ("one", "two"))
+    runs = [store.step({"session": s.id, "step_id": 1, "actions": rows(s)}) for s in (one, two)]
+    store.close(at_once=True)
+    assert (one.committed, two.committed) == (1, 0)
+    assert runs[0].result().step_id == 1
+
+
+def test_an_action_that_ends_out_of_sight_of_the_scene_is_refused(store):
+    fields = {"camera": True, "camera_reach": [0.15, 3.14]}
+    made = store.create({"seed": 3, "actions": fields})
+    away = np.concatenate([made.actions.rest[:-6], [0, 0, 0, 0, 3.1, 0]])[None]
+    with pytest.raises(RequestError, match="its last camera sees none"):
+        step(store, made, 1, away)
+    assert step(store, made, 1, made.actions.rest[None]).step_id == 1
