@@ -295,6 +295,9 @@ class FromTabletop(FromScratch):
     """Scenes to validate on, one clip of each."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    attempts: float | None = None
+    """Share of the scenes in which a policy may fail and the head turns, not a script; None: none.
+    """
     rollouts: int | None = None
     """Further scenes to train on, with states of the given weights' own rollouts; None: none."""
     rollout_clips: int = 4
@@ -338,6 +341,7 @@ class FromTabletop(FromScratch):
             spec=model.video,
             kind="human" if self.twins else "mixed",
             black_cloths=self.black_cloths,
+            attempts=self.attempts if split == "train" else None,
             prior="static" if self.twins else "state",
             hands="mesh" if self.twins else "skeleton",
         )

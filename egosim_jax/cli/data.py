@@ -189,6 +189,9 @@ class Make:
     """Frame rate of the clips in frames per second."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    attempts: float | None = None
+    """Share of the scenes in which a policy may fail and the head turns, not a script; None: none.
+    """
     prior: Literal["state", "static"] = "state"
     """Rendering of the scene along the camera path.
 
@@ -214,6 +217,7 @@ class Make:
             spec=spec,
             kind=self.kind,
             black_cloths=self.black_cloths,
+            attempts=self.attempts,
             prior=self.prior,
             hands=self.hands,
         )

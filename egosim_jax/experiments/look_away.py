@@ -20,7 +20,7 @@ from egosim_jax.experiments.config import LookAway
 from egosim_jax.experiments.continuous import METHODS
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generator import Generator
-from egosim_jax.geometry import invert, rotation_z, transform
+from egosim_jax.geometry import invert, transform
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import read_json
 from egosim_jax.metrics import region
@@ -30,9 +30,9 @@ from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rollout import Rollout, load_clip
 from egosim_jax.simulator import Simulator
-from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, check_counts
+from egosim_jax.types import Action, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Script, TabletopClip, World, make_scripts, to_episode
-from egosim_jax.worlds.tabletop import actions as scripted
+from egosim_jax.worlds.tabletop.attempts import LOOKING, turn
 from egosim_jax.worlds.tabletop.clips import film_scenes
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
@@ -169,22 +169,12 @@ def _away(script: Script) -> float | None:
         [moment.scene.body(script.intent.name).world_from_body[:3, 3] for moment in script.moments]
     )
     for sign in (1.0, -1.0):
-        turned = _turn(script.cameras, 0.0, sign * np.radians(AWAY_DEGREES), len(places))
+        turned = turn(script.cameras, 0.0, sign * np.radians(AWAY_DEGREES), len(places))
         local = transform(invert(turned.world_from_camera[-1]), places)
         angles = np.degrees(np.arctan2(np.abs(local[:, 0]), local[:, 2]))
         if angles.min() > OUTSIDE_DEGREES:
             return sign * np.radians(AWAY_DEGREES)
     return None
-
-
-def _turn(cameras: Cameras, first: float, last: float, frames: int) -> Cameras:
-    """Return cameras that turn about the vertical from one angle to another, in radians."""
-    start = cameras.world_from_camera[0]
-    poses = np.repeat(start[None], frames, axis=0)
-    for pose, share in zip(poses, np.linspace(0, 1, frames), strict=True):
-        angle = first + scripted.smooth(float(share)) * (last - first)
-        pose[:3, :3] = rotation_z(angle) @ start[:3, :3]
-    return replace(cameras, world_from_camera=poses)
 
 
 def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
@@ -194,18 +184,17 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
     if angle is None:
         raise ValueError(f"the object of scene {seed} cannot be out of view")
     joints, prompt = script.action.joints_m[:, :1], script.caption
-    still = "The wearer looks around."
     missing = np.full_like(joints, np.nan)
     if case == "seen":
         poses = script.cameras.world_from_camera[-1:]
         view, hands = replace(script.cameras, world_from_camera=poses), [joints, missing, missing]
-        cameras = [script.cameras, _turn(view, 0.0, angle, frames), _turn(view, angle, 0.0, frames)]
-        prompts = [prompt, still, still]
+        cameras = [script.cameras, turn(view, 0.0, angle, frames), turn(view, angle, 0.0, frames)]
+        prompts = [prompt, LOOKING, LOOKING]
     else:
         view, hands = script.cameras, [missing, joints, missing]
         ends = ((0.0, angle), (angle, angle), (angle, 0.0))
-        cameras = [_turn(view, first, last, frames) for first, last in ends]
-        prompts = [still] * 3
+        cameras = [turn(view, first, last, frames) for first, last in ends]
+        prompts = [LOOKING] * 3
     world, clips = World(scene=script.scene, seed=seed), []
     for path, joint, text in zip(cameras, hands, prompts, strict=True):
         action = Action(cameras=path, joints_m=missing, kind=script.kind, prompt=text)

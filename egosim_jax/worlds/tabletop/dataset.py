@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.pack import triplet_record
@@ -19,6 +21,7 @@ from egosim_jax.io.untrusted import quote_path
 from egosim_jax.processes import run_in_processes
 from egosim_jax.types import WAN_GRID, InputError, Kind, SceneState, VideoGrid, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
+from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
 
 States = Callable[[Sequence[TabletopClip]], Iterable[SceneState | None]]
@@ -39,6 +42,8 @@ class DatasetConfig:
     """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
     black_cloths: int | None = None
     """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    attempts: float | None = None
+    """Share of the scenes in which a policy may fail and the head turns (`attempts.py`)."""
     prior: PriorName = "state"
     """Rendering of the scene: points of the state, or `static`, ray cast as it was at the start."""
     hands: HandsName = "skeleton"
@@ -52,12 +57,39 @@ class DatasetConfig:
             return "human" if seed % 4 else "robot"
         return self.kind
 
+    def clips_of(self, seed: int) -> Iterator[TabletopClip]:
+        """Yield the clips of a scene."""
+        kind, cloths = self.kind_of(seed), self.black_cloths
+        if self.attempts and np.random.default_rng([seed, 3]).random() < self.attempts:
+            yield from make_attempts(
+                seed, spec=self.spec, clips=self.clips, kind=kind, black_cloths=cloths
+            )
+            return
+        yield from make_sequence(
+            seed,
+            spec=self.spec,
+            clips=self.clips,
+            kind=kind,
+            black_cloths=cloths,
+            fixed_camera=bool(self.fixed_camera),
+        )
+
     def __post_init__(self) -> None:
         """Raise `InputError` if the dataset would be empty."""
         if not self.seeds or self.clips < 1:
             raise InputError(
                 f"The dataset is empty: it has {len(self.seeds)} scenes of {self.clips} clips; "
                 "both must be at least 1. (--scenes, --clips)"
+            )
+        if self.attempts is not None and not 0 <= self.attempts <= 1:
+            raise InputError(
+                f"{self.attempts:g} is no share of the scenes: it must be between 0 and 1. "
+                "(--attempts)"
+            )
+        if self.attempts and self.fixed_camera:
+            raise InputError(
+                "In attempts the head turns, which a fixed camera excludes: omit one of them. "
+                "(--attempts)"
             )
         if self.hands != "skeleton" and self.kind != "human":
             raise InputError(
@@ -126,15 +158,7 @@ def make_shards(
 
 
 def _make(config: DatasetConfig, seed: int, parts: Path, states: States) -> None:
-    sequence = make_sequence(
-        seed,
-        spec=config.spec,
-        clips=config.clips,
-        kind=config.kind_of(seed),
-        black_cloths=config.black_cloths,
-        fixed_camera=bool(config.fixed_camera),
-    )
-    clips = list(sequence)
+    clips = list(config.clips_of(seed))
     for clip, state in zip(clips, states(clips), strict=True):
         with atomic_write(_part(parts, seed, clip.number)) as temporary:
             triplet = with_conditions(clip, to_triplet(clip, state), config.prior, config.hands)
