@@ -21,6 +21,7 @@ from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.experiment import Experiment
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.models import Models
+from egosim_jax.cli.play import Play
 from egosim_jax.cli.preflight import Preflight
 from egosim_jax.cli.rank import Rank
 from egosim_jax.cli.serve import Serve
@@ -33,6 +34,7 @@ Commands = (
     | Annotated[Preflight, tyro.conf.subcommand("preflight")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Episode, tyro.conf.subcommand("episode")]
+    | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Serve, tyro.conf.subcommand("serve")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
@@ -52,6 +54,7 @@ START = """\
 egosim: an egocentric world simulator in JAX
 
   egosim simulate                 three clips of a tabletop world, with the model in the package
+  egosim play                     the same world by hand, in the browser
   egosim generate                 one clip; --metadata FILE generates your own
   egosim data annotate VIDEO      a scene, cameras and hands from your own video
   egosim episode make             an episode to edit: scene, cameras, hands, prompts

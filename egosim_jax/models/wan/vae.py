@@ -249,17 +249,26 @@ class WanVAE(nnx.Module):
 
     def decode(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
         """Return the video of normalized latents, float32 in [-1, 1], frame by latent frame."""
-        hidden = self.from_latents(self.denormalize(latents.astype(jnp.float32)))
-        first, cache = self.decoder(hidden[:, :1], None)
+        first, cache = self.decode_next(latents[:, :1], None)
 
         def step(cache: Cache, frame: Array) -> tuple[Cache, Array]:
-            video, cache = self.decoder(frame, cache)
+            video, cache = self.decode_next(frame, cache)
             return cache, video
 
-        _, rest = jax.lax.scan(step, cache, rearrange(hidden[:, 1:], "b n h w c -> n b 1 h w c"))
+        _, rest = jax.lax.scan(step, cache, rearrange(latents[:, 1:], "b n h w c -> n b 1 h w c"))
         rest = rearrange(rest, "n b f h w c -> b (n f) h w c")
-        video = jnp.concatenate([first, rest], axis=1).astype(jnp.float32)
-        return jnp.clip(video, -1.0, 1.0)
+        return jnp.concatenate([first, rest], axis=1)
+
+    def decode_next(
+        self, latents: Float[Array, "b 1 h w z"], cache: Cache
+    ) -> tuple[Float[Array, "b g h2 w2 3"], Cache]:
+        """Return the frames of the next latent frame, and the cache for the one after it.
+
+        The first latent frame has no cache and gives one frame; all others give four.
+        """
+        hidden = self.from_latents(self.denormalize(latents.astype(jnp.float32)))
+        video, cache = self.decoder(hidden, cache)
+        return jnp.clip(video.astype(jnp.float32), -1.0, 1.0), cache
 
     def normalize(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:
         """Normalize latents with the configured mean and standard deviation."""

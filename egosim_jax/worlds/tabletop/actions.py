@@ -190,7 +190,7 @@ def _covered(scene: Scene, body: Body) -> bool:
 
 def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generator) -> Hand:
     """Return the acting hand of the first clip, in the air in front of its target."""
-    grasp = _grasp(scene, intent, kind, "right")
+    grasp = grip_on(scene, intent, kind, "right")
     side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.04) > 0 else "left"
     before = grasp.point_m + [0, -0.09, 0.07] + rng.normal(0, 0.015, 3)
     share = rng.uniform(0.0, 0.3)
@@ -211,7 +211,7 @@ def _relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
     return Grip(point_m=point, yaw=inward, pitch=np.radians(30), closure=closure)
 
 
-def _grasp(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
+def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
     """Return the configuration in which the hand grasps the target."""
     body = scene.body(intent.name)
     inward = 0.5 if side == "right" else -0.5
@@ -281,7 +281,7 @@ def opened(kind: Kind) -> float:
 
 def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
     """Return the keyframes of the acting hand."""
-    start, grasp = hand.grip, _grasp(scene, intent, kind, hand.side)
+    start, grasp = hand.grip, grip_on(scene, intent, kind, hand.side)
     wide = opened(kind)
     body = scene.body(intent.name)
     above = _shift(grasp, [0, -0.02, 0.03], closure=wide)
@@ -298,7 +298,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
         last = 1.0 - first
         for share in (0.25, 0.5, 0.75, 1.0):
             opening = first + smooth(share) * (last - first)
-            moved = _grasp(scene.with_opening(intent.name, opening), intent, kind, hand.side)
+            moved = grip_on(scene.with_opening(intent.name, opening), intent, kind, hand.side)
             time = begin + share * (end - begin)
             keys.append(_Key(time=time, grip=moved, held=True, opening=opening))
         final = keys[-1].grip

@@ -177,7 +177,7 @@ def test_a_lid_falls_shut_unless_it_is_beyond_the_vertical(cameras):
     for opening in (0.0, 0.25, 0.5, 0.95):
         scene = world.scene.with_opening("green chest", opening)
         intent = actions.Intent(verb="open", name="green chest")
-        grip = actions._grasp(scene, intent, "robot", "right")
+        grip = actions.grip_on(scene, intent, "robot", "right")
         hands.append((*grip.point_m, grip.closure, 0.0, grip.pitch))
     opened = (*hands[0][:3], OPENED, 0.0, hands[0][5])
     for last, expected in ((2, 0.0), (3, 1.0)):

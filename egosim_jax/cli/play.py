@@ -1,0 +1,132 @@
+"""`egosim play`: play in the world of the small model by hand, in the browser."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import sys
+import threading
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from egosim_jax.command import ExitCode
+from egosim_jax.types import InputError, check_counts, check_seed
+
+if TYPE_CHECKING:
+    from egosim_jax.env.actions import ActionSpec
+    from egosim_jax.env.backends import GeneratedWorld
+    from egosim_jax.env.start import Start
+    from egosim_jax.play.page import LocalServer
+
+HOST = "127.0.0.1"
+"""Address of the page: viser asks nobody for a password."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Play:
+    """Play in a generated world by hand, on a page in the browser.
+
+    Drag the hand, or let it pick up an object and put it elsewhere; the clip is shown as it is
+    decoded, with the true one next to it. Every clip is recorded in OUT, which `egosim data export`
+    reads. Only this machine can reach the page. Needs the extra `play`. Prints the address.
+    """
+
+    out: Path = Path("runs/play")
+    """Folder of the recorded episodes."""
+    seed: int = 0
+    """Seed of the tabletop scene."""
+    episode: Path | None = None
+    """Episode to begin in the scene of, instead of a seed's."""
+    hand: Literal["right", "left"] = "right"
+    """Hand that acts."""
+    config: str = "tabletop"
+    """Name of the model."""
+    weights: Path | None = None
+    """Folder of weights, if not those that come with the package."""
+    perception: str = "classical"
+    """Perception pipeline by name, with its options."""
+    steps: int | None = None
+    """Denoising steps, instead of the model's."""
+    port: int = 8080
+    """Port to listen on; 0 for a free one."""
+
+    def run(self) -> int:
+        """Check, load, compile, and serve the page until it is interrupted."""
+        if find_spec("viser") is None:
+            raise InputError(
+                "egosim play needs viser, which is not installed: pip install 'egosim-jax[play]'."
+            )
+        check_counts({"--steps": self.steps})
+        check_seed(self.seed, name="--seed")
+        self._check_port()
+        from egosim_jax.env.actions import ActionSpec
+        from egosim_jax.env.backends import GeneratedWorld
+        from egosim_jax.env.streaming import Streamer
+        from egosim_jax.generator import Generator
+        from egosim_jax.io.atomic import lock_folder
+        from egosim_jax.io.executables import share_with_jax
+        from egosim_jax.play.page import Page
+        from egosim_jax.play.played import Played
+
+        share_with_jax()
+        generator = Generator.load(self.config, self.weights)
+        streamer = Streamer(generator)
+        world = GeneratedWorld(
+            generator=streamer, video=generator.config.video, perception=self.perception
+        )
+        spec = ActionSpec(sides=(self.hand,), camera=True)
+        start = self._start(world, spec)
+        streamer.compile()
+
+        def begin(seed: int) -> Played:
+            check_seed(seed, name="table")
+            return Played(streamer, world, self.out, world.start(seed, spec), self.hand)
+
+        with lock_folder(self.out):
+            server = self._serve()
+            Page(server, begin, Played(streamer, world, self.out, start, self.hand))
+            print(f"http://127.0.0.1:{server.get_port()}", flush=True)
+            _wait()
+            server.stop()
+        return ExitCode.DONE
+
+    def _check_port(self) -> None:
+        """Raise `InputError` if the port is none, or taken: viser would take another one."""
+        if not 0 <= self.port < 1 << 16:
+            raise InputError(f"--port must be from 0 to 65535, not {self.port}.")
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, self.port))
+            except OSError as error:
+                raise InputError(
+                    f"{HOST}:{self.port} cannot be listened on ({error.strerror}): the port must "
+                    "be free. Choose another one, 0 for any. (--port)"
+                ) from error
+
+    def _start(self, world: GeneratedWorld, spec: ActionSpec) -> Start:
+        from egosim_jax.env.start import Start
+        from egosim_jax.episode import Episode
+
+        if self.episode is None:
+            return world.start(self.seed, spec)
+        episode = Episode.load(self.episode)
+        seed = episode.state.provenance.get("seed", "")
+        return Start.of(episode, seed=int(seed) if seed.isdecimal() else self.seed)
+
+    def _serve(self) -> LocalServer:
+        from egosim_jax.play.page import LocalServer
+
+        with contextlib.redirect_stdout(sys.stderr):  # viser greets
+            return LocalServer(HOST, self.port, verbose=False)
+
+
+def _wait() -> None:
+    """Wait for Ctrl-C or SIGTERM, which end the page as they should."""
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    ended.wait()
