@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import jax
 import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
@@ -260,7 +261,11 @@ class Networks(nnx.Module):
     def random(cls, config: ModelConfig, *, seed: int) -> Networks:
         """Build untrained networks in one compiled program."""
         graph = nnx.graphdef(cls.abstract(config))
-        params = init_sharded(lambda: nnx.state(cls.build(config, rngs=nnx.Rngs(seed)), nnx.Param))
+
+        def make(key: jax.Array) -> nnx.State:
+            return nnx.state(cls.build(config, rngs=nnx.Rngs(key)), nnx.Param)
+
+        params = init_sharded(make, jax.random.key(seed))
         return nnx.merge(graph, params)
 
     @classmethod

@@ -157,16 +157,17 @@ class RMSNorm(nnx.Module):
         return x * jax.lax.optimization_barrier(inverse) * self.scale[...].astype(jnp.float32)
 
 
-def init_sharded(make: Callable[[], Any], *, out_shardings: Any = None) -> Any:
+def init_sharded(make: Callable[..., Any], *args: Any, out_shardings: Any = None) -> Any:
     """Run an initializer as one compiled program, with sharded outputs.
 
-    Drawing hundreds of random arrays is a long program that runs once, so that on a CPU, where
-    optimizing it would take longer than training a tiny model, it is compiled as it is.
+    With its key in `args` the program is the same for every seed. Drawing hundreds of random arrays
+    is a long program that runs once, so that on a CPU, where optimizing it would take longer than
+    training a tiny model, it is compiled as it is.
     """
-    program = jax.jit(make, out_shardings=out_shardings).lower()
+    program = jax.jit(make, out_shardings=out_shardings).lower(*args)
     on_cpu = jax.default_backend() == "cpu"
     options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    return program.compile(compiler_options=options if on_cpu else None)()
+    return program.compile(compiler_options=options if on_cpu else None)(*args)
 
 
 def stack(make: Callable[[nnx.Rngs], Block], layers: int, *, rngs: nnx.Rngs) -> Block:
