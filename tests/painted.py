@@ -1,12 +1,13 @@
 """A small world whose clips are its views with the hands painted over them, and a server of it.
 
-    python -m tests.painted FOLDER [--pause S]
+    python -m tests.painted FOLDER [--pause S] [--batch N]
 
 serves it on a free port and prints the address.
 """
 
 import argparse
 import functools
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,9 @@ import numpy as np
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import GeneratedWorld, tabletop_start
+from egosim_jax.env.batching import Batcher
 from egosim_jax.rendering import reference
-from egosim_jax.types import VideoSpec
+from egosim_jax.types import Clip, VideoSpec
 
 VIDEO = VideoSpec(frames=5, height=32, width=48, fps=8)
 
@@ -30,6 +32,9 @@ class Painter:
 
     def __call__(self, view, action, first_frame, seed):
         time.sleep(self.pause)
+        return self.paint(view, action, seed)
+
+    def paint(self, view, action, seed):
         hands, depth = reference.draw_hands(action.joints_m, action.cameras, kind=action.kind)
         frames = np.where((depth < view.depth_m)[..., None], hands, view.frames).astype(float)
         noise = np.random.default_rng(seed).normal(0, 2, frames.shape)
@@ -37,6 +42,21 @@ class Painter:
 
     def fingerprint(self):
         return "painter"
+
+
+class BatchPainter(Painter):
+    """Painter of several clips together, of which all take as long as one."""
+
+    def condition(self, view, action, first_frame):
+        return view, action
+
+    def generate(self, conditions, seeds):
+        time.sleep(self.pause)
+        print(f"a batch of {len(seeds)}", file=sys.stderr, flush=True)
+        return [
+            Clip(frames=self.paint(*condition, seed), fps=VIDEO.fps)
+            for condition, seed in zip(conditions, seeds, strict=True)
+        ]
 
 
 class PaintedWorld(GeneratedWorld):
@@ -52,9 +72,10 @@ def _start(seed, kind, sides):
     return tabletop_start(seed, ActionSpec(layout=layout, sides=sides), VIDEO)
 
 
-def painted(perception=None, pause=0.0):
+def painted(perception=None, pause=0.0, batch=None):
     """World of the painter, by default without perception, which takes longest."""
-    return PaintedWorld(generator=Painter(pause), video=VIDEO, perception=perception)
+    painter = Painter(pause) if batch is None else Batcher(BatchPainter(pause), most=batch)
+    return PaintedWorld(generator=painter, video=VIDEO, perception=perception)
 
 
 def main():
@@ -67,8 +88,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pause", type=float, default=0.0)
+    parser.add_argument("--batch", type=int)
     given = parser.parse_args()
-    backend = painted("classical", given.pause)
+    backend = painted("classical", given.pause, given.batch)
     service = Service(Store(given.folder, backend, Limits(), Metrics()), world="painted")
 
     def ready(port):

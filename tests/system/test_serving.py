@@ -3,9 +3,9 @@
     python -m venv openpi && openpi/bin/pip install openpi-client typing_extensions
     OPENPI_PYTHON=openpi/bin/python pytest -m slow tests/system/test_serving.py
 
-The same with the model that comes with the package, printed step by step:
+The same with the model that comes with the package, printed step by step, with batches of 4 clips:
 
-    OPENPI_PYTHON=openpi/bin/python python -m tests.system.test_serving FOLDER
+    OPENPI_PYTHON=openpi/bin/python python -m tests.system.test_serving FOLDER 4
 """
 
 import json
@@ -114,8 +114,21 @@ def drive(kind, port, *, until=None):
     return clients, threads, found
 
 
+def committed(folder):
+    """The hash of the state of each committed step, and the sessions with a step under way."""
+    states, underway = {}, []
+    for path in sorted(folder.glob("*/steps/*/request.json")):
+        session, number = path.parts[-4], int(path.parts[-2])
+        info = path.with_name("info.json")
+        if info.exists():
+            states[session, number] = json.loads(info.read_text())["state_sha256"]
+        else:
+            underway.append(session)
+    return states, underway
+
+
 def kill_and_continue(kind, command, folder):
-    """Kill the server in mid step, continue; the same without a kill; the steps of both."""
+    """Kill the server in mid step, continue: the steps before and after, what was committed."""
     server = Server(folder / "killed", command)
     clients, threads, before = drive(kind, server.port, until=2)
     time.sleep(0.3)
@@ -123,27 +136,51 @@ def kill_and_continue(kind, command, folder):
     for process, thread in zip(clients, threads, strict=True):
         process.wait(60)
         thread.join()
-    journals = list((folder / "killed").glob("*/steps/*/info.json"))
-    print(f"killed with {len(journals)} committed steps", flush=True)
+    known, underway = committed(folder / "killed")
+    print(f"killed with {len(known)} committed steps, {underway} under way", flush=True)
     server = Server(folder / "killed", command)
     after = drive(kind, server.port)[2]
     assert server.end(signal.SIGTERM) == 0
+    return before, after, (known, underway)
+
+
+def check_kept(before, after, killed):
+    """Check that all committed steps are as they were, and that all steps are made once."""
+    known, underway = killed
+    assert underway
+    assert all(underway.count(session) == 1 for session in underway)
+    for session, some, all_ in zip("ab", before, after, strict=True):
+        assert [step[0] for step in all_] == list(range(1, STEPS + 1))
+        assert some == all_[: len(some)]
+        assert len(some) < STEPS
+        states = {number: state for number, state, _ in all_}
+        steps = [number for name, number in known if name == session]
+        assert steps == list(range(1, len(steps) + 1))
+        assert all(known[session, number] == states[number] for number in steps)
+
+
+def straight(kind, command, folder):
+    """The steps without a kill."""
     server = Server(folder / "straight", command)
-    straight = drive(kind, server.port)[2]
+    found = drive(kind, server.port)[2]
     assert server.end(signal.SIGTERM) == 0
-    return before, after, straight
+    return found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [OURS, pytest.param(OPENPI, marks=NEEDS_OPENPI)], ids=len)
 def test_clients_continue_after_a_kill_to_the_same_states(tmp_path, kind):
     command = ["tests.painted", "--pause", "0.5"]
-    before, after, straight = kill_and_continue(kind, command, tmp_path)
-    assert after == straight
-    assert [len(steps) for steps in straight] == [STEPS, STEPS]
-    assert max(map(len, before)) < STEPS
-    for some, all_ in zip(before, straight, strict=True):
-        assert some == all_[: len(some)]
+    before, after, killed = kill_and_continue(kind, command, tmp_path)
+    check_kept(before, after, killed)
+    assert after == straight(kind, command, tmp_path)
+
+
+@pytest.mark.slow
+def test_committed_steps_of_batches_survive_a_kill(tmp_path, capfd):
+    command = ["tests.painted", "--pause", "0.5", "--batch", "2"]
+    check_kept(*kill_and_continue(OURS, command, tmp_path))
+    assert "a batch of 2" in capfd.readouterr().err
 
 
 if __name__ == "__main__":
@@ -151,4 +188,8 @@ if __name__ == "__main__":
     served = ["egosim_jax.cli", "serve", "--port", "0", "--batch", *batch, "--out"]
     kinds = OPENPI if "OPENPI_PYTHON" in os.environ else OURS
     results = kill_and_continue(kinds, served, Path(sys.argv[1]))
-    print("equal to the byte" if results[1] == results[2] else f"DIFFERENT: {results}")
+    check_kept(*results)
+    print("every committed step is as it was, the steps under way are made")
+    uninterrupted = straight(kinds, served, Path(sys.argv[1]))
+    equal = results[1] == uninterrupted
+    print("equal to the byte" if equal else f"the uninterrupted run differs: {uninterrupted}")
