@@ -36,7 +36,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
         {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64"},
     )
     recorded = read_video(folder / "video.mp4")
-    moments = _moments(len(recorded.frames), float(recorded.fps), float(video.fps))
+    moments = nearest_frames(len(recorded.frames), float(recorded.fps), float(video.fps))
     step = video.frames - 1
     possible = (len(moments) - 1) // step
     count = possible if clips is None else clips
@@ -47,7 +47,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
         )
     picked = [moments[number * step : number * step + video.frames] for number in range(count)]
     frames = [resize_video(recorded.frames[k], video.height, video.width) for k in picked]
-    cameras = _resized(arrays["intrinsics_px"], recorded.frames.shape[1:3], video)
+    cameras = resized_intrinsics(arrays["intrinsics_px"], recorded.frames.shape[1:3], video)
     kinds: dict[int, Kind] = {joints: kind for kind, joints in JOINTS.items()}
     return Episode(
         state=snapshot.load(folder / "state"),
@@ -71,13 +71,15 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     )
 
 
-def _moments(count: int, have: float, want: float) -> np.ndarray:
+def nearest_frames(count: int, have: float, want: float) -> np.ndarray:
     """Return the frames nearest in time to those at another rate."""
     times = np.arange(int((count - 1) * want / have + 1e-6) + 1) * have / want
     return np.minimum(np.floor(times + 0.5).astype(int), count - 1)
 
 
-def _resized(intrinsics_px: np.ndarray, size: tuple[int, ...], video: VideoSpec) -> np.ndarray:
+def resized_intrinsics(
+    intrinsics_px: np.ndarray, size: tuple[int, ...], video: VideoSpec
+) -> np.ndarray:
     """Return intrinsics of pictures that were resized along each axis."""
     scale = np.array([video.width / size[1], video.height / size[0]])
     resized = intrinsics_px.copy()

@@ -171,6 +171,47 @@ class FromAnnotation:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FromLeRobot:
+    """Make an episode of a LeRobot dataset of version 3.0 that has hands and cameras.
+
+    `egosim data export --to lerobot` writes such datasets, with the scene of each episode; others
+    need the features that docs/serving.md names, and a --state. Of a dataset with videos only,
+    import and annotate a video instead (docs/video.md).
+    """
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset, with meta/info.json."""
+    out: Path
+    """Folder to write, or a file whose name ends in .zip."""
+    episode: int = 0
+    """Number of the episode."""
+    config: str = "tabletop"
+    """Model whose length, size and frame rate the clips have."""
+    state: Path | None = None
+    """Folder of a state, or a .ply of colored points, instead of the dataset's own scene."""
+    clips: int | None = None
+    """Number of clips; as many as the episode is long if not given."""
+
+    def run(self) -> int:
+        """Read the dataset, make, check and write the episode."""
+        from egosim_jax import configs
+        from egosim_jax.env.recorded import episode_from_lerobot
+        from egosim_jax.state.snapshot import load, read_ply
+
+        check_counts({"--clips": self.clips})
+        state = None
+        if self.state is not None:
+            state = (read_ply if self.state.suffix == ".ply" else load)(self.state)
+        video = configs.get(self.config).video
+        episode = episode_from_lerobot(
+            self.dataset, self.episode, video, state=state, clips=self.clips
+        )
+        episode.save(self.out)
+        print(f"{self.out}: {summary(episode)}")
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
 class CheckEpisode:
     """Validate an episode: files, joints, units, cameras, frame of reference.
 
@@ -350,6 +391,7 @@ class Episode:
     command: (
         Annotated[MakeEpisode, tyro.conf.subcommand("make")]
         | Annotated[FromAnnotation, tyro.conf.subcommand("from-annotation")]
+        | Annotated[FromLeRobot, tyro.conf.subcommand("from-lerobot")]
         | Annotated[CheckEpisode, tyro.conf.subcommand("check")]
         | Annotated[ShowEpisode, tyro.conf.subcommand("show")]
     )

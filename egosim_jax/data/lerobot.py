@@ -2,18 +2,21 @@
 
     meta/info.json meta/stats.json meta/tasks.parquet
     meta/episodes/chunk-000/file-000.parquet   length, tasks and place of each episode
+    meta/egosim/episode_000000/                scene in which the episode begins
     data/chunk-000/file-000.parquet            rows of episode 0; the next one is file-001
 
 A row has the frame as a PNG, which loses nothing (feature of dtype image), `observation.state`, the
 row of hands and camera at that frame, and `action`, that of the next frame; both are float32. The
-clips of an episode follow each other: the first frame of a clip takes the place of the last one of
-the clip before. Followed: `lerobot` 0.4.4, `datasets/lerobot_dataset.py`, `datasets/utils.py`.
+joints of the hands, the pose of the camera and its intrinsics are there as float64, too, in the
+names `HANDS`, `POSES` and `INTRINSICS`. The clips of an episode follow each other: the first frame
+of a clip takes the place of the last one of the clip before. Followed: `lerobot` 0.4.4,
+`datasets/lerobot_dataset.py`, `datasets/utils.py`.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,9 +29,17 @@ from PIL import Image
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import quote_path
-from egosim_jax.types import InputError
+from egosim_jax.types import Action, InputError
 
 IMAGE, STATE, ACTION = "observation.images.ego", "observation.state", "action"
+HANDS = "observation.hands.joints_m"
+"""Joints of all hands in the world, in meters, hand by hand; NaN where a hand is missing."""
+POSES = "observation.camera.world_from_camera"
+"""Rows of the camera's 4x4 pose in the world, in OpenCV axes."""
+INTRINSICS = "observation.camera.intrinsics_px"
+"""Rows of the camera's 3x3 matrix in pixels."""
+SCENE = "meta/egosim/episode_{:06d}"
+"""Folder of the scene in which an episode begins."""
 CHUNK = 1000
 """Files in a folder."""
 PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -44,8 +55,19 @@ class ClipRecord:
     """Frames of the clip."""
     rows: Float[np.ndarray, "f d"]
     """Row of hands and camera at each frame."""
-    prompt: str
-    """Caption of the clip."""
+    action: Action
+    """Cameras, joints of the hands and caption of the clip."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRecord:
+    """Clips that follow each other, from a scene."""
+
+    clips: Iterable[ClipRecord]
+    """Clips of the episode, which are read one by one."""
+    save_scene: Callable[[Path], None]
+    """Write the scene in which the episode begins to a folder."""
 
 
 @dataclass
@@ -80,6 +102,7 @@ class _Totals:
     episodes: list[dict[str, Any]] = field(default_factory=list)
     frames: int = 0
     sizes: set[tuple[int, ...]] = field(default_factory=set)
+    vectors: dict[str, int] = field(default_factory=dict)
 
 
 def check_new(folder: Path) -> None:
@@ -93,7 +116,7 @@ def check_new(folder: Path) -> None:
 
 def write_lerobot(
     folder: Path,
-    episodes: Iterable[Iterable[ClipRecord]],
+    episodes: Iterable[EpisodeRecord],
     *,
     names: Sequence[str],
     fps: int,
@@ -111,15 +134,12 @@ def write_lerobot(
             "A LeRobot dataset is written by pyarrow, which is not installed: pip install "
             "'egosim-jax[video]'."
         )
-    statistics = {
-        IMAGE: _Statistics((3, 1, 1)),
-        STATE: _Statistics((len(names),)),
-        ACTION: _Statistics((len(names),)),
-    }
+    statistics = {IMAGE: _Statistics((3, 1, 1))}
     totals = _Totals()
     with atomic_folder(folder) as temporary:
-        for clips in episodes:
-            _write_episode(temporary, clips, totals, statistics, fps)
+        for episode in episodes:
+            episode.save_scene(temporary / SCENE.format(len(totals.episodes)))
+            _write_episode(temporary, episode.clips, totals, statistics, fps)
         if not totals.episodes:
             raise InputError("There are no episodes: a dataset needs at least one. Record one.")
         _write_meta(temporary, totals, statistics, fps=fps, robot_type=robot_type,
@@ -128,8 +148,8 @@ def write_lerobot(
 
 def _steps(
     clips: Iterable[ClipRecord], totals: _Totals
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, str]]:
-    """Yield frame, row, next row and prompt; the last frame of all holds its row."""
+) -> Iterator[tuple[np.ndarray, str, dict[str, np.ndarray]]]:
+    """Yield frame, prompt and numbers of each step; the last frame of all holds its row."""
     last = None
     for last in clips:
         totals.sizes.add(last.frames.shape[1:3])
@@ -138,11 +158,23 @@ def _steps(
                 f"The episodes have clips of the sizes {sorted(totals.sizes)}: all must have one "
                 "size. Export them separately."
             )
-        for frame, row, following in zip(last.frames, last.rows[:-1], last.rows[1:], strict=False):
-            yield frame, row, following, last.prompt
+        for number, frame in enumerate(last.frames[:-1]):
+            yield frame, last.action.prompt, _numbers(last, number)
     if last is None:
         raise InputError("An episode has no clip: it needs at least one. Remove it.")
-    yield last.frames[-1], last.rows[-1], last.rows[-1], last.prompt
+    yield last.frames[-1], last.action.prompt, _numbers(last, len(last.frames) - 1)
+
+
+def _numbers(clip: ClipRecord, frame: int) -> dict[str, np.ndarray]:
+    """Return the vectors of a frame by name."""
+    cameras, following = clip.action.cameras, min(frame + 1, len(clip.rows) - 1)
+    return {
+        STATE: clip.rows[frame].astype(np.float32),
+        ACTION: clip.rows[following].astype(np.float32),
+        HANDS: clip.action.joints_m[frame].astype(float).ravel(),
+        POSES: np.asarray(cameras.world_from_camera[frame], float).ravel(),
+        INTRINSICS: np.asarray(cameras.intrinsics_px, float).ravel(),
+    }
 
 
 def _write_episode(
@@ -152,22 +184,21 @@ def _write_episode(
     statistics: dict[str, _Statistics],
     fps: int,
 ) -> None:
-    number, pictures, steps = len(totals.episodes), [], []
-    for frame, *step in _steps(clips, totals):
+    number, pictures, prompts, steps = len(totals.episodes), [], [], []
+    for frame, prompt, step in _steps(clips, totals):
         statistics[IMAGE].add(frame.reshape(-1, 3) / 255)
         pictures.append({"bytes": _png(frame), "path": None})
-        steps.append(step)
-    states, actions = (np.stack([step[i] for step in steps]).astype(np.float32) for i in (0, 1))
-    prompts = [prompt for *_, prompt in steps]
-    for prompt in prompts:
+        prompts.append(prompt)
         totals.tasks.setdefault(prompt, len(totals.tasks))
-    statistics[STATE].add(states.astype(float))
-    statistics[ACTION].add(actions.astype(float))
+        steps.append(step)
+    vectors = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
+    for name, values in vectors.items():
+        totals.vectors[name] = size = values.shape[1]
+        statistics.setdefault(name, _Statistics((size,))).add(values.astype(float))
     count, first = len(steps), totals.frames
     columns = {
         IMAGE: pictures,
-        STATE: list(states),
-        ACTION: list(actions),
+        **{name: list(values) for name, values in vectors.items()},
         "timestamp": (np.arange(count) / fps).astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, number),
@@ -196,8 +227,9 @@ def _write_table(path: Path, columns: dict[str, Any]) -> None:
     import pyarrow.parquet as pq
 
     picture = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    vector = pa.list_(pa.float32())
-    types = {IMAGE: picture, STATE: vector, ACTION: vector, "timestamp": pa.float32()}
+    short, long = pa.list_(pa.float32()), pa.list_(pa.float64())
+    types = {IMAGE: picture, STATE: short, ACTION: short, "timestamp": pa.float32(),
+             HANDS: long, POSES: long, INTRINSICS: long}  # fmt: skip
     arrays = {
         name: pa.array(values, types.get(name, pa.int64() if name in COUNTERS else None))
         for name, values in columns.items()
@@ -230,6 +262,10 @@ def _write_meta(
     write_json(folder / "meta/stats.json", stats)
     (size,) = totals.sizes
     vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+    exact = {
+        name: {"dtype": "float64", "shape": [totals.vectors[name]], "names": None}
+        for name in (HANDS, POSES, INTRINSICS)
+    }
     picture = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
     own = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
     info = {
@@ -249,6 +285,7 @@ def _write_meta(
             IMAGE: picture,
             STATE: vector,
             ACTION: vector,
+            **exact,
             "timestamp": {"dtype": "float32", "shape": [1], "names": None},
             **own,
         },

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.data.lerobot import ClipRecord, write_lerobot
+from egosim_jax.data.lerobot import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.env.backends import GeneratedWorld
@@ -79,14 +79,18 @@ def _recorded(path: Path) -> GeneratedWorld:
 
 def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
     """Write a LeRobot dataset with an episode for each stretch between resets."""
-    names = {session.actions.names for session in sessions}
+    names = {(session.actions.kind, session.actions.names) for session in sessions}
     videos = {session.backend.video for session in sessions}
     if len(names) > 1 or len(videos) > 1:
         raise InputError(
             f"The sessions have {len(names)} kinds of actions and clips of {len(videos)} sizes or "
             "rates: a dataset has one. Export them separately. (--session)"
         )
-    episodes = (_clips(session, steps) for session in sessions for _, steps in session.runs())
+    episodes = (
+        EpisodeRecord(clips=_clips(session, steps), save_scene=start.save)
+        for session in sessions
+        for start, steps in session.runs()
+    )
     kind = "gripper" if sessions[0].actions.kind == "robot" else "human_hands"
     write_lerobot(
         folder, episodes, names=sessions[0].actions.names, fps=videos.pop().fps, robot_type=kind
@@ -98,7 +102,7 @@ def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
         yield ClipRecord(
             frames=session.repeat(number).frames,
             rows=session.rows(number),
-            prompt=session.action(number).prompt,
+            action=session.action(number),
         )
 
 

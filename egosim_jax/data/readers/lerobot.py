@@ -14,7 +14,7 @@ index is the text, or has a column `task`.
 from __future__ import annotations
 
 import string
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -59,20 +59,9 @@ class LeRobot:
 
     def find(self) -> Iterator[Entry]:
         """Yield the episodes of a LeRobot dataset."""
-        info = read_json(self.source / "meta" / "info.json")
-        if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
-            raise InputError(f"{self.source}/meta/info.json is not that of a LeRobot dataset.")
-        version = info.get("codebase_version")
-        if version not in VERSIONS:
-            raise InputError(
-                f"{self.source} is of LeRobot version {quote(version)}; {', '.join(VERSIONS)} are "
-                "read. Convert it with LeRobot's own script."
-            )
-        camera = _choose_camera(info["features"], self.camera)
-        fps = info.get("fps")
-        if not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-            raise InputError(f"{self.source}/meta/info.json: fps is {quote(fps)}, not a rate.")
-        episodes = _episodes_v3 if version == "v3.0" else _episodes_v2
+        info = read_info(self.source)
+        camera, fps = _choose_camera(info["features"], self.camera), info["fps"]
+        episodes = _episodes_v3 if info["codebase_version"] == "v3.0" else _episodes_v2
         probe = _Probe()
         for episode in episodes(self.source, info, camera):
             if isinstance(episode, str):
@@ -108,6 +97,58 @@ class LeRobot:
             width=info.width,
             caption="; ".join(episode.tasks) or None,
         )
+
+
+def read_info(root: Path, versions: Sequence[str] = VERSIONS) -> dict[str, Any]:
+    """Return meta/info.json of a dataset with its features, of some versions, and its fps."""
+    info = read_json(root / "meta" / "info.json")
+    if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
+        raise InputError(f"{root}/meta/info.json is not that of a LeRobot dataset.")
+    if (version := info.get("codebase_version")) not in versions:
+        raise InputError(
+            f"{root} is of LeRobot version {quote(version)}; {', '.join(versions)} are "
+            "read. Convert it with LeRobot's own script."
+        )
+    fps = info.get("fps")
+    if not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
+        raise InputError(f"{root}/meta/info.json: fps is {quote(fps)}, not a rate.")
+    return info
+
+
+def read_rows(
+    root: Path, info: Mapping[str, Any], episode: int, columns: Sequence[str]
+) -> dict[str, list[Any]]:
+    """Return columns of the frames of an episode of version 3.0, in their order.
+
+    Raises `InputError` if there is no such episode, or if it does not have the frames that its
+    description names.
+    """
+    require("pyarrow")
+    places = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    known = 0
+    for path in sorted((root / "meta" / "episodes").glob("*/*.parquet"), key=natural_order):
+        table = read_parquet(path, places)
+        known += len(table["episode_index"])
+        if episode in table["episode_index"]:
+            number = table["episode_index"].index(episode)
+            break
+    else:
+        raise InputError(
+            f"{quote_path(root)} has no episode {episode} among its {known}: choose another one. "
+            "(--episode)"
+        )
+    row = {name: _count(values[number], name) for name, values in table.items()}
+    fields = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
+    path = _fill(root, info.get("data_path"), fields, what="data_path")
+    frames = read_parquet(path, ["episode_index", "frame_index", *columns])
+    chosen = [n for n, index in enumerate(frames["episode_index"]) if index == episode]
+    chosen.sort(key=lambda n: frames["frame_index"][n])
+    if [frames["frame_index"][n] for n in chosen] != list(range(row["length"])):
+        raise InputError(
+            f"{quote_path(path)} has {len(chosen)} frames of episode {episode}, meta/episodes says "
+            f"{row['length']}, from 0 without gaps. Download both again."
+        )
+    return {name: [frames[name][n] for n in chosen] for name in columns}
 
 
 class _Probe:
