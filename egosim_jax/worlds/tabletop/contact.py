@@ -26,7 +26,7 @@ from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Body
 from egosim_jax.worlds.tabletop.hands import frame_of, pinch
 from egosim_jax.worlds.tabletop.scene import DRAWER_M, LID_DEGREES, Scene, moving_part
-from egosim_jax.worlds.tabletop.solids import solids_of
+from egosim_jax.worlds.tabletop.solids import surface_of
 from egosim_jax.worlds.tabletop.support import (
     RANKS,
     least_opening,
@@ -96,7 +96,7 @@ class Contact:
         return next((grasp for grasp in self.grasps if grasp.name == name), None)
 
 
-def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"], kind: Kind) -> Contact:
+def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"]) -> Contact:
     """Return the contact at the first frame of an action: hands may be in bodies or have jumped."""
     kept = [
         grasp
@@ -107,14 +107,22 @@ def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"], kind: Kind) ->
         <= SLIP_M
     ]
     contact = _let_go(contact, [grasp for grasp in contact.grasps if grasp not in kept])
-    inside = [
-        (hand, int(joint), body.name)
-        for hand, joints in enumerate(joints_m)
+    there = frozenset(pair for pair in contact.released if pair[0] < len(joints_m))
+    contact = replace(contact, released=there)
+    return _appear(contact, joints_m, np.isfinite(joints_m).all(axis=(1, 2)))
+
+
+def _appear(
+    contact: Contact, joints_m: Float[np.ndarray, "n j 3"], hands: Bool[np.ndarray, " n"]
+) -> Contact:
+    """Return the contact after some hands appeared: those inside bodies do not push them."""
+    inside = {
+        (int(hand), int(joint), body.name)
+        for hand in np.flatnonzero(hands)
         for body in contact.scene.bodies
-        if np.isfinite(joints).all()
-        for joint in np.flatnonzero(surface_of(contact.scene, body, joints)[0] < 0)
-    ]
-    return replace(contact, pressing=frozenset(inside))
+        for joint in np.flatnonzero(surface_of(contact.scene, body, joints_m[hand])[0] < 0)
+    }
+    return replace(contact, pressing=contact.pressing | inside)
 
 
 def advance(
@@ -124,8 +132,18 @@ def advance(
     kind: Kind,
 ) -> Contact:
     """Return the contact after all hands moved in straight lines; a missing hand holds nothing."""
-    seen = np.asarray(np.isfinite(before_m + after_m).all(axis=(1, 2)))
+    there, here = (np.isfinite(joints).all(axis=(1, 2)) for joints in (before_m, after_m))
+    seen = there & here
     contact = _let_go(contact, [grasp for grasp in contact.grasps if not seen[grasp.hand]])
+    gone = set(np.flatnonzero(~seen).tolist())
+    contact = replace(
+        contact,
+        pressing=frozenset(key for key in contact.pressing if key[0] not in gone),
+        closing=contact.closing - gone,
+        released=frozenset(pair for pair in contact.released if pair[0] not in gone),
+    )
+    if (here & ~there).any():
+        contact = _appear(contact, after_m, here & ~there)
     if not seen.any():
         return contact
     length = np.linalg.norm(after_m[seen] - before_m[seen], axis=-1).max()
@@ -134,26 +152,6 @@ def advance(
     for last, here in pairwise(path):
         contact = _step(contact, last, here, np.flatnonzero(seen), kind)
     return contact
-
-
-def surface_of(
-    scene: Scene, body: Body, points_m: Float[np.ndarray, "n 3"], *, handle: bool = False
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Return distance, outward normal in the world, and whether the part moves, at each point.
-
-    Of all solids of a body, or of those that a hand grasps: its handle, if it has one.
-    """
-    found = []
-    for solid in solids_of(body):
-        if handle and body.articulated and not solid.handle:
-            continue
-        moving = solid.part == 0
-        pose = scene.first_part_pose(body.name) if moving else body.world_from_body
-        distance, normal = solid.at(transform(invert(pose), points_m))
-        found.append((distance, normal @ pose[:3, :3].T, np.full(len(points_m), moving)))
-    distances = np.stack([distance for distance, *_ in found])
-    nearest, every = distances.argmin(axis=0), np.arange(len(points_m))
-    return tuple(np.stack(values)[nearest, every] for values in zip(*found, strict=True))  # type: ignore[return-value]
 
 
 def _step(

@@ -13,9 +13,11 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from egosim_jax.geometry import invert, transform
 from egosim_jax.worlds.tabletop.bodies import Body, Shape
+from egosim_jax.worlds.tabletop.scene import Scene
 
 Form = Literal["box", "cylinder", "ball", "cone", "ring"]
 
@@ -115,3 +117,23 @@ def _solids(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, ..
             Solid(form="box", size_m=(x, y, z - lid), part=1),
         )  # fmt: skip
     return (Solid(form=FORMS[shape], size_m=size_m),)
+
+
+def surface_of(
+    scene: Scene, body: Body, points_m: Float[np.ndarray, "n 3"], *, handle: bool = False
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Return distance, outward normal in the world, and whether the part moves, at each point.
+
+    Of all solids of a body, or of those that a hand grasps: its handle, if it has one.
+    """
+    found = []
+    for solid in solids_of(body):
+        if handle and body.articulated and not solid.handle:
+            continue
+        moving = solid.part == 0
+        pose = scene.first_part_pose(body.name) if moving else body.world_from_body
+        distance, normal = solid.at(transform(invert(pose), points_m))
+        found.append((distance, normal @ pose[:3, :3].T, np.full(len(points_m), moving)))
+    distances = np.stack([distance for distance, *_ in found])
+    nearest, every = distances.argmin(axis=0), np.arange(len(points_m))
+    return tuple(np.stack(values)[nearest, every] for values in zip(*found, strict=True))  # type: ignore[return-value]

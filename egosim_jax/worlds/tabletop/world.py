@@ -16,7 +16,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.types import Action, Cameras, Kind, SceneState
+from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
 from egosim_jax.worlds.tabletop.clips import Arm, TabletopClip, film, first_view, provenance
 from egosim_jax.worlds.tabletop.contact import Contact, Grasp, advance, start
 from egosim_jax.worlds.tabletop.hands import Side, arm_of, side_of
@@ -50,10 +50,17 @@ class World:
 
         A hand that holds a body keeps it if it starts near where it ended, and else lets it fall. A
         hand is missing where its joints are NaN. `joints_m` replaces the joints of the action, for
-        hands that are out of view, which an action refuses.
+        hands that are out of view, which an action refuses; `InputError` if it has another shape
+        than an action of these cameras and hands.
         """
         joints = np.asarray(action.joints_m if joints_m is None else joints_m, float)
-        contact = start(Contact(scene=self.scene, grasps=self.grasps), joints[0], action.kind)
+        frames, number = len(action.cameras.world_from_camera), JOINTS[action.kind]
+        if joints.ndim != 4 or (len(joints), *joints.shape[2:]) != (frames, number, 3):
+            raise InputError(
+                f"joints_m is {joints.shape}: {action.kind} hands of a path of {frames} cameras "
+                f"must be ({frames}, hands, {number}, 3). Give as many frames as cameras."
+            )
+        contact = start(Contact(scene=self.scene, grasps=self.grasps), joints[0])
         scenes = [contact.scene]
         for before, after in pairwise(joints):
             contact = advance(contact, before, after, action.kind)

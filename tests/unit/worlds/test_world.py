@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from egosim_jax.types import Action, Kind, VideoSpec
+from egosim_jax.types import Action, InputError, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import Object, World, actions, make_scene, make_sequence, to_action
 from egosim_jax.worlds.tabletop.actions import Grip
 from egosim_jax.worlds.tabletop.hands import closure_for, frame_of, joints_of, side_of
@@ -217,6 +217,33 @@ def test_a_hand_that_disappears_lets_go(cameras):
     _, world = world_of(BOX).move(replace(action, joints_m=joints))
     assert not world.grasps
     np.testing.assert_allclose(place_of(world), [0, 0.25, 0], atol=3e-3)
+
+
+def test_a_hand_that_holds_a_body_may_be_absent_from_the_next_action(cameras):
+    held = drive(cameras, *PICK[1:], (0, 0.25, 0.15, GRAB), frames=4).joints_m
+    away = drive(cameras, (0.2, 0.2, 0.2, OPENED), (0.2, 0.2, 0.2, OPENED)).joints_m
+    first = away[:1].repeat(len(held), axis=0)
+    _, world = world_of(BOX).move(act(cameras, np.concatenate([first, held], axis=1)))
+    assert [grasp.hand for grasp in world.grasps] == [1]
+    scenes, world = world.move(act(cameras, first))
+    assert not world.grasps
+    np.testing.assert_allclose(place_of(replace(world, scene=scenes[0]))[2], 0, atol=1e-6)
+
+
+def test_a_hand_that_appears_inside_a_body_does_not_push_it(cameras):
+    action = drive(cameras, (0.02, 0.25, 0.03, CLOSED), (0.021, 0.25, 0.03, CLOSED))
+    joints = action.joints_m.copy()
+    joints[:3] = np.nan
+    start = world_of(BOX)
+    _, world = start.move(replace(action, joints_m=joints))
+    np.testing.assert_allclose(place_of(world), place_of(start), atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 3, 3), (9, 1, 21, 3), (9, 3, 3)])
+def test_joints_of_another_shape_are_refused(cameras, shape):
+    action = drive(cameras, *PICK[:2])
+    with pytest.raises(InputError, match="as many frames as cameras"):
+        world_of(BOX).move(action, joints_m=np.zeros(shape))
 
 
 def test_an_executed_clip_has_its_ground_truth(cameras):
