@@ -204,9 +204,9 @@ class DWM:
     """Name of the model."""
     only: tuple[str, ...] = ()
     """Train and compare only these models, along with the bases; by default all."""
-    moving_scenes: int = 400
+    moving_scenes: int = 240
     """Scenes with a moving camera to train on, one clip of each."""
-    fixed_scenes: int = 160
+    fixed_scenes: int = 96
     """Scenes with a fixed camera to train on, one clip of each."""
     held_out: int = 24
     """Scenes with a moving camera to generate, and as many with a fixed one."""
@@ -217,11 +217,11 @@ class DWM:
     )
     """Training of the autoencoder, on crops."""
     base: Hyperparameters = Hyperparameters(
-        steps=1600, learning_rate=2e-3, warmup=100, batch_size=8
+        steps=1200, learning_rate=2e-3, warmup=100, batch_size=8
     )
     """Training of each base model, from random weights."""
     adaptation: Hyperparameters = Hyperparameters(
-        steps=700, learning_rate=2e-3, warmup=50, batch_size=8
+        steps=600, learning_rate=2e-3, warmup=50, batch_size=8
     )
     """Training of each model from its base."""
     rank: int | None = 48

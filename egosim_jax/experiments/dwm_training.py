@@ -52,7 +52,7 @@ from egosim_jax.worlds.tabletop import TabletopClip, make_sequence
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 Split = Camera | str
-CROP = (48, 64)
+CROP = (64, 80)
 """Rows and columns of the crops that the autoencoder is trained on."""
 SPLITS = 10_000
 """Seeds between the first scenes of two splits."""

@@ -304,3 +304,36 @@ def video_mae(folder: Path) -> Path:
     }  # fmt: skip
     (folder / "preprocessor_config.json").write_text(json.dumps(processor))
     return folder
+
+
+def xclip(folder: Path) -> Path:
+    import torch
+    import transformers as hf
+
+    torch.manual_seed(0)
+    sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
+    config = hf.XCLIPConfig(
+        text_config={
+            **sizes, "num_attention_heads": 2, "vocab_size": 600, "max_position_embeddings": 32,
+            "bos_token_id": 512, "eos_token_id": 513,
+        },
+        vision_config={
+            **sizes, "num_attention_heads": 2, "image_size": 32, "patch_size": 8, "num_frames": 4,
+            "mit_hidden_size": 16, "mit_intermediate_size": 32, "mit_num_attention_heads": 2,
+        },
+        projection_dim=16, prompt_num_attention_heads=2,
+    )  # fmt: skip
+    network = hf.XCLIPModel(config)
+    with torch.no_grad():  # initialized as for training, all videos would be alike
+        for weight in network.parameters():
+            if weight.ndim > 1:
+                weight.normal_(std=0.2)
+    network.save_pretrained(folder)
+    clip_tokenizer().save_pretrained(folder)
+    processor = {
+        "image_processor_type": "VideoMAEImageProcessor", "do_center_crop": True,
+        "image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.25],
+        "size": {"shortest_edge": 32}, "crop_size": {"height": 32, "width": 32},
+    }  # fmt: skip
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
+    return folder
