@@ -41,6 +41,8 @@ class FineTuning(Recipe):
     """Rank of a LoRA, which is then trained instead of the weights."""
     times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
     """Distribution and weighting of the noise levels."""
+    max_difference: float | None = None
+    """Difference from the target above which an element's error counts as 0; None: none."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
     navigation: float | None = None
@@ -62,7 +64,7 @@ class FineTuning(Recipe):
         model = self.model()
         task = Denoising(
             model=model,
-            objective=Objective(times=self.times),
+            objective=Objective(times=self.times, max_difference=self.max_difference),
             dropout=self.dropout,
             rank=self.rank,
             navigation=self.navigation,

@@ -158,6 +158,7 @@ eight devices 7 each, with `--training.grad-accum-steps 7` one at a time.
 DWM_WAN_14B = replace(
     DWM_COGVIDEOX_5B,
     config="dwm_wan_14b",
+    max_difference=50.0,
     training=replace(
         DWM_COGVIDEOX_5B.training,
         steps=5000,
@@ -172,8 +173,9 @@ r"""DWM's training on Wan 2.1 Fun V1.1 14B InP, widened from 36 to 52 channels.
         --out weights/base
 
 and then as `dwm_cogvideox_5b`. A LoRA of rank and alpha 64 on all 488 linear layers, and the patch
-embedding; 5000 updates, as the released checkpoint has. One clip at a time takes 59 GiB of an H100
-(`--preflight h100:1`).
+embedding; 5000 updates, as the released checkpoint has. As in its trainer, elements whose
+prediction is more than 50 away from its target do not count. One clip at a time takes 59 GiB of an
+H100 (`--preflight h100:1`).
 """
 
 

@@ -17,7 +17,8 @@ e ~ N(0, 1) and one of these draws of the time t:
                   which the EgoSim release is built)
 
 where t(u) is the process's `warp`, the shift of a rectified flow. The mean of L may weight the
-locations of a sample.
+locations of a sample, and elements whose |f - target| exceeds a bound may count as 0 (DWM-Wan's
+trainer, at 50), so that one corrupt value does not spoil an update.
 """
 
 from __future__ import annotations
@@ -55,11 +56,18 @@ class Objective:
     """Mean of the normal of `logit-normal`; above 0 prefers noisy samples."""
     logit_std: float = 1.0
     """Standard deviation of that normal."""
+    max_difference: float | None = None
+    """Difference from the target above which an element's error counts as 0; None: none."""
 
     def __post_init__(self) -> None:
-        """Check the width of the logit-normal."""
+        """Check the width of the logit-normal and the bound of differences."""
         if not self.logit_std > 0:
             raise InputError(f"logit_std must be above 0, not {self.logit_std}.")
+        if self.max_difference is not None and not self.max_difference > 0:
+            raise InputError(
+                f"max_difference must be above 0, not {self.max_difference}: at 0 nothing would be "
+                "learned. Omit it, or give DWM-Wan's 50. (--max-difference)"
+            )
 
     def sample_times(
         self, process: Process, key: Key[Array, " *keys"], batch: int
@@ -121,6 +129,8 @@ class Objective:
         level = time[:, None, None, None, None]
         output = denoise(process.add_noise(x0, noise, level), process.timesteps(time))
         difference = output.astype(jnp.float32) - process.target(x0, noise, level)
+        if self.max_difference is not None:
+            difference = jnp.where(jnp.abs(difference) <= self.max_difference, difference, 0)
         return (loss_weights * jnp.square(difference)).mean(axis=(1, 2, 3, 4))
 
 

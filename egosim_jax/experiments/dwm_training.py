@@ -53,7 +53,7 @@ from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 Split = Camera | str
 CROP = (64, 80)
-"""Rows and columns of the crops that the autoencoder is trained on."""
+"""Most rows and columns of the crops that the autoencoder is trained on."""
 SPLITS = 10_000
 """Seeds between the first scenes of two splits."""
 FIRST_FRAME_SHARE = 0.6
@@ -105,7 +105,9 @@ class Training:
         out, path = self.out / "autoencoder", self.out / "autoencoder/weights/vae.safetensors"
         if not path.exists():
             frames = self.frames("moving")
-            task = Autoencoding(vae=self.config.vae, video=self.config.video, crop=CROP)
+            video = self.config.video
+            crop = min(CROP[0], video.height), min(CROP[1], video.width)
+            task = Autoencoding(vae=self.config.vae, video=video, crop=crop)
             vae = loop.train(
                 task,
                 train_config(self.settings.autoencoder),

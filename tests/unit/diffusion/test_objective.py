@@ -49,6 +49,20 @@ def test_the_true_velocity_has_no_error(x0):
     np.testing.assert_array_equal(errors, np.zeros(3))
 
 
+def test_elements_far_from_their_target_do_not_count(x0):
+    noise, levels = jax.random.normal(jax.random.key(6), SHAPE), jnp.array([0.1, 0.5, 0.9])
+    away = jnp.full(SHAPE, 3.0).at[:, 0, 0, 0].set(60.0).at[0, 0, 0, 0, 0].set(jnp.nan)
+
+    def errors(objective):
+        return objective.loss_at(PROCESS, lambda x, t: noise - x0 + away, x0, noise, levels)
+
+    kept = 1 - 16 / math.prod(SHAPE[1:])
+    np.testing.assert_allclose(errors(Objective(max_difference=50.0)), 9 * kept, rtol=1e-5)
+    assert (errors(Objective())[1:] > 50).all()
+    with pytest.raises(InputError, match="max_difference must be above 0, not 0"):
+        Objective(max_difference=0.0)
+
+
 def test_the_network_is_given_the_rounded_timesteps(x0):
     process = RectifiedFlow(timestep_rounding="bfloat16")
     given = []

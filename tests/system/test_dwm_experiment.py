@@ -1,0 +1,64 @@
+"""`egosim experiment dwm` from clips to its report, and again with what is missing."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from flax import nnx
+
+from egosim_jax import configs
+from egosim_jax.cli.__main__ import main
+from egosim_jax.io import weights
+from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
+
+pytestmark = pytest.mark.slow
+STAGES = ("autoencoder", "base", "adaptation")
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    """Run the experiment on a tiny config, one update a training, from a random autoencoder."""
+    config = replace(TINY, encoders="joint")
+    monkeypatch.setattr(configs, "get", lambda name: config)
+    counts = "--moving-scenes 2 --fixed-scenes 1 --held-out 2 --batch-size 2 --seeds 1 --rank 2"
+    trainings = " ".join(f"--{stage}.steps 1 --{stage}.batch-size 2" for stage in STAGES)
+    out = tmp_path / "run"
+
+    def command():
+        given = f"experiment dwm --steps 2 {counts} {trainings} --only no_hands --out {out}"
+        assert main(given.split()) == 0
+        return out, json.loads((out / "report.json").read_text())
+
+    weights.save(out / "autoencoder/weights/vae.safetensors", config.vae.build(rngs=nnx.Rngs(0)))
+    return command
+
+
+def test_it_trains_compares_and_makes_what_is_missing(run):
+    out, report = run()
+    rows = {
+        "full", "no_hands", "sdedit", "hands_dropped", "autoencoder", "prior copied",
+        "first frame repeated",
+    }  # fmt: skip
+    for camera in ("moving", "fixed"):
+        assert report["tables"][camera].keys() == rows
+        assert report["differences"][camera].keys() == rows - {"full"}
+        psnr = report["tables"][camera]["full"]["psnr"]["mean"]
+        copied = report["tables"][camera]["prior copied"]["psnr"]["mean"]
+        gain = report["differences"][camera]["prior copied"]["psnr"]
+        assert gain["low"] <= gain["mean"] <= gain["high"]
+        assert gain["mean"] == pytest.approx(psnr - copied, abs=1e-6)
+        assert (out / f"contact_sheet_{camera}.png").stat().st_size > 1000
+    made = [
+        path
+        for pattern in ("*/lora.safetensors", "*/weights/*", "generated/*.npy")
+        for path in out.glob(pattern)
+    ]
+    kept = {path: path.stat().st_mtime_ns for path in made}
+    missing = out / "generated" / "moving_sdedit_0.npy"
+    before = missing.read_bytes()
+    missing.unlink()
+    _, again = run()
+    assert again == report
+    assert missing.read_bytes() == before
+    del kept[missing]
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
