@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -85,11 +84,8 @@ class Serve:
         return ExitCode.DONE
 
     def _service(self) -> Service:
-        from egosim_jax.env import backend_of
-        from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.serving.metrics import Metrics
-        from egosim_jax.serving.service import Service
-        from egosim_jax.serving.store import Limits, Store
+        from egosim_jax.serving.service import open_service
+        from egosim_jax.serving.store import Limits
 
         limits = Limits(
             sessions=self.sessions,
@@ -99,18 +95,16 @@ class Serve:
             connections=self.connections,
             step_timeout_s=self.step_timeout,
         )
-        share_with_jax()
-        backend = backend_of(
-            self.world,
+        return open_service(
+            self.out,
+            limits,
+            world=self.world,
             config=self.config,
             weights=self.weights,
             perception=self.perception,
             steps=self.steps,
             batch=self.batch,
         )
-        store = Store(self.out, backend, limits, Metrics())
-        print(f"{len(store.sessions)} sessions are resumed", file=sys.stderr)
-        return Service(store, world=self.world)
 
     def _ready(self, port: int) -> None:
         print(f"http://{self.host}:{port}", flush=True)

@@ -86,7 +86,8 @@ class Client:
                 return self._ask(message)
             except RequestError as error:
                 wait = error.retry_after_s
-                again = error.status in (409, 429) or (error.status == 504 and kind in REPEATABLE)
+                late = error.code in ("timeout", "part_restarts") and kind in REPEATABLE
+                again = error.status in (409, 429) or late
                 if wait is None or not again or time.monotonic() + wait > until:
                     raise
             time.sleep(wait)

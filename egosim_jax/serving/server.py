@@ -11,7 +11,9 @@ import asyncio
 import json
 import socket
 import threading
-from typing import Annotated, Any
+from contextlib import AbstractContextManager
+from importlib import metadata
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import uvicorn
 from fastapi import Depends, FastAPI, Path, Request, Response, WebSocket, WebSocketDisconnect
@@ -24,6 +26,7 @@ from egosim_jax.serving import wire
 from egosim_jax.serving.connections import BoundedProtocol
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.guard import Guard, is_loopback, response, too_large, too_slow
+from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.service import Service
 from egosim_jax.types import InputError
 
@@ -38,6 +41,37 @@ BODY = {
 }
 """Description of the body of a request, which is not read by FastAPI: its size is bounded first."""
 SessionId = Annotated[str, Path(description="Id that create has returned.")]
+
+
+@runtime_checkable
+class Requests(Protocol):
+    """Object that replies to clients: a `Service`, or several behind one entrance."""
+
+    @property
+    def metrics(self) -> Metrics:
+        """Metrics of the requests."""
+        ...
+
+    @property
+    def draining(self) -> bool:
+        """True if nothing new is taken."""
+        ...
+
+    async def describe(self) -> dict[str, Any]:
+        """Return the description that a client gets when it connects."""
+        ...
+
+    def active(self) -> AbstractContextManager[None]:
+        """Return the context in which a request is replied to."""
+        ...
+
+    def refused(self, error: Exception) -> RequestError:
+        """Return the error of a request for the client."""
+        ...
+
+    async def handle(self, message: Any) -> dict[str, Any]:
+        """Return the reply to a request."""
+        ...
 
 
 async def _fields(request: Request) -> dict[str, Any]:
@@ -55,11 +89,11 @@ async def _fields(request: Request) -> dict[str, Any]:
 Fields = Annotated[dict[str, Any], Depends(_fields)]
 
 
-def make_app(service: Service, *, token: str | None = None) -> FastAPI:
+def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
     """Return the application of a service; without a token it is used from this machine only."""
     app = FastAPI(
         title="egosim_jax",
-        version=service.describe()["version"],
+        version=metadata.version("egosim-jax"),
         docs_url=None,  # its pages run scripts of another server
         redoc_url=None,
     )
@@ -102,17 +136,17 @@ def make_app(service: Service, *, token: str | None = None) -> FastAPI:
 
     @app.get("/readyz", summary="The server takes requests")
     async def readyz() -> PlainTextResponse:
-        if service.store.draining:
+        if service.draining:
             return PlainTextResponse("draining\n", status_code=503)
         return PlainTextResponse("OK\n")
 
     @app.get("/metrics", summary="Metrics in Prometheus's format")
     async def metrics() -> PlainTextResponse:
-        return PlainTextResponse(service.store.metrics.text().decode())
+        return PlainTextResponse(service.metrics.text().decode())
 
     @app.get("/", summary="World, limits and requests of the server")
     async def describe() -> JSONResponse:
-        return JSONResponse(service.describe())
+        return JSONResponse(await service.describe())
 
     @app.get("/sessions", summary="Sessions and their committed steps")
     async def sessions() -> Response:
@@ -167,13 +201,13 @@ def _from_json(fields: dict[str, Any]) -> dict[str, Any]:
         raise InputError("episode must be the bytes of a .zip in Base64.") from error
 
 
-async def _converse(socket: WebSocket, service: Service) -> None:
+async def _converse(socket: WebSocket, service: Requests) -> None:
     """Describe the server to a client, then reply to its messages one after the other."""
     await socket.accept()
-    connections = service.store.metrics.connections
+    connections = service.metrics.connections
     connections.inc()
     try:
-        await socket.send_bytes(wire.pack(service.describe()))
+        await socket.send_bytes(wire.pack(await service.describe()))
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -186,7 +220,7 @@ async def _converse(socket: WebSocket, service: Service) -> None:
         connections.dec()
 
 
-async def _reply(socket: WebSocket, service: Service, data: bytes | None) -> None:
+async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> None:
     try:
         if data is None:
             raise InputError("The message is text: it must be binary, packed as MessagePack.")

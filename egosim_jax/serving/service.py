@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
 import traceback
 from collections.abc import Iterator, Mapping
@@ -11,17 +12,21 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from importlib import metadata
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from egosim_jax.env import World, backend_of
 from egosim_jax.env.actions import LAYOUTS
 from egosim_jax.env.chunks import view_of
 from egosim_jax.env.specs import vars_of
+from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.untrusted import quote
 from egosim_jax.serving.errors import RequestError, as_request_error
+from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.session import Result, Session
-from egosim_jax.serving.store import Store
+from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -46,7 +51,17 @@ class Service:
         self._active = 0
         self._quiet = threading.Condition()
 
-    def describe(self) -> dict[str, Any]:
+    @property
+    def metrics(self) -> Metrics:
+        """Metrics of the store."""
+        return self.store.metrics
+
+    @property
+    def draining(self) -> bool:
+        """True if the server is ending and takes nothing new."""
+        return self.store.draining
+
+    async def describe(self) -> dict[str, Any]:
         """Return the description that a client gets when it connects."""
         video, limits = self.store.backend.video, self.store.limits
         return {
@@ -79,11 +94,7 @@ class Service:
 
     def refused(self, error: Exception) -> RequestError:
         """Count the error of a request and return it for the client; log a defect of the server."""
-        found = as_request_error(error)
-        if found is not error and found.code == "internal":
-            traceback.print_exception(error)
-        self.store.metrics.refused.labels(found.code).inc()
-        return found
+        return refusal(error, self.metrics)
 
     def drain(self, timeout_s: float) -> bool:
         """Refuse new work; return True when no request is under way any more."""
@@ -172,6 +183,36 @@ class Service:
             view = await self._wait(self.store.submit(render, bounded=False))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
+
+
+def refusal(error: Exception, metrics: Metrics) -> RequestError:
+    """Count an error and return it for the client; log a defect of the server."""
+    found = as_request_error(error)
+    if found is not error and found.code == "internal":
+        traceback.print_exception(error)
+    metrics.refused.labels(found.code).inc()
+    return found
+
+
+def open_service(
+    folder: Path,
+    limits: Limits,
+    *,
+    world: World,
+    config: str,
+    weights: Path | None,
+    perception: str,
+    steps: int | None,
+    batch: int,
+) -> Service:
+    """Load and compile a world, resume the sessions of a folder, and return their service."""
+    share_with_jax()
+    backend = backend_of(
+        world, config=config, weights=weights, perception=perception, steps=steps, batch=batch
+    )
+    store = Store(folder, backend, limits, Metrics())
+    print(f"{len(store.sessions)} sessions are resumed", file=sys.stderr)
+    return Service(store, world=world)
 
 
 def _parsed(message: Any) -> tuple[str, Mapping[str, Any]]:
