@@ -8,14 +8,26 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import is_dataclass, replace
 from enum import IntEnum
 from importlib import metadata
-from typing import Any, Protocol, get_args, get_type_hints, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Protocol,
+    get_args,
+    get_type_hints,
+    runtime_checkable,
+)
 
 from egosim_jax import interrupts
 from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 
 class ExitCode(IntEnum):
@@ -41,9 +53,16 @@ class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
         self.code = code
 
 
+HelpGroups = Mapping[str, tuple[str, ...]]
+"""Type of a command's `help_groups`: fields by the title of their group in its help.
+
+The help begins with all other fields: the few that one changes.
+"""
+
+
 @runtime_checkable
 class Command(Protocol):
-    """Command line that was parsed into a dataclass."""
+    """Command line that was parsed into a dataclass, which may have `help_groups`."""
 
     def run(self) -> int:
         """Run the command and return the exit code."""
@@ -84,6 +103,7 @@ def main(
             description=f"{description} --version prints the version.",
             args=given,
             config=(tyro.conf.OmitSubcommandPrefixes,),
+            registry=_rules(given),
         )
         with context():
             code = command.run()
@@ -92,6 +112,62 @@ def main(
         return code
 
     return run_with_exit_codes(run)
+
+
+def _rules(args: Sequence[str]) -> ConstructorRegistry:
+    """Return tyro's rule for our dataclasses: a class with `help_groups` has a box for each.
+
+    Where a script of completions is printed, descriptions end after the first line: each is a line
+    of the script's output.
+    """
+    import tyro
+    from tyro.constructors import (
+        MISSING_NONPROP,
+        ConstructorRegistry,
+        StructConstructorSpec,
+        StructFieldSpec,
+    )
+
+    registry = ConstructorRegistry()
+    completing = any(arg.startswith("--tyro-") for arg in args)
+    open_types: list[Any] = []
+
+    def described(field: StructFieldSpec) -> StructFieldSpec:
+        text = field.helptext
+        if not completing or text is None:
+            return field
+        full = text() if callable(text) else text
+        return replace(field, helptext=full and full.strip().partition("\n")[0])
+
+    @registry.struct_rule
+    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if (members := getattr(info.type, "help_members", None)) is not None:
+            return StructConstructorSpec(instantiate=dict, fields=members)
+        if not is_dataclass(info.type) or info.type in open_types:
+            return None
+        open_types.append(info.type)
+        spec = ConstructorRegistry.get_struct_spec(info)
+        open_types.pop()
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        groups: Mapping[str, tuple[str, ...]] = getattr(info.type, "help_groups", {})
+        fields = {field.name: described(field) for field in spec.fields}
+        boxes = []
+        for title, names in groups.items():
+            box = type(title, (), {"help_members": tuple(fields.pop(name) for name in names)})
+            kind: Any = Annotated[box, tyro.conf.OmitArgPrefixes]
+            boxes.append(StructFieldSpec(name=title, type=kind, default=MISSING_NONPROP))
+
+        def make(**values: Any) -> Any:
+            for title in groups:
+                values |= values.pop(title)
+            return spec.instantiate(**values)
+
+        nested = [field for field in fields.values() if is_dataclass(field.default)]
+        single = [field for field in fields.values() if not is_dataclass(field.default)]
+        return StructConstructorSpec(instantiate=make, fields=(*single, *boxes, *nested))
+
+    return registry
 
 
 def _mistyped(

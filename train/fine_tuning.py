@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.train.config import Recipe, TrainConfig
@@ -27,6 +27,10 @@ class FineTuning(Recipe):
     devices.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "preflight report": ("json", "search"),
+        "method": ("rank", "times", "navigation", "remat", "attention", "dtype", "samples"),
+    }
     config: str
     """Name of the model."""
     training: TrainConfig

@@ -14,10 +14,10 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from egosim_jax import configs
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import Products
 from egosim_jax.progress import track
@@ -45,6 +45,12 @@ class FromScratch(Recipe):
     Writes OUT/weights, with the shards, logs and checkpoints of each stage next to it.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "preflight report": ("json", "search"),
+        "losses and weights": (
+            "crop", "stride", "change_loss_weight", "weights_dtype", "products", "bundle",
+        ),
+    }  # fmt: skip
     config: str
     """Name of the model, which must train its own encoders."""
     vae: TrainConfig
@@ -233,6 +239,7 @@ def _joined(latents: Mapping[str, Path], out: Path) -> Path:
 class FromClips(FromScratch):
     """Train a small model from scratch on clips of a metadata file, or on a few synthetic ones."""
 
+    help_groups: ClassVar[HelpGroups] = {"data": ("clip_frames",), **FromScratch.help_groups}
     metadata: Path | None = None
     """CSV or JSONL in EgoSim's columns, with video and split."""
     clips: int = 0
@@ -289,6 +296,10 @@ class FromClips(FromScratch):
 class FromTabletop(FromScratch):
     """Train a small model from scratch on scenes of the tabletop world, a quarter with a robot."""
 
+    help_groups: ClassVar[HelpGroups] = {
+        "data": ("held_out", "black_cloths", "attempts", "rollouts", "rollout_clips", "twins"),
+        **FromScratch.help_groups,
+    }
     scenes: int = 1000
     """Scenes to train on, two clips of each."""
     held_out: int = 48

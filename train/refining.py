@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.update import Stage
@@ -23,6 +23,13 @@ class RefineVAE(Recipe):
     Writes OUT/weights, with the other networks of the folder, and log and checkpoints in OUT/vae.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "preflight report": ("json", "search"),
+        "losses and weights": (
+            "part", "crop", "perceptual_weight", "perceptual_frames", "motion_weight",
+            "stream_probs", "weights_dtype",
+        ),
+    }  # fmt: skip
     config: str
     """Name of the model."""
     vae: TrainConfig

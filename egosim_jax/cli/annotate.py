@@ -6,11 +6,11 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.perception.estimates import Rung
 from egosim_jax.progress import track
 from egosim_jax.rendering import RendererName
@@ -33,6 +33,20 @@ class Annotate:
     command resumes an interrupted one. Prints the folder.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "format": ("size", "fps", "num_frames", "split", "caption"),
+        "selection": (
+            "min_hands", "min_sharpness", "max_black", "min_motion", "max_motion",
+            "min_prior_gain",
+        ),
+        "hands and masks": ("hand_weights", "hands", "side", "masks", "detector", "phrases"),
+        "cameras and scene": (
+            "focal", "rung", "scale", "camera_height", "state", "renderer",
+        ),
+        "run": (
+            "device", "dtype", "offline", "workers", "ray", "ray_gpus", "ray_actors", "seed",
+        ),
+    }  # fmt: skip
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO ...")]
     """Videos, recordings, or folders of them."""
     out: Path

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from egosim_jax.command import HelpGroups
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -29,6 +30,10 @@ NO_DREAMSIM = (
 class Options:
     """Clips, baselines and measures of a table."""
 
+    help_groups: ClassVar[HelpGroups] = {
+        "measures": ("lpips", "regions", "hands", "cameras", "depth", "fvd", "device"),
+        "page": ("baselines", "page_clips"),
+    }
     metadata: Path
     """CSV or JSONL in EgoSim's columns, with video."""
     generated: tuple[str, ...]

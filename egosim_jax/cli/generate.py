@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -29,6 +29,11 @@ class Generate:
     Prints the path of each clip.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "clips": ("robot", "limit", "where", "video_id", "start", "lenient", "decoding"),
+        "sampling": ("steps", "sampling", "strength", "solver", "lora", "lora_scale", "baseline"),
+        "run": ("batch_size", "skip_existing", "reconstruct"),
+    }
     config: str
     """Name of the model."""
     metadata: Path | None = None

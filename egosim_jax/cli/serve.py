@@ -6,9 +6,9 @@ import os
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ class Serve:
     the extra `serve`. Prints the address when it takes requests.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "clips": ("perception", "steps", "batch"),
+        "limits": ("sessions", "queue", "threads", "max_steps", "connections", "step_timeout"),
+    }
     out: Path = Path("runs/serve")
     """Folder of the sessions."""
     config: str = "tabletop"

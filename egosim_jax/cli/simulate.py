@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from egosim_jax.command import ExitCode
+from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import up_of, write_portrait
@@ -39,6 +39,10 @@ class Simulate:
     has ground truth, as in the tabletop world. An interrupted run is resumed.
     """
 
+    help_groups: ClassVar[HelpGroups] = {
+        "scene": ("robot", "first_frame"),
+        "loop": ("weights", "steps", "perception", "update", "renderer"),
+    }
     config: str = "tabletop"
     """Name of the model."""
     episode: Path | None = None

@@ -1,7 +1,9 @@
 """Behavior of every command line: version, suggestions, errors in one line."""
 
+import dataclasses
 import errno
 import runpy
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -15,10 +17,16 @@ import egosim_jax
 from egosim_jax import command
 from egosim_jax.cli.__main__ import Commands
 from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.cli.annotate import Annotate
+from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.cli.generate import Generate
+from egosim_jax.cli.serve import Serve
+from egosim_jax.cli.simulate import Simulate
 from egosim_jax.convert.__main__ import main as convert
 from egosim_jax.train.__main__ import main as train
 from egosim_jax.train.config import TrainConfig
-from egosim_jax.types import InputError
+from egosim_jax.train.recipes import RECIPES
+from egosim_jax.types import InputError, MeshConfig
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,7 +71,7 @@ def test_egosim_alone_shows_what_to_do_next(capsys):
     assert egosim([]) == command.ExitCode.DONE
     shown = capsys.readouterr().out
     lines = [line.split("  ")[1].split() for line in shown.splitlines()[2:-2]]
-    assert len(lines) == 7
+    assert len(lines) == 8
     for program, *words in lines:
         assert program == "egosim"
         assert command._mistyped(Commands, words, program, ["train"]) is None
@@ -174,3 +182,59 @@ def test_help_needs_no_jax():
         "assert 'jax' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+GROUPED = [Annotate, Evaluate, Generate, Serve, Simulate, *{type(r) for _, r in RECIPES.values()}]
+
+
+@pytest.mark.parametrize("kind", GROUPED)
+def test_help_begins_with_few_options_and_every_other_is_in_one_group(kind):
+    grouped = [name for names in kind.help_groups.values() for name in names]
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    first = [
+        n for n, field in fields.items() if n not in grouped and "Config" not in str(field.type)
+    ]
+    assert len(set(grouped)) == len(grouped)
+    assert set(grouped) < fields.keys()
+    assert len(first) <= 7
+    assert not set(first) & kind.help_groups.keys()
+
+
+def test_the_groups_of_options_are_in_the_help(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        egosim(["generate", "--help"])
+    shown = capsys.readouterr().out
+    places = [
+        shown.index(text)
+        for text in ("--config", "--seed", "sampling options", "--steps", "mesh options")
+    ]
+    assert places == sorted(places)
+
+
+def test_grouped_options_arrive_in_their_fields(monkeypatch):
+    found = []
+    monkeypatch.setattr(Generate, "run", lambda self: found.append(self) or 0)
+    args = "generate --config debug --steps 3 --robot --start 1 2 --mesh.data 4"
+    assert egosim(shlex.split(args)) == command.ExitCode.DONE
+    mesh = MeshConfig(data=4, fsdp=1)
+    assert found == [Generate(config="debug", steps=3, robot=True, start=(1, 2), mesh=mesh)]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"), [("egosim simul", "simulate"), ("egosim generate --str", "--strength")]
+)
+def test_the_printed_script_completes_commands_and_options_in_bash(
+    words, expected, tmp_path, capsys
+):
+    with pytest.raises(SystemExit):
+        egosim(["--tyro-print-completion", "bash"])
+    script = tmp_path / "egosim"
+    script.write_text(capsys.readouterr().out)
+    last = len(words.split()) - 1
+    code = (
+        f"source {script}; COMP_WORDS=({words}); COMP_CWORD={last}; "
+        '$(complete -p egosim | grep -o "_tyro[a-z_]*"); echo "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [expected]
