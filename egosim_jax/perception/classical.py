@@ -23,7 +23,7 @@ from egosim_jax.perception.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
 from egosim_jax.perception.registry import register
 from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
-from egosim_jax.rendering.reference import render, splat
+from egosim_jax.rendering.reference import splat
 from egosim_jax.types import Action, Cameras, Clip, SceneState, check_counts
 
 
@@ -81,13 +81,16 @@ class RevealedSurfaces:
         planes: Mapping[int, Float[np.ndarray, " 4"]],
     ) -> tuple[Float32[np.ndarray, "f h w"], Int32[np.ndarray, "f h w"]]:
         """Return depth and object ids of changed pixels; infinite and 0 elsewhere."""
-        view = render(state, cameras, point_px=self.point_px)
-        others = ~np.isin(state.object_ids, list(motions))
-        rest, _ = splat(state.points_m[others], cameras, point_px=self.point_px)
-        depth = np.full(rest.shape, np.inf, np.float32)
-        ids = np.zeros(rest.shape, np.int32)
+        shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
+        depth, ids = np.full(shape, np.inf, np.float32), np.zeros(shape, np.int32)
+        if not motions:
+            return depth, ids
+        held = np.isin(state.object_ids, list(motions))
+        rest, _ = splat(state.points_m[~held], cameras, point_px=self.point_px)
+        _, index = splat(state.points_m[held], cameras, point_px=self.point_px)
+        before = np.append(state.object_ids[held], np.int32(0))[index]
         for number in motions:
-            revealed = (view.object_ids == number) & ~np.isfinite(rest)
+            revealed = (before == number) & ~np.isfinite(rest)
             depth[revealed] = np.minimum(depth, plane_depth(planes[number], cameras))[revealed]
         for number, motion in motions.items():
             points = state.points_m[state.object_ids == number].astype(float)

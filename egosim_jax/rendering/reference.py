@@ -23,6 +23,9 @@ from egosim_jax.rendering.skeleton import (
 )
 from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
 
+NO_POINT = np.iinfo(np.uint64).max
+"""Key of a pixel that sees no point."""
+
 
 def splat(
     points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
@@ -35,22 +38,26 @@ def splat(
     shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
     depth, index = np.full(shape, np.inf, np.float32), np.full(shape, -1)
     (known,) = np.nonzero(np.isfinite(points_m).all(axis=1))
+    points, focal = points_m[known].astype(float), cameras.intrinsics_px.astype(np.float32)
     for frame, world_from_camera in enumerate(cameras.world_from_camera):
-        local = transform(invert(world_from_camera), points_m[known]).astype(np.float32)
+        local = transform(invert(world_from_camera), points).astype(np.float32)
         drawable = (local[:, 2] >= NEAR_M) & (local[:, 2] <= FAR_M)
         local, number = local[drawable], known[drawable].astype(np.uint64)
-        u, v = project(cameras.intrinsics_px.astype(np.float32), local)
-        column, row = np.ceil(u - point_px / 2), np.ceil(v - point_px / 2)
+        u, v = project(focal, local)
         # One key for depth and number: the bits of positive floats sort as the floats do.
         keys = local[:, 2].copy().view(np.uint32).astype(np.uint64) << 32 | number
-        best = np.full(shape[1:], np.iinfo(np.uint64).max)
+        order = np.argsort(keys)[::-1]  # of equal cells the last one counts: the nearest point
+        column, row = (np.ceil(x[order] - point_px / 2).astype(int) for x in (u, v))
+        keys, best = keys[order], np.full(shape[1] * shape[2], NO_POINT)
         for down in range(point_px):
             for right in range(point_px):
                 y, x = row + down, column + right
                 inside = (y >= 0) & (y < shape[1]) & (x >= 0) & (x < shape[2])
-                cell = y[inside].astype(int) * shape[2] + x[inside].astype(int)
-                np.minimum.at(best.reshape(-1), cell, keys[inside])
-        drawn = best != np.iinfo(np.uint64).max
+                seen = np.full_like(best, NO_POINT)
+                seen[y[inside] * shape[2] + x[inside]] = keys[inside]
+                best = np.minimum(best, seen)
+        best = best.reshape(shape[1:])
+        drawn = best != NO_POINT
         depth[frame][drawn] = (best[drawn] >> 32).astype(np.uint32).view(np.float32)
         index[frame][drawn] = (best[drawn] & 0xFFFFFFFF).astype(int)
     return depth, index

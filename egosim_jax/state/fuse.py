@@ -145,8 +145,9 @@ def carve_free_space(
     votes = np.zeros(len(old.points_m), int)
     observed = np.zeros(len(votes), bool)
     depth = np.where(valid, perceived.depth_m, np.nan)
-    for frame in range(len(depth)):
-        behind = _surface_behind(old, perceived, depth[frame], frame)
+    points = old.points_m.astype(np.float64)
+    for frame in np.flatnonzero(valid.any(axis=(1, 2))):
+        behind = _surface_behind(points, old.object_ids, perceived, depth[frame], frame)
         here = np.abs(behind) <= FREE_SPACE_MARGIN_M
         through = behind > FREE_SPACE_MARGIN_M
         votes = np.clip(votes + here - through, -VOTE_LIMIT, VOTE_LIMIT)
@@ -156,16 +157,20 @@ def carve_free_space(
 
 
 def _surface_behind(
-    old: _Points, perceived: Perceived, depth_m: Float32[np.ndarray, "h w"], frame: int
+    points_m: Float[np.ndarray, "n 3"],
+    object_ids: Int[np.ndarray, " n"],
+    perceived: Perceived,
+    depth_m: Float32[np.ndarray, "h w"],
+    frame: int,
 ) -> Float[np.ndarray, " n"]:
     """Return the distance in meters of a frame's surface behind each point; NaN where unknown."""
     cameras = perceived.cameras
     camera_from_world = invert(cameras.world_from_camera[frame])
-    local = transform(camera_from_world, old.points_m.astype(np.float64))
+    local = transform(camera_from_world, points_m)
     for number, path in perceived.world_from_object.items():
-        own = old.object_ids == number
+        own = object_ids == number
         camera_from_end = camera_from_world @ path[frame] @ invert(path[-1])
-        local[own] = transform(camera_from_end, old.points_m[own].astype(np.float64))
+        local[own] = transform(camera_from_end, points_m[own])
     row, column, inside = pixels_of(cameras, local)
     behind = np.full(len(local), np.nan)
     behind[inside] = depth_m[row[inside], column[inside]] - local[inside, 2]
