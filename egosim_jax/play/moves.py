@@ -22,6 +22,12 @@ from egosim_jax.worlds.tabletop.scene import DRAWER_M, Scene, moving_part
 Deed = Literal["carry", "lift", "open or close"]
 TRAVEL = 0.75
 """Share of a clip in which a driven hand moves; afterwards it opens or closes."""
+RELAXED = 0.25
+"""Closure of a hand that does nothing."""
+MIDDLE_M = (0.0, 0.25)
+"""Middle of the objects' places on the table, in meters."""
+FIRST_M = (0.10, 0.16)
+"""Shortest and longest way that is suggested to carry an object, in meters."""
 OPENINGS = np.linspace(0, 1, 41)
 """Openings of furniture that are compared."""
 
@@ -105,6 +111,30 @@ def reach(scene: Scene, name: str, side: Side) -> Pose:
     """Return the open hand at the place where it would grasp a body."""
     grip = actions.grip_on(scene, Intent(verb="lift", name=name), "human", side)
     return Pose.of_grip(replace(grip, closure=actions.opened("human")), side)
+
+
+def ready(scene: Scene, name: str, side: Side) -> Pose:
+    """Return the hand in the air in front of a body, where hands begin in the training clips."""
+    grip = actions.grip_on(scene, Intent(verb="lift", name=name), "human", side)
+    point = grip.point_m + [0.0, -0.09, 0.07]
+    relaxed = replace(grip, point_m=point, pitch=np.radians(30), closure=RELAXED)
+    return Pose.of_grip(relaxed, side)
+
+
+def first_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] | None:
+    """Return a body near the middle, and a free place across the hand, which hides it nowhere.
+
+    None if there is no loose body with such a place.
+    """
+    across, rng = -1.0 if side == "right" else 1.0, np.random.default_rng(0)
+    loose = [b for b in scene.bodies if b.shape != "ring" and not (b.static or b.articulated)]
+    gaps = {b.name: np.linalg.norm(b.world_from_body[:2, 3] - MIDDLE_M) for b in loose}
+    for name in sorted(gaps, key=lambda name: gaps[name]):
+        drawn = [scene.free_place(scene.body(name), rng, away_m=FIRST_M) for _ in range(8)]
+        places = [place for place in drawn if place is not None]
+        if places:
+            return name, max(places, key=lambda place: across * place[0])
+    return None
 
 
 def intent_of(

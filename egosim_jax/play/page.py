@@ -64,7 +64,7 @@ class Page:
         self._filling = False
         self._make_scene()
         self._make_controls()
-        self._refresh()
+        self._open()
         threading.Thread(target=self._keep_preview, name="preview", daemon=True).start()
 
     def _make_scene(self) -> None:
@@ -105,7 +105,6 @@ class Page:
             for label in ("Generated", "Truth")
         ]
         self._status = gui.add_markdown(HELP)
-        self._inputs: list[Any] = []
         with gui.add_folder("Act"):
             self._object: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", NOTHING)
             self._choose("Let the hand", {label: partial(self._do, d) for label, d in DEEDS})
@@ -133,26 +132,19 @@ class Page:
         """Add a row of buttons, each of which changes the episode."""
         group = self._server.gui.add_button_group(label, tuple(runs))
         group.on_click(lambda event: self._change(runs[event.target.value]))
-        self._inputs.append(group)
 
     def _change(self, run: Callable[[], None]) -> None:
         """Run what changes the episode, unless something else already waits to."""
         if not self._waiting.acquire(blocking=False):
             return
-        self._enable(False)
         try:
             with self._changing:
                 self._waiting.release()
                 self._shown += 1  # ends what is being replayed
                 run()
-        except InputError as error:
+        except (InputError, FloatingPointError) as error:
+            self._status.content = quote_text(str(error))
             self._tell("Not possible", str(error))
-        finally:
-            self._enable(True)
-
-    def _enable(self, usable: bool) -> None:
-        for item in self._inputs:
-            item.disabled = not usable
 
     def _tell(self, title: str, body: str) -> None:
         for client in self._server.get_clients().values():
@@ -213,7 +205,6 @@ class Page:
                 self._pictures[0].image = _large(frame)
             if last:
                 self._status.content = "Looking at what happened…"
-                self._enable(True)
 
         timing = self.played.step(poses, self._camera, caption, show)
         self._status.content = (
@@ -223,6 +214,17 @@ class Page:
         self._refresh()
         self._replay_later([self.played.now])
 
+    def _open(self) -> None:
+        """Show a new episode."""
+        played = self.played
+        if played.scene is not None:
+            self._object.options = [body.name for body in played.scene.bodies]
+        if played.goal is not None:
+            self._object.value, place = played.goal
+            self._ring.position = (*place, 0.0)
+        self._status.content = HELP
+        self._refresh()
+
     def _refresh(self) -> None:
         """Show the present moment."""
         played, now = self.played, self.played.now
@@ -231,11 +233,6 @@ class Page:
             self._cloud.points = state.points_m
             self._cloud.colors = state.colors
         self._filling = True
-        names = [] if played.scene is None else [body.name for body in played.scene.bodies]
-        chosen = self._object.value
-        self._object.options = names or NOTHING
-        if chosen in names:
-            self._object.value = chosen
         captions = [f"{n}: {moment.caption}" for n, moment in enumerate(played.moments)]
         self._past.options = captions
         self._past.value = captions[played.at]
@@ -330,8 +327,7 @@ class Page:
 
     def _begin(self) -> None:
         self.played = self._new(int(self._seed.value))
-        self._status.content = HELP
-        self._refresh()
+        self._open()
 
 
 def _video(played: Played) -> UInt8[np.ndarray, "f h w 3"]:

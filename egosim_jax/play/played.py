@@ -10,7 +10,7 @@ import secrets
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import no_type_check
@@ -24,7 +24,7 @@ from egosim_jax.env.chunks import view_of
 from egosim_jax.env.start import Start, check_size
 from egosim_jax.env.streaming import Streamer
 from egosim_jax.episode import Episode
-from egosim_jax.play.moves import Pose, remembered
+from egosim_jax.play.moves import Pose, first_goal, ready, remembered
 from egosim_jax.serving.session import Session
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 from egosim_jax.worlds.tabletop import Scene, World, opening
@@ -81,12 +81,17 @@ class Played:
         check_size(start, world.video)
         self.world, self._streamer = world, streamer
         self.side: Side = side
+        self.scene = _true_scene(start, world)
+        self.goal = None if self.scene is None else first_goal(self.scene, side)
+        """Object and place that are suggested for a first clip."""
         name = f"play-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         actions = ActionSpec(sides=(side,), camera=True)
+        if self.scene is not None and self.goal is not None and start.row is None:
+            row = ready(self.scene, self.goal[0], side).row(side, np.zeros(6))
+            start = replace(start, row=np.clip(row, *actions.bounds))
         self.session = Session.create(folder / name, world, actions, start)
         self._filming = ThreadPoolExecutor(1, thread_name_prefix="truth")
         first = self.session.result.frames
-        self.scene = _true_scene(start, world)
         truth: Future[Filmed] | None = None
         if self.scene is not None:
             truth = Future()

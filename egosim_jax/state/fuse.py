@@ -146,7 +146,7 @@ def carve_free_space(
     observed = np.zeros(len(votes), bool)
     depth = np.where(valid, perceived.depth_m, np.nan)
     points = old.points_m.astype(np.float64)
-    for frame in np.flatnonzero(valid.any(axis=(1, 2))):
+    for frame in np.flatnonzero(valid.any(axis=(1, 2))).tolist():
         behind = _surface_behind(points, old.object_ids, perceived, depth[frame], frame)
         here = np.abs(behind) <= FREE_SPACE_MARGIN_M
         through = behind > FREE_SPACE_MARGIN_M
