@@ -77,6 +77,8 @@ def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
         "frames": {side: int(seen[:, n].sum()) for n, side in enumerate(SIDES)},
         "visible": share,
     }
+    if hands.mirrored is not None:
+        notes["mirrored"] = {side: int(hands.mirrored[:, n].sum()) for n, side in enumerate(SIDES)}
     least = config.cutting.quality.min_hands
     if share < least:
         raise RefusedError(
@@ -135,6 +137,7 @@ def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
         joints_hand_m=np.where(joints, np.nan, hands.joints_hand_m),
         presence=np.where(dropped, 0, hands.presence),
         filled=None if hands.filled is None else hands.filled & ~dropped,
+        mirrored=None if hands.mirrored is None else hands.mirrored & ~dropped,
     )
 
 
@@ -245,9 +248,10 @@ def _on_side(hands: HandTracks, side: Side) -> HandTracks:
     own = LEFT if side == "left" else RIGHT
     best = np.argmax(np.where(visible(hands), hands.presence, -1), axis=1)
     frames = np.arange(len(best))
-    moved: dict[str, Any] = {"filled": None}
+    moved: dict[str, Any] = {"filled": None, "mirrored": None}
     for name, missing in (
-        ("joints_px", np.nan), ("joints_hand_m", np.nan), ("presence", 0), ("filled", False)
+        ("joints_px", np.nan), ("joints_hand_m", np.nan), ("presence", 0), ("filled", False),
+        ("mirrored", False),
     ):  # fmt: skip
         if (values := getattr(hands, name)) is not None:
             moved[name] = np.full_like(values, missing)

@@ -37,6 +37,8 @@ class HandTracks:
     """Confidence from 0 to 1 that the hand is in the frame; 0 where it was not seen."""
     filled: Bool[np.ndarray, "f 2"] | None = None
     """Hands that were not seen but interpolated between frames near by; None for none at all."""
+    mirrored: Bool[np.ndarray, "f 2"] | None = None
+    """Hands whose joints seem to be those of the other side; None for none at all."""
 
 
 @no_type_check

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Protocol, no_type_check, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.perception.hands.palms import Palms, cut_tile, decode_palms, make_tiles
 from egosim_jax.perception.hands.regions import (
@@ -28,6 +28,14 @@ from egosim_jax.perception.hands.regions import (
 BATCH = 64
 """Number of pictures that are given to a network at once."""
 _PALM = [0, 1, 2, 5, 9, 13, 17]
+_KNUCKLES = [5, 9, 13, 17]
+_BENT = [7, 8, 11, 12, 15, 16, 19, 20]
+_FOREARM_NATS = 10
+"""Log odds of a right hand per picture width that a forearm enters to the right of the middle."""
+_BEND_NATS = 10
+"""Log odds of a right hand per length of the palm that its fingers bend to their side of it."""
+_OTHER_REGIONS = [(turn, scale) for turn in (-0.5, -0.25, 0.25, 0.5) for scale in (1.0, 1.4)]
+"""Turns in radians, and scales, of the regions in which a hand of the other side is searched."""
 
 
 @runtime_checkable
@@ -66,7 +74,11 @@ class Candidates:
     presence: Float[np.ndarray, " n"]
     """Confidence from 0 to 1 that there is a hand."""
     right: Float[np.ndarray, " n"]
-    """Probability that it is a right hand."""
+    """Probability that it is a right hand, as the network says."""
+    bend_right: Float[np.ndarray, " n"]
+    """Probability that its joints are those of a right hand, by how its fingers bend."""
+    forearm_right: Float[np.ndarray, " n"]
+    """Probability that it is a right hand, by where its forearm enters the picture."""
     palm: Float[np.ndarray, " n"]
     """Confidence from 0 to 1 that its palm was detected where its joints say."""
 
@@ -88,6 +100,11 @@ class Candidates:
         )
 
     @property
+    def seems_right(self) -> Bool[np.ndarray, " n"]:
+        """True for hands whose joints are more likely those of a right one."""
+        return (self.right + self.bend_right) / 2 > 0.5
+
+    @property
     def size_px(self) -> Float[np.ndarray, " n"]:
         """Size of each hand in pixels: the root mean square distance of its joints, times two."""
         return spread(self.joints_px)
@@ -105,6 +122,62 @@ def relative_distance(
     """Return the mean distance of the joints of two hands, in sizes of the larger one."""
     distance = np.linalg.norm(one - other, axis=-1).mean(-1)
     return distance / np.maximum(np.maximum(spread(one), spread(other)), 1e-6)
+
+
+def right_by_forearm(
+    joints_px: Float[np.ndarray, "n 21 2"], height: int, width: int
+) -> Float[np.ndarray, " n"]:
+    """Return the probability of right hands by where their forearms enter the wearer's picture.
+
+    A forearm continues the line from the knuckles to the wrist. That of a right hand crosses the
+    edge of the picture to the right of the middle; one that crosses the upper edge says nothing.
+    """
+    wrist, size = joints_px[:, 0], np.array([width, height])
+    along = wrist - joints_px[:, _KNUCKLES].mean(1)
+    ahead = np.where(along > 0, size - wrist, -wrist)
+    steps = ahead / np.where(along == 0, 1e-9, along)
+    column, row = ((wrist + steps.clip(0).min(1, keepdims=True) * along) / size).T
+    odds = np.clip(_FOREARM_NATS * (column - 0.5), -4, 4)
+    return np.where(row < 0.05, 0.5, 1 / (1 + np.exp(-odds)))
+
+
+def right_by_bend(joints_m: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, " n"]:
+    """Return the probability of right hands by the side of the palm to which fingers bend."""
+    palm = joints_m[:, _KNUCKLES] - joints_m[:, :1]
+    normal = np.cross(palm[:, 0], palm[:, -1])
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    bend = joints_m[:, _BENT].mean(1) - joints_m[:, _KNUCKLES].mean(1)
+    length = np.maximum(np.linalg.norm(palm[:, 1], axis=-1), 1e-9)
+    return 1 / (1 + np.exp(-np.clip(_BEND_NATS * (bend * normal).sum(-1) / length, -4, 4)))
+
+
+def find_other_side(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    networks: HandNetworks,
+    hands: Candidates,
+    *,
+    right: bool,
+    min_presence: float,
+    same_hand: float,
+) -> Candidates:
+    """Return hands of a side in the places of candidates that were taken for the other one.
+
+    With hidden fingers, the network takes a hand for a left or a right one as its region happens
+    to be: regions turned and enlarged often show the other one, whose joints are not mirrored.
+    """
+    seen = hands.take(np.zeros(0, int))
+    own = regions_of_joints(hands.joints_px)
+    for turn, scale in _OTHER_REGIONS:
+        regions = replace(own, angle=own.angle + turn, size_px=own.size_px * scale)
+        found = _find_joints(frames, networks, hands.frame, regions, 0.0)
+        found = replace(
+            found,
+            palm=hands.palm,
+            forearm_right=right_by_forearm(found.joints_px, *frames.shape[1:3]),
+        )
+        wanted = (found.presence >= min_presence) & (found.seems_right == right)
+        seen = seen.join(found.take(wanted))
+    return _once(seen, same_hand)
 
 
 def find_candidates(
@@ -142,6 +215,7 @@ def find_candidates(
         fresh = _new_ones(_once(fresh, same_hand), found, same_hand)
         found = found.join(fresh)
     found = _refined(frames, networks, found, min_presence, same_hand)
+    found = replace(found, forearm_right=right_by_forearm(found.joints_px, *frames.shape[1:3]))
     of_frame = dict(zip(searched.tolist(), palms, strict=True))
     for i, frame in enumerate(found.frame):
         found.palm[i] = _support(found.joints_px[i], of_frame[int(frame)])
@@ -201,7 +275,9 @@ def _find_joints(
         joints_hand_m=turned_back(regions, meters),
         presence=presence,
         right=right,
+        bend_right=right_by_bend(meters),
         palm=np.zeros(len(numbers)),
+        forearm_right=np.full(len(numbers), 0.5),
     )
     return found.take(presence >= min_presence)
 
@@ -218,7 +294,7 @@ def _refined(
     same = relative_distance(own.joints_px, found.joints_px) <= same_hand
     sure = np.flatnonzero(same & (own.presence >= min_presence))
     values = {}
-    for name in ("joints_px", "joints_hand_m", "presence", "right"):
+    for name in ("joints_px", "joints_hand_m", "presence", "right", "bend_right"):
         values[name] = getattr(found, name).copy()
         values[name][sure] = (values[name][sure] + getattr(own, name)[sure]) / 2
     return replace(found, **values)

@@ -10,9 +10,14 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.perception.estimates import HandTracks
+from egosim_jax.perception.estimates import LEFT, RIGHT, HandTracks
 from egosim_jax.perception.hands import weights as hand_weights
-from egosim_jax.perception.hands.detect import Candidates, HandNetworks, find_candidates
+from egosim_jax.perception.hands.detect import (
+    Candidates,
+    HandNetworks,
+    find_candidates,
+    find_other_side,
+)
 from egosim_jax.perception.hands.litert import LiteRtNetworks
 from egosim_jax.perception.hands.track import (
     TrackConfig,
@@ -66,13 +71,20 @@ class LandmarkHands:
     def candidates(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Candidates:
         """Return the possible hands of all frames, with those in gloves where there are no others.
 
+        Chosen hands whose joints are those of the other side are searched once more.
+
         Frames are searched at the size they have.
         """
         found = self._candidates(frames)
         if self.gloves and (empty := np.all(self._choose(found, len(frames)) < 0, axis=1)).any():
             gloved = self._candidates(paint_skin(frames), wanted=empty)
             found = found.join(gloved.take(gloved.presence >= self.min_gloved))
-        return found
+        path = self._choose(found, len(frames))
+        for side in (LEFT, RIGHT):
+            hands = found.take(path[path[:, side] >= 0, side])
+            other = hands.take(hands.seems_right != (side == RIGHT))
+            found = found.join(self._other_side(frames, other, right=side == RIGHT))
+        return found.take(np.argsort(found.frame, kind="stable"))
 
     def tracks(self, found: Candidates, frames: int) -> HandTracks:
         """Return the tracks among the candidates of a number of frames."""
@@ -94,6 +106,16 @@ class LandmarkHands:
             min_presence=self.min_presence,
             same_hand=self.same_hand,
             wanted=wanted,
+        )
+
+    def _other_side(self, frames: np.ndarray, hands: Candidates, *, right: bool) -> Candidates:
+        return find_other_side(
+            frames,
+            self._networks,
+            hands,
+            right=right,
+            min_presence=self.min_presence,
+            same_hand=self.same_hand / 2,
         )
 
     def _choose(self, found: Candidates, frames: int) -> np.ndarray:
@@ -129,6 +151,8 @@ def _as_tracks(
     joints_px[there] = found.joints_px[path[there]]
     joints_hand_m[there] = found.joints_hand_m[path[there]]
     presence[there] = found.presence[path[there]]
+    mirrored = np.zeros(path.shape, bool)
+    mirrored[there] = (found.seems_right[path] != (np.arange(2) == RIGHT))[there]
     gaps = find_gaps(joints_px, most=max_gap, max_motion=max_motion)
     joints_px = fill_gaps(joints_px, gaps)
     weights = smoothing(joints_px, max_motion=max_motion / 2)
@@ -137,4 +161,5 @@ def _as_tracks(
         joints_hand_m=smooth(fill_gaps(joints_hand_m, gaps), weights),
         presence=presence,
         filled=gaps,
+        mirrored=mirrored,
     )

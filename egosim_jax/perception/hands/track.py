@@ -5,11 +5,15 @@ which may be missing, and which are not the same hand. A dynamic program finds t
 states of least cost. The cost of a frame is that of the network's doubt in presence and side, of a
 missing hand, and of two hands that are nearly in the same place; from frame to frame, that of the
 distance a hand has moved, in hand sizes, or of its appearance or disappearance.
+
+The network's side is often wrong, and surely so, while fingers are hidden. Hence a second program
+decides which hand is which: its candidates are those in the places of the hands that the first one
+found, and its cost has the doubt in the side that the forearm enters from, too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -24,7 +28,13 @@ class TrackConfig:
     """Costs of tracking, in nats where a probability is behind them."""
 
     side: float = 0.5
-    """Weight of the doubt in the side."""
+    """Weight of the network's doubt in the side."""
+    forearm: float = 1.0
+    """Weight of the doubt in the side that the forearm enters from, once hands are found."""
+    bend: float = 0.5
+    """Weight of the doubt in the side whose joints bend like the candidate's, then, too."""
+    least_side: float = 0.05
+    """Least probability of a side: the network is as sure where it is wrong."""
     presence: float = 1.0
     """Weight of the doubt in presence."""
     palm: float = 0.5
@@ -55,8 +65,27 @@ def choose_tracks(
     candidates: Candidates, frames: int, config: TrackConfig, *, same_hand: float
 ) -> Int[np.ndarray, "f 2"]:
     """Return the index of the candidate of the left and right hand in each frame, or -1."""
+    first = replace(config, forearm=0.0, bend=0.0)
+    path = _of_one_side(candidates, _cheapest(candidates, frames, first, same_hand), first)
+    path = _without_false(candidates, path, config)
+    there = np.flatnonzero(_near_chosen(candidates, path, config))
+    hands = (path >= 0).sum(1)
+    sided = _cheapest(candidates.take(there), frames, config, same_hand, hands)
+    return _of_one_side(candidates, np.where(sided >= 0, np.append(there, -1)[sided], -1), config)
+
+
+def _cheapest(
+    candidates: Candidates,
+    frames: int,
+    config: TrackConfig,
+    same_hand: float,
+    hands: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the states of least cost, by dynamic programming; `hands`: how many each frame has."""
     per_frame = [_best(candidates, frame, config.most) for frame in range(frames)]
     states = [_pairs(candidates, there, same_hand) for there in per_frame]
+    if hands is not None:
+        states = [s[(s >= 0).sum(1) == n] for s, n in zip(states, hands, strict=True)]
     cost = _state_cost(candidates, states[0], config)
     back: list[np.ndarray] = []
     for before, now in pairwise(states):
@@ -69,8 +98,17 @@ def choose_tracks(
     chosen = [int(cost.argmin())]
     for pointers in reversed(back):
         chosen.append(int(pointers[chosen[-1]]))
-    path = np.array([s[i] for s, i in zip(states, reversed(chosen), strict=True)])
-    return _without_false(candidates, _of_one_side(candidates, path, config), config)
+    return np.array([s[i] for s, i in zip(states, reversed(chosen), strict=True)])
+
+
+def _near_chosen(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
+    """Return the candidates that are in the place of a chosen one of their frame."""
+    near = np.zeros(len(candidates), bool)
+    for side in (LEFT, RIGHT):
+        pairs = np.stack([np.arange(len(candidates)), path[candidates.frame, side]], axis=-1)
+        there = np.flatnonzero(pairs[:, 1] >= 0)
+        near[there] |= _apart(candidates, pairs[there]) < config.apart
+    return near
 
 
 def _best(candidates: Candidates, frame: int, most: int) -> np.ndarray:
@@ -94,15 +132,26 @@ def _state_cost(candidates: Candidates, states: np.ndarray, config: TrackConfig)
     for side in (LEFT, RIGHT):
         there = states[:, side] >= 0
         chosen = states[there, side]
-        right = candidates.right[chosen]
-        doubt = _nats(right if side == RIGHT else 1 - right)
-        cost[there] += config.side * doubt + config.presence * _nats(candidates.presence[chosen])
+        cost[there] += _side_doubt(candidates, side, config)[chosen]
+        cost[there] += config.presence * _nats(candidates.presence[chosen])
         cost[there] += config.palm * _nats(np.clip(candidates.palm[chosen], 0.1, 1))
         cost[~there] += config.missing
     both = (states >= 0).all(1)
     near = np.clip(1 - _apart(candidates, states[both]) / config.apart, 0, None)
     cost[both] += config.overlap * near
     return cost
+
+
+def _side_doubt(candidates: Candidates, side: int, config: TrackConfig) -> np.ndarray:
+    """Return the cost of each candidate's being a hand of a side."""
+    doubt = np.zeros(len(candidates))
+    for weight, right in (
+        (config.side, np.clip(candidates.right, config.least_side, 1 - config.least_side)),
+        (config.forearm, candidates.forearm_right),
+        (config.bend, candidates.bend_right),
+    ):
+        doubt += weight * _nats(right if side == RIGHT else 1 - right)
+    return doubt
 
 
 def _apart(candidates: Candidates, pairs: np.ndarray) -> np.ndarray:
@@ -137,10 +186,10 @@ def _of_one_side(candidates: Candidates, path: np.ndarray, config: TrackConfig) 
     """Return the path with each hand on one side.
 
     Where a hand of one side ends and one of the other side begins in the same place, both are one
-    hand, of the side that the network says over all of its frames.
+    hand, of the side of least doubt over all of its frames.
     """
     path = path.copy()
-    odds = _nats(1 - candidates.right) - _nats(candidates.right)
+    odds = _side_doubt(candidates, LEFT, config) - _side_doubt(candidates, RIGHT, config)
     parts = [(start, stop, side) for side in (0, 1) for start, stop in runs(path[:, side] >= 0)]
     for start, stop, side in sorted(parts):
         for begin, end, _ in parts:

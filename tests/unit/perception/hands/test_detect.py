@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from egosim_jax.perception.hands.detect import find_candidates, relative_distance
+from egosim_jax.perception.hands.detect import (
+    find_candidates,
+    find_other_side,
+    relative_distance,
+    right_by_bend,
+    right_by_forearm,
+)
 from egosim_jax.perception.hands.palms import (
     Tile,
     cut_tile,
@@ -137,3 +143,31 @@ def test_only_wanted_frames_are_searched():
 
 def test_a_video_without_hands_has_no_candidates():
     assert len(search(paint([[], []]), PaintedHands())) == 0
+
+
+@pytest.mark.parametrize(("angle", "right"), [(-0.6, True), (0.6, False)])
+def test_a_forearm_enters_on_the_side_of_its_hand(angle, right):
+    hands = np.stack([hand_px(center=(160, 80), angle=angle), hand_px(center=(160, 80), angle=3)])
+    sides = right_by_forearm(hands, 240, 320)
+    assert (sides[0] > 0.5) == right
+    assert abs(sides[0] - 0.5) > 0.3
+    assert sides[1] == 0.5  # it enters from above
+
+
+def test_fingers_bend_to_the_other_side_in_a_mirror():
+    hand = np.concatenate([hand_px(center=(0, 0)), np.zeros((21, 1))], -1)[None] / 1000
+    hand[:, [7, 8, 11, 12, 15, 16, 19, 20], 2] = 0.04
+    sides = right_by_bend(np.concatenate([hand, hand * [-1, 1, 1]]))
+    np.testing.assert_allclose(sides.sum(), 1)
+    assert sides.max() > 0.9
+    assert right_by_bend(hand * [1, 1, 0]) == 0.5
+
+
+def test_a_hand_is_searched_again_for_joints_of_its_side():
+    frames = paint([[hand_px(center=(150, 120))]] * 2, right=False)
+    hands = search(frames, PaintedHands())
+    settings = {"min_presence": 0.5, "same_hand": 0.2}
+    again = find_other_side(frames, PaintedHands(), hands, right=False, **settings)
+    assert sorted(again.frame) == [0, 1]
+    assert relative_distance(again.joints_px, hands.joints_px).max() < 0.1
+    assert len(find_other_side(frames, PaintedHands(), hands, right=True, **settings)) == 0

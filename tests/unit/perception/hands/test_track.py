@@ -20,7 +20,7 @@ from egosim_jax.perception.hands.track import (
 from tests.hands import PaintedHands, hand_px, paint
 
 
-def candidates(*hands):
+def candidates(*hands, forearm=0.5, bend=0.5):
     """Return candidates of (frame, center, probability of a right hand, presence, palm)."""
     frame, centers, right, presence, palm = zip(*hands, strict=True)
     joints = np.array([hand_px(center=center) for center in centers])
@@ -31,6 +31,8 @@ def candidates(*hands):
         presence=np.array(presence, float),
         right=np.array(right, float),
         palm=np.array(palm, float),
+        forearm_right=np.broadcast_to(np.asarray(forearm, float), (len(hands),)),
+        bend_right=np.broadcast_to(np.asarray(bend, float), (len(hands),)),
     )
 
 
@@ -52,6 +54,18 @@ def test_a_side_that_is_wrong_in_a_few_frames_does_not_break_a_track():
     path = chosen(found, 8)
     assert path[:, RIGHT].tolist() == list(range(8))
     assert (path[:, LEFT] == -1).all()
+
+
+def test_a_hand_whose_forearm_enters_from_the_right_is_a_right_one():
+    hands = [(f, (100, 100), 0.2, 0.9, 0.9) for f in range(6)]
+    assert (chosen(candidates(*hands), 6)[:, LEFT] >= 0).all()
+    assert (chosen(candidates(*hands, forearm=0.95), 6)[:, RIGHT] >= 0).all()
+
+
+def test_of_two_readings_of_a_hand_the_one_whose_fingers_bend_as_on_its_side_is_chosen():
+    hands = [(f, (100 + d, 100), 0.6, 0.9, 0.9) for d in (0, 30) for f in range(6)]
+    found = candidates(*hands, forearm=0.95, bend=[0.05] * 6 + [0.95] * 6)
+    assert chosen(found, 6)[:, RIGHT].tolist() == list(range(6, 12))
 
 
 def test_hands_that_cross_keep_their_sides():
@@ -158,6 +172,7 @@ def test_a_painted_video_has_its_hand_on_its_side_and_its_gap_is_marked():
     assert (tracks.presence[:, LEFT] > 0).tolist() == [f != 4 for f in range(9)]
     assert np.flatnonzero(tracks.filled[:, LEFT]).tolist() == [4]
     assert np.isnan(tracks.joints_px[:, RIGHT]).all()
+    assert not tracks.mirrored.any()
     expected = [hand_px(center=(150 + 3 * f, 120)) for f in range(9)]
     np.testing.assert_allclose(tracks.joints_px[1:8, LEFT], expected[1:8], atol=1)
     honest = replace(estimator, max_gap=0)(paint(hands, right=False))
