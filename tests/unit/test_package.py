@@ -3,14 +3,20 @@
 import ast
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import egosim_jax
 
 ROOT = Path(egosim_jax.__file__).parent
 OPTIONAL = {"torch", "transformers", "diffusers", "wandb", "open3d", "rerun"}
+
+CLONE = ROOT.parent
 
 
 def modules_after(statement: str) -> set[str]:
@@ -47,3 +53,39 @@ def test_optional_packages_are_never_imported_at_module_level():
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             offenders += [f"{path}: {n}" for n in names if n.partition(".")[0] in OPTIONAL]
     assert not offenders
+
+
+def parsed(text: str) -> tuple:
+    """Return a requirement in a form to compare."""
+    need = Requirement(text)
+    return (
+        canonicalize_name(need.name),
+        *map(str, (sorted(need.extras), need.specifier, need.marker)),
+    )
+
+
+def test_the_lock_file_is_of_the_requirements_of_the_project():
+    """Otherwise: `uv lock`."""
+    project = tomllib.loads((CLONE / "pyproject.toml").read_text("utf-8"))["project"]
+    wanted = {parsed(text) for text in project["dependencies"]}
+    for extra, needs in project["optional-dependencies"].items():
+        for text in needs:
+            name, _, marker = text.partition(";")
+            both = f"{marker.strip()} and extra == '{extra}'" if marker else f"extra == '{extra}'"
+            wanted.add(parsed(f"{name}; {both}"))
+    lock = tomllib.loads((CLONE / "uv.lock").read_text("utf-8"))
+    (ours,) = (package for package in lock["package"] if package["name"] == project["name"])
+    locked = set()
+    for need in ours["metadata"]["requires-dist"]:
+        text = f"{need['name']}[{','.join(need.get('extras', ()))}]{need.get('specifier', '')}"
+        marker = need.get("marker", "").replace("python_full_version", "python_version")
+        locked.add(parsed(f"{text}; {marker}" if marker else text))
+    assert locked == wanted
+
+
+def test_the_lock_file_installs_from_the_public_index_alone():
+    lock = tomllib.loads((CLONE / "uv.lock").read_text("utf-8"))
+    files = [file["url"] for p in lock["package"] for file in p.get("wheels", ())]
+    sources = [p["source"]["registry"] for p in lock["package"] if "registry" in p["source"]]
+    hosts = {urlsplit(address).netloc for address in (*files, *sources)}
+    assert hosts == {"files.pythonhosted.org", "pypi.org"}
