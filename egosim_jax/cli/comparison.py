@@ -20,10 +20,6 @@ if TYPE_CHECKING:
 
 Baseline = Literal["prior", "prior_fit", "still"]
 Network = Literal["alex", "vgg"]
-NO_DREAMSIM = (
-    "dreamsim: its weights are published for the package dreamsim alone, which is not used here; "
-    "the column has published figures only"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +43,8 @@ class Options:
     """Baselines without a model: the prior, the prior with fitted colors, and frame 0 repeated."""
     lpips: tuple[Network, ...] = ("alex",)
     """Networks of LPIPS, which needs the extra `metrics`."""
+    dreamsim: Path | None = None
+    """Folder of DreamSim's ensemble, as its release v0.2.0-checkpoints is unpacked."""
     regions: bool = False
     """Also PSNR near the drawn hands, and of the object where object_mask_video.mp4 has it."""
     hands: bool = False
@@ -78,8 +76,9 @@ class Options:
 
     def measures(self, networks: Sequence[Network]) -> tuple[list[Measure], list[str]]:
         """Return the measures, and why others are unavailable."""
-        from egosim_jax.evaluation.measures import LpipsDistance, Pixels
+        from egosim_jax.evaluation.measures import DreamSimDistance, LpipsDistance, Pixels
         from egosim_jax.metrics import lpips
+        from egosim_jax.metrics.dreamsim import DreamSim
 
         measures: list[Measure] = [Pixels()]
         unavailable: list[str] = []
@@ -89,6 +88,8 @@ class Options:
                 unavailable.append(f"lpips_{name}: {lpips.MISSING}")
             else:
                 measures.append(LpipsDistance(network, name))
+        if self.dreamsim is not None:
+            measures.append(DreamSimDistance(DreamSim(self.dreamsim)))
         return [*measures, *self._estimated()], unavailable
 
     def _estimated(self) -> Iterator[Measure]:
@@ -138,6 +139,7 @@ class Options:
         from egosim_jax.evaluation.page import PAGE, check_jinja, write_page
         from egosim_jax.evaluation.result import Evaluation
         from egosim_jax.evaluation.scoring import CACHE, ScoreCache, Scoring
+        from egosim_jax.metrics.dreamsim import MISSING
 
         if self.page_clips:
             check_jinja()
@@ -155,8 +157,8 @@ class Options:
         )
         rows = scoring.run(clips)
         extra = [key for m in measures[1:] for key in m.columns if key not in result["shown"]]
-        if "dreamsim" in result["shown"]:
-            unavailable.append(NO_DREAMSIM)
+        if "dreamsim" in result["shown"] and self.dreamsim is None:
+            unavailable.append(f"dreamsim: {MISSING}")
         result["shown"] = (*result["shown"], *extra)
         evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
         write_files(evaluation, out)

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from egosim_jax.batch import Window
 from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
 from egosim_jax.evaluation.methods import Shape, read_at
+from egosim_jax.io.digest import sha256
 from egosim_jax.metrics.depth import depth_error
 from egosim_jax.metrics.hands import hand_iou, hand_recall, keypoint_errors
 from egosim_jax.metrics.region import region_psnr
@@ -56,6 +59,10 @@ def _shape(truth: GroundTruth) -> Shape:
     return Shape(*truth.frames.shape[:3])
 
 
+def _object_mask(window: Window) -> Path:
+    return window.files.prior.parent / OBJECT_MASK
+
+
 @dataclass(frozen=True)
 class Regions:
     """PSNR near the hands and, where there is a mask, of the object acted on."""
@@ -79,9 +86,10 @@ class Regions:
             "together",
         }
 
-    def settings(self) -> Any:
-        """Return the parameters of the regions."""
-        return DRAWN_LEVEL, REGION_MARGIN
+    def settings(self, window: Window) -> Any:
+        """Return the parameters of the regions, and the hashes of the files that have them."""
+        files = [p for p in (window.files.hands, _object_mask(window)) if p.exists()]
+        return DRAWN_LEVEL, REGION_MARGIN, [sha256(path) for path in files]
 
     def against(self, truth: GroundTruth) -> Scorer:
         """Return a function that computes both; NaN for an absent region."""
@@ -97,7 +105,7 @@ class Regions:
         return score
 
     def _object(self, truth: GroundTruth) -> Bool[np.ndarray, "f h w"]:
-        path = truth.window.files.prior.parent / OBJECT_MASK
+        path = _object_mask(truth.window)
         if not path.exists():
             return np.zeros(truth.frames.shape[:3], bool)
         return read_at(path, _shape(truth), truth.window.start).min(axis=-1) > 127
@@ -127,7 +135,7 @@ class DepthError:
             "first multiplied by the ratio of the medians",
         }
 
-    def settings(self) -> Any:
+    def settings(self, window: Window) -> Any:
         """Return the hash of the network."""
         return self.estimator, DEPTH_FRAMES
 
@@ -177,14 +185,14 @@ class CameraError:
             "paths "
             "estimated from the videos without the pixels near hands",
             "camera_error": "ours; RMS distance between positions since the first frame, each path "
-            "divided by its largest distance from there",
+            "divided by its largest distance from there; not measured where the true camera stays",
             "camera_ate": "ours; RMS distance between positions since the first frame after the "
             "least-squares scale, divided by the extent of the ground truth's path",
         }
 
-    def settings(self) -> Any:
-        """Return the estimator's options."""
-        return self.estimator
+    def settings(self, window: Window) -> Any:
+        """Return the estimator's options, and the hash of the hands that are ignored."""
+        return self.estimator, DRAWN_LEVEL, REGION_MARGIN, sha256(window.files.hands)
 
     def against(self, truth: GroundTruth) -> Scorer:
         """Return a function that estimates cameras; NaN where they cannot be."""
@@ -197,11 +205,11 @@ class CameraError:
                 return dict.fromkeys(self.columns, NAN)
             target = wanted.world_from_camera.astype(float)
             errors = path_errors(found.world_from_camera.astype(float), target)
-            extent = np.linalg.norm(target[:, :3, 3] - target[0, :3, 3], axis=1).max()
+            extent = float(np.linalg.norm(target[:, :3, 3] - target[0, :3, 3], axis=1).max())
             return {
                 "camera_rotation": errors.rotation_deg,
-                "camera_error": errors.translation,
-                "camera_ate": errors.ate / float(extent) if extent else NAN,
+                "camera_error": errors.translation if extent else NAN,
+                "camera_ate": errors.ate / extent if extent else NAN,
             }
 
         return score
@@ -238,7 +246,7 @@ class HandScores:
             "the video",
         }
 
-    def settings(self) -> Any:
+    def settings(self, window: Window) -> Any:
         """Return the detector's options."""
         return self.estimator
 

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_json, write_text
+from egosim_jax.metrics.report import cell_of
 
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -81,11 +82,6 @@ def to_csv(evaluation: Evaluation) -> str:
             ]
         )
     return buffer.getvalue()
-
-
-def cell_of(value: Mapping[str, float], form: str) -> str:
-    """Return a cell of a table: the mean, and the spread if there is one."""
-    return " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)
 
 
 def to_latex(evaluation: Evaluation) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from egosim_jax.batch import Window
 from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
 from egosim_jax.metrics.frechet import frechet_distance
 from egosim_jax.perception.networks.video_mae import VideoMae
@@ -37,7 +38,7 @@ class Features:
         """Definitions by key."""
         return {"fvd": DEFINITION}
 
-    def settings(self) -> Any:
+    def settings(self, window: Window) -> Any:
         """Return the network, which counts by the hash of its files."""
         return self.network
 

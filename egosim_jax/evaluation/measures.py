@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from egosim_jax.batch import Window
 from egosim_jax.metrics import lpips
+from egosim_jax.metrics.dreamsim import DEFINITION, DreamSim
 from egosim_jax.metrics.image import clip_psnr, color_drift, psnr, ssim
 from egosim_jax.metrics.report import DEFINITIONS
 
@@ -61,8 +62,8 @@ class Measure(Protocol):
         """Definitions by key or keys."""
         ...
 
-    def settings(self) -> Any:
-        """Return what else the values depend on, such as the hash of weights."""
+    def settings(self, window: Window) -> Any:
+        """Return what else the values depend on, such as the hash of weights or of other files."""
         ...
 
     def against(self, truth: GroundTruth) -> Scorer:
@@ -97,7 +98,7 @@ class Pixels:
             "mean over channels",
         }
 
-    def settings(self) -> Any:
+    def settings(self, window: Window) -> Any:
         """Return nothing."""
 
     def against(self, truth: GroundTruth) -> Scorer:
@@ -137,7 +138,7 @@ class LpipsDistance:
         """Definition of the network's column."""
         return {f"lpips_{self.name}": lpips.definition(self.name)}
 
-    def settings(self) -> Any:
+    def settings(self, window: Window) -> Any:
         """Return the config, which has the hash of the weights."""
         return self.network.config
 
@@ -147,6 +148,38 @@ class LpipsDistance:
         return lambda video: {
             f"lpips_{self.name}": float(reference.distances(video[truth.first :]).mean())
         }
+
+
+@dataclass(frozen=True, eq=False)
+class DreamSimDistance:
+    """DreamSim by given weights."""
+
+    network: DreamSim
+    """Loaded network."""
+
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """Heading of the column."""
+        return {"dreamsim": Column("DreamSim", "{:.4f}", "lower")}
+
+    @property
+    def definitions(self) -> Mapping[str, str]:
+        """Definition of the column."""
+        return {"dreamsim": DEFINITION.format(self.network.size)}
+
+    def settings(self, window: Window) -> Any:
+        """Return the hashes of the weights."""
+        return self.network.hashes
+
+    def against(self, truth: GroundTruth) -> Scorer:
+        """Return a function that computes the mean distance over frames."""
+        reference = self.network.embed(truth.counted)
+
+        def score(video: np.ndarray) -> Mapping[str, float]:
+            found = self.network.embed(video[truth.first :])
+            return {"dreamsim": float(self.network.distances(found, reference).mean())}
+
+        return score
 
 
 def standard() -> Sequence[Measure]:

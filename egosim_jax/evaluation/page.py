@@ -19,11 +19,12 @@ from jaxtyping import UInt8
 
 from egosim_jax.batch import Window
 from egosim_jax.data.transforms import resize_video
-from egosim_jax.evaluation.files import ARROWS, cell_of
+from egosim_jax.evaluation.files import ARROWS
 from egosim_jax.evaluation.methods import Method, Shape, read_at
 from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.io.run import write_text
 from egosim_jax.io.video import encode_video, probe_video
+from egosim_jax.metrics.report import cell_of
 from egosim_jax.progress import track
 from egosim_jax.types import InputError
 
@@ -96,14 +97,7 @@ def _tables(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
             "differences": [
                 (
                     evaluation.titles[method],
-                    [
-                        "{} [{}, {}]".format(
-                            *(c.form.format(v[k]) for k in ("mean", "low", "high"))
-                        )
-                        if (v := values.get(key))
-                        else ""
-                        for key, c in columns.items()
-                    ],
+                    [cell_of(values.get(key, {}), c.form) for key, c in columns.items()],
                 )
                 for method, values in differences.get(group, {}).items()
             ],

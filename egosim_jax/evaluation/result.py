@@ -162,6 +162,7 @@ class Evaluation:
                 "size": self.protocol.size,
                 "pixels": sorted({f"{row.shape.width}x{row.shape.height}" for row in self.rows}),
                 "frames": [self.protocol.first, max(row.shape.frames for row in self.rows) - 1],
+                "last_frames": sorted({row.shape.frames - 1 for row in self.rows}),
                 "resize": FIT,
                 "lpips_alex": lpips.protocol(),
                 "unavailable": list(self.unavailable),
@@ -173,10 +174,16 @@ class Evaluation:
         }
 
     def table(self, group: str) -> dict[str, Mapping[str, Mapping[str, float]]]:
-        """Return the rows of a group's table by title, published figures last."""
+        """Return the rows of a group's table by title, published figures last.
+
+        The title of a method that has fewer clips than others says how many.
+        """
         methods = self.summaries()[group]
+        most = max(summary["clips"] for summary in methods.values())
         rows = {
-            self.titles[name]: {key: summary[key] for key in self.shown if key in summary}
+            _title(self.titles[name], summary["clips"], most): {
+                key: summary[key] for key in self.shown if key in summary
+            }
             for name, summary in methods.items()
         }
         published = {
@@ -217,10 +224,11 @@ class Evaluation:
     def notes(self) -> list[str]:
         """Return protocol, definitions and sources in lines of text."""
         protocol = self.report["protocol"]
-        first, last = protocol["frames"]
+        last = " or ".join(map(str, protocol["last_frames"]))
         sizes = ", ".join(protocol["pixels"])
+        frames = f"frames {self.protocol.first} to {last}"
         lines = [
-            f"frames {first} to {last} at the size of the {protocol['size']}: {sizes}",
+            f"{frames} at the size of the {protocol['size']}: {sizes}",
             f"protocol: {protocol['description']}",
         ]
         lines += [
@@ -232,3 +240,7 @@ class Evaluation:
             lines.append(f"lpips_alex: {protocol['lpips_alex']}")
         lines += [f"unavailable: {line}" for line in self.unavailable]
         return lines + ([f"published: {self.source}"] if self.published else [])
+
+
+def _title(name: str, clips: int, most: int) -> str:
+    return name if clips == most else f"{name}, {clips} of {most} clips"

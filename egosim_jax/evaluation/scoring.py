@@ -231,7 +231,7 @@ class Scoring:
         video: np.ndarray | None = None
         scores: dict[str, float] = {}
         for measure in self.measures:
-            key = fingerprint([content, type(measure).__name__, measure.settings()])
+            key = fingerprint([content, type(measure).__name__, measure.settings(truth.window)])
             found = self.cache.get(key)
             if found is None:
                 if video is None:

@@ -28,7 +28,7 @@ DEFINITIONS = {
     "top1": "share of goals whose action has the highest score, in percent; 95 % interval of "
     "Clopper and Pearson",
     "spearman": "rank correlation of the scores of a goal's candidates with those of their true "
-    "videos; mean over goals, 95 % interval by Student's t",
+    "videos; mean over goals, 95 % interval of the bootstrap over goals",
 }
 MOST_TRIES = 200
 """Actions of a scene that are tried, of which different ones are kept."""

@@ -19,7 +19,9 @@ DEFINITIONS = {
 Measures = Mapping[str, tuple[str, str]]
 """Column title and number format of each measure, by name."""
 Summary = Mapping[str, Mapping[str, float]]
-"""`mean` and `spread` of each measure, by name; a measure without repetitions has no `spread`."""
+"""`mean` and `spread` of each measure, by name; a measure without repetitions has no `spread`.
+
+`known` and `of` count the scores, where some are missing."""
 
 
 def score(
@@ -42,13 +44,20 @@ def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
 def summarize(
     scores: Sequence[Mapping[str, float]], measures: Iterable[str]
 ) -> dict[str, dict[str, float]]:
-    """Return mean and spread of each measure over scores, without those that no score has."""
+    """Return mean and spread of each measure over scores, without those that no score has.
+
+    Where some scores are NaN, `known` is the number of the others and `of` that of all: their mean
+    hides what failed.
+    """
     summary = {}
     for name in measures:
         if not any(name in score for score in scores):
             continue
-        mean, spread = mean_and_spread(score[name] for score in scores)
-        summary[name] = {"mean": mean, "spread": spread}
+        values = [score.get(name, float("nan")) for score in scores]
+        mean, spread = mean_and_spread(values)
+        known = int(np.isfinite(values).sum())
+        counts = {} if known == len(values) else {"known": known, "of": len(values)}
+        summary[name] = {"mean": mean, "spread": spread, **counts}
     return summary
 
 
@@ -76,17 +85,19 @@ def paired_difference(
     """Return the mean of `values - reference` over pairs and its bootstrap confidence interval.
 
     Pairs are drawn again with replacement, with a fixed seed, and the interval is that of the
-    percentiles of their means. Pairs with NaN are ignored; fewer than two have an infinite
-    interval. Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3.
+    percentiles of their means. Pairs with NaN are ignored, and then counted as `known` and `of`;
+    fewer than two have an infinite interval. Source: Efron and Tibshirani, An Introduction to the
+    Bootstrap, 1993, section 13.3.
     """
     pairs = np.subtract(values, reference)
     known = pairs[~np.isnan(pairs)]
+    counts = {} if len(known) == len(pairs) else {"known": len(known), "of": len(pairs)}
     if len(known) < 2:
         mean = float(known.mean()) if len(known) else float("nan")
-        return {"mean": mean, "low": -np.inf, "high": np.inf}
+        return {"mean": mean, "low": -np.inf, "high": np.inf, **counts}
     draws = np.random.default_rng(0).integers(len(known), size=(resamples, len(known)))
     low, high = np.quantile(known[draws].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
-    return {"mean": float(known.mean()), "low": float(low), "high": float(high)}
+    return {"mean": float(known.mean()), "low": float(low), "high": float(high), **counts}
 
 
 def print_table(
@@ -95,21 +106,24 @@ def print_table(
     """Print a row for each summary, as mean ± spread; `corner` heads the column of row names.
 
     The cell of a missing measure is empty; a `spread_over_seeds` is appended in parentheses, an
-    interval from `low` to `high` in brackets.
+    interval from `low` to `high` in brackets, and the number of `known` values if it is not that of
+    all.
     """
     from rich.console import Console
     from rich.table import Table
 
     table = Table(corner, *(heading for heading, _ in measures.values()), title=title)
     for row, summary in rows.items():
-        cells = (_cell(summary.get(name, {}), form) for name, (_, form) in measures.items())
+        cells = (cell_of(summary.get(name, {}), form) for name, (_, form) in measures.items())
         table.add_row(row, *cells)
     Console(width=160).print(table)
 
 
-def _cell(value: Mapping[str, float], form: str) -> str:
+def cell_of(value: Mapping[str, float], form: str) -> str:
+    """Return a cell of a table, for instance "0.25 ± 0.04 (3 of 5)"."""
     text = " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)
     if "low" in value:
         text = f"{text} [{form.format(value['low'])}, {form.format(value['high'])}]"
-    seeds = value.get("spread_over_seeds")
-    return text if seeds is None else f"{text} (± {form.format(seeds)})"
+    if "spread_over_seeds" in value:
+        text = f"{text} (± {form.format(value['spread_over_seeds'])})"
+    return f"{text} ({value['known']} of {value['of']})" if "known" in value else text

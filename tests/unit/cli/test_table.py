@@ -112,7 +112,9 @@ def test_dwm_counts_frame_0_and_one_error_a_clip(metadata, folders, tmp_path, ca
     expected = 10 * np.log10(255**2 / np.square(video - target).mean())
     assert float(row["psnr_clip"]) == pytest.approx(expected, abs=1e-4)
     assert row["frames_scored"] == "9"
-    assert "unavailable: lpips_vgg" in capsys.readouterr().out  # VGG, which is not installed here
+    printed = capsys.readouterr().out
+    assert "unavailable: lpips_vgg" in printed  # VGG, which is not installed here
+    assert "unavailable: dreamsim: its weights" in printed
 
 
 def test_a_narrow_border_is_cut_off(metadata, folders, tmp_path):
@@ -181,6 +183,31 @@ def test_a_missing_clip_is_skipped_and_named(metadata, folders, tmp_path, capsys
     assert f"skipped: clip2: {tmp_path / 'near' / 'clip2.mp4'}" in capsys.readouterr().err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "near" not in report["splits"]["egovid"]
+
+
+def test_a_method_with_fewer_clips_says_so(metadata, folders, tmp_path):
+    (tmp_path / "far" / "egodex" / "clip1.mp4").unlink()
+    make(metadata, folders, tmp_path / "out", baselines=())
+    text = (tmp_path / "out" / "table.tex").read_text()
+    assert "Far, 1 of 2 clips" in text
+    assert "near, " not in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", Name.__args__)
+def test_every_table_writes_all_of_its_files(metadata, folders, tmp_path, name):
+    group = next(iter(TABLES[name].groups))
+    text = metadata.read_text().replace("egodex", "other").replace("egovid", group)
+    metadata.write_text(text)
+    make(metadata, folders[:1], tmp_path / "out", name=name, baselines=(), page_clips=1)
+    out = tmp_path / "out"
+    assert json.loads((out / "report.json").read_text())["splits"][group]["near"]["clips"] == 1
+    assert len(read_rows(out)) == 1
+    assert TABLES[name].groups[group] in (out / "table.tex").read_text()
+    assert (out / "scores.png").read_bytes().startswith(b"\x89PNG")
+    page = (out / "index.html").read_text()
+    assert "data:video/mp4;base64" in page
+    assert all(title in page for title in TABLES[name].published.get(group, {}))
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,20 @@ def test_an_object_mask_next_to_the_prior_makes_the_object_region(truth):
     assert score == pytest.approx(10 * np.log10(255**2 / (6 * 14 / (8 * 16))), abs=0.01)
 
 
+def test_other_masks_and_hands_make_other_cached_scores(truth):
+    window = truth.window
+    found = [Regions().settings(window)]
+    mask = np.zeros_like(truth.frames)
+    write_video(window.files.prior.parent / OBJECT_MASK, mask, 16)
+    found.append(Regions().settings(window))
+    cameras = [CameraError(cameras_by_level).settings(window)]
+    write_video(window.files.hands, mask + 9, 16)
+    found.append(Regions().settings(window))
+    cameras.append(CameraError(cameras_by_level).settings(window))
+    assert len(set(map(str, found))) == 3
+    assert len(set(map(str, cameras))) == 2
+
+
 def depth_of(scale, metric):
     """Return an estimator of depth that is the green level in some unit."""
 
@@ -100,6 +114,15 @@ def test_camera_paths_are_compared_up_to_scale(truth):
     same = score(frames * 2)
     assert [same[key] for key in sorted(same)] == pytest.approx([0, 0, 0], abs=1e-6)
     assert np.isnan(score(np.zeros_like(frames))["camera_error"])
+
+
+def test_a_camera_that_stays_has_no_translation_error(truth):
+    still = np.full_like(truth.frames, 50)
+    truth = GroundTruth(frames=still, first=1, window=truth.window)
+    video = still + np.arange(9, dtype=np.uint8)[:, None, None, None]
+    scores = CameraError(cameras_by_level).against(truth)(video)
+    assert scores["camera_rotation"] == pytest.approx(0, abs=1e-6)
+    assert np.isnan([scores["camera_error"], scores["camera_ate"]]).all()
 
 
 def test_hands_are_compared_from_the_first_counted_frame(truth):

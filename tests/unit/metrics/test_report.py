@@ -64,3 +64,13 @@ def test_a_table_has_mean_and_spreads_and_empty_cells(capsys):
     print_table("method", {"full": full}, measures, title="human")
     row = next(line for line in capsys.readouterr().out.splitlines() if "full" in line)
     assert [cell.strip() for cell in row.split("│")[1:-1]] == ["full", "20.00 ± 1.00 (± 0.50)", ""]
+
+
+def test_missing_values_are_counted(capsys):
+    scores = [{"psnr": value} for value in (20.0, float("nan"), 22.0)]
+    summary = summarize(scores, ["psnr"])
+    assert (summary["psnr"]["known"], summary["psnr"]["of"]) == (2, 3)
+    print_table("", {"ours": summary}, {"psnr": ("PSNR", "{:.1f}")})
+    assert "21.0 ± 1.4 (2 of 3)" in capsys.readouterr().out
+    difference = paired_difference([1.0, 2.0, float("nan")], [0.0, 0.0, 0.0])
+    assert (difference["known"], difference["of"]) == (2, 3)
