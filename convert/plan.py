@@ -193,6 +193,7 @@ def _leaves(found: DetectedNetwork, network: NetworkConfig) -> dict[str, Leaf]:
             f"{found.source.name} holds another {found.network} network than {network.table} "
             "converts. (--config, --only)"
         )
+    table.check(found.tensors)
     return assign(
         found.tensors,
         table.rules(found.naming, network),

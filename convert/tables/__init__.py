@@ -21,6 +21,7 @@ from egosim_jax.types import InputError
 if TYPE_CHECKING:
     from egosim_jax.conditioning.layout import ChannelLayout
     from egosim_jax.convert.widen import Widening
+    from egosim_jax.io.mapped import Tensor
     from egosim_jax.models import NetworkConfig
     from egosim_jax.networks import ModelConfig
 
@@ -146,6 +147,8 @@ class Table:
     """Path of the layer that reads the input channels, the first axis of its kernel."""
     checkpoint: CheckpointNaming | None = None
     """Names of the low-rank tensors in checkpoints of DWM; None for networks without."""
+    check: Callable[[Mapping[str, Tensor]], None] = lambda tensors: None
+    """Raises `InputError` for the tensors of a relative that cannot be converted."""
     pipeline: Callable[[ModelConfig], dict[str, dict[str, Any]]] | None = None
     """JSON files by path of a diffusers pipeline around this denoiser, without its networks."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.io.mapped import Tensor
     from egosim_jax.networks import ModelConfig
 
 TEXT_TOKENS = 226
@@ -56,6 +58,18 @@ def diffusers(config: CogVideoXDiTConfig) -> list[Rule]:
     for name in ("norm_q", "norm_k"):
         rules += norm_rules(f"{theirs}.attn1.{name}", f"blocks.attn.{name}")
     return rules
+
+
+def check(tensors: Mapping[str, Tensor]) -> None:
+    """Raise `InputError` for a transformer of CogVideoX 1.5, whose tokens have two frames."""
+    name = "patch_embed.proj.weight"
+    if name in tensors and len(tensors[name].shape) == 2:
+        raise InputError(
+            "This transformer is of CogVideoX 1.5, which cannot be converted: a token must have "
+            f"one latent frame, and its {name} of shape {tensors[name].shape} reads two (so that "
+            "the 13 latents of 49 frames, an odd number, would not fit either). Take version 1.1, "
+            "as DWM's release does: CogVideoX-Fun-V1.1-5b-InP. (--source)"
+        )
 
 
 def arguments(config: CogVideoXDiTConfig) -> dict[str, Any]:
@@ -171,6 +185,7 @@ TABLE = Table(
         shorten=shorten,
         outputs=outputs,
     ),
+    check=check,
     base=COGVIDEOX_INPAINT,
     checkpoint=CheckpointNaming(naming="diffusers", stem="pytorch_lora_weights"),
     pipeline=pipeline,

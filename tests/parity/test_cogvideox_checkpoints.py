@@ -143,3 +143,15 @@ def test_weights_in_full_that_are_not_of_the_network_are_refused(model, tmp_path
     )
     with pytest.raises(InputError, match=r"head\.bias: not a weight of this network"):
         read_lora(tmp_path, model.dit)
+
+
+def test_version_1_5_is_refused_with_the_version_to_take(model, tmp_path, capsys):
+    base = replace(model.dit, in_channels=33)
+    module = CogVideoXTransformer3DModel(**cogvideox_dit.arguments(base), patch_size_t=2)
+    module.save_pretrained(tmp_path / "released" / "transformer")
+    command = f"weights {tmp_path}/released --config dwm_tiny --out {tmp_path}/out --widen polarity"
+    assert egosim_convert([*command.split(), "--only", "dit"]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "one latent frame, and its patch_embed.proj.weight of shape (32, 264)" in message
+    assert "CogVideoX-Fun-V1.1-5b-InP" in message
+    assert not (tmp_path / "out" / "dit.safetensors").exists()

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,9 +11,12 @@ from egosim_jax import configs
 from egosim_jax.batch import BatchJob
 from egosim_jax.cli.generate import Generate
 from egosim_jax.conditioning.baselines import STRENGTH, with_hand_mask
-from egosim_jax.generator import Generator
+from egosim_jax.conditioning.condition import Condition
+from egosim_jax.diffusion import Guidance
+from egosim_jax.generator import Generator, denoise
 from egosim_jax.testing import write_weights
-from egosim_jax.types import Triplet
+from egosim_jax.types import InputError, Triplet
+from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as DWM_TINY
 
 
 @pytest.fixture
@@ -66,6 +71,53 @@ def test_sdedit_begins_at_the_models_strength_or_its_default(tmp_path):
     assert command._model().strength == STRENGTH
     assert replace(command, strength=0.5)._model().strength == 0.5
     assert replace(command, baseline="no_hands")._model().strength is None
+
+
+class Blind:
+    """A denoiser that keeps what it is given and predicts that there is no noise."""
+
+    def __init__(self):
+        self.seen = []
+
+    def prepare(self, condition, text, image):
+        self.condition = condition
+
+    def denoise(self, noisy, t, context):
+        self.seen.append((noisy, t))
+        return jnp.zeros_like(noisy)
+
+
+def test_sdedit_takes_the_last_steps_from_the_noised_prior():
+    config = replace(DWM_TINY, steps=8, strength=0.75, guidance=Guidance(scale=1.0))
+    draw = np.random.default_rng(0).standard_normal
+    prior, noise = (jnp.asarray(draw((1, *config.latent_shape, 16), np.float32)) for _ in range(2))
+    condition = Condition(
+        mask=jnp.zeros((1, *config.latent_shape, 1)),
+        prior=prior,
+        hands=prior,
+        text=jnp.ones((1, 2, 16)),
+    )
+    dit = Blind()
+    with jax.disable_jit():
+        denoise(dit, condition, noise, config)
+    levels = config.process.timesteps(config.process.times(8)[:-1])
+    assert [float(t[0]) for _, t in dit.seen] == levels[2:].tolist()
+    signal = np.sqrt(1 - config.process.sigma(config.process.times(8)[2:3]) ** 2)
+    want = signal * prior + np.sqrt(1 - signal**2) * noise
+    np.testing.assert_allclose(dit.seen[0][0], want, atol=1e-5)
+    # Nothing is said of the prior: latents 0, and a mask that asks to generate everything.
+    at = {name: config.layout.slice(name) for name in ("mask", "prior", "hands")}
+    shift = config.layout.slice("noisy").stop
+    for name in ("mask", "prior"):
+        part = dit.condition[..., at[name].start - shift : at[name].stop - shift]
+        assert not part.any(), name
+    assert dit.condition[..., at["hands"].start - shift :].any()
+
+
+@pytest.mark.parametrize("strength", [0.0, 1.5])
+def test_a_strength_outside_of_0_to_1_is_refused(strength):
+    with pytest.raises(InputError, match=rf"strength {strength}: .* at most 1.*\(--strength\)"):
+        replace(DWM_TINY, strength=strength)
 
 
 def test_another_baseline_is_another_job(tmp_path):
