@@ -42,6 +42,8 @@ SHEET_CLIPS = 6
 """Maximum number of clips on the contact sheet."""
 SHEET_COLUMNS = 6
 """Frames of each clip on the contact sheet."""
+SHEET_ROWS = ("prior", "hands", "generated", "ground truth")
+"""Rows of each clip on the contact sheet; the last one where it is known."""
 SHEET_WIDTH = 240
 """Width of a frame on the contact sheet in pixels."""
 
@@ -387,4 +389,5 @@ class BatchJob:
             if self._video(window).exists():
                 videos = read_video(self.out / f"{window.output_id}_cmp.mp4").frames
                 videos = np.split(videos, videos.shape[2] // self.model.video.width, axis=2)
-                yield SheetClip(f"{window.output_id}   prior, hands, generated", videos[:3])
+                rows = dict(zip(SHEET_ROWS, videos, strict=False))
+                yield SheetClip(f"{window.output_id}   {', '.join(rows)}", list(rows.values()))

@@ -24,8 +24,8 @@ Solver = Literal["euler", "unipc", "wan", "ddim", "dpmpp_2m", "dpmpp_2m_sde"]
 class Generate:
     """Generate a clip for each row of a metadata file, or for scenes of the tabletop world.
 
-    Writes {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | ground truth), contact_sheet.png (of
-    the first clips: prior, hands, generated), results.jsonl, config.json and environment.json.
+    Writes {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | ground truth), contact_sheet.png (the
+    same rows of the first clips), results.jsonl, config.json and environment.json.
     Prints the path of each clip.
     """
 

@@ -212,7 +212,7 @@ def test_without_metadata_a_scene_is_drawn_by_seed(tmp_path):
     assert "gripper" in results(out)["tabletop_robot_5_0"]["prompt"]
     assert (out / "scenes" / "tabletop_robot_5_0" / "video.mp4").exists()
     with Image.open(out / "contact_sheet.png") as sheet:
-        assert sheet.size == (6 * 240, 2 * (16 + 3 * 160))
+        assert sheet.size == (6 * 240, 2 * (16 + 4 * 160))
 
 
 def test_the_ablation_has_a_row_for_each_method_and_a_sheet_for_each_kind(
