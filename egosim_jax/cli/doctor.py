@@ -24,7 +24,13 @@ LIBRARIES = (
     "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "open3d-cpu", "av",
     "opencv-python-headless",
 )  # fmt: skip
-EXTRAS = {"rerun": "viewer", "OpenEXR": "recorded", "tensorboardX": "tensorboard", "wandb": "wandb"}
+EXTRAS = {
+    "rerun": "viewer",
+    "viser": "play",
+    "OpenEXR": "recorded",
+    "tensorboardX": "tensorboard",
+    "wandb": "wandb",
+}
 """Extras by the module that they install."""
 NATIVE = ("open3d", "cv2", "av")
 """Modules that need system libraries."""

@@ -1,0 +1,103 @@
+"""Time clips of `egosim play` at the browser, and record the page as a GIF.
+
+    python -m tests.benchmarks.bench_play [--clips 5] [--gif docs/play.gif]
+
+Prints, for each clip, the seconds from the click to the first and the last frames that the browser
+has received, and to the state's update; then their medians without the first clip. The recording
+shows one clip that is made and played.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from PIL import Image
+
+from tests.browser import browse, playing
+
+WATCH = """(() => {
+  window.events = [];
+  const note = what => window.events.push([performance.now() / 1000, what]);
+  new MutationObserver(changes => {
+    for (const change of changes)
+      if (change.type == 'attributes' && change.target.tagName == 'IMG') note('picture');
+    const text = document.body.innerText;
+    for (const part of ['Generating', 'Looking at', 'remembered after'])
+      if (text.includes(part) && window.last != part) { window.last = part; note(part); }
+  }).observe(document.body, {subtree: true, childList: true, characterData: true,
+                             attributes: true, attributeFilter: ['src']});
+})()"""
+"""Script that notes when pictures and the status change in the page."""
+WIDTH = 880
+"""Columns of the recording."""
+
+
+def make_clip(page, button):
+    """Make a clip; return the seconds to its first frames, last frames and update."""
+    page.run("window.events = []; window.last = ''; window.clicked = performance.now() / 1000")
+    page.click(button)
+    page.wait_for("window.events.some(e => e[1] == 'remembered after')")
+    clicked, events = page.run("window.clicked"), page.run("window.events")
+    times = {what: seconds - clicked for seconds, what in reversed(events)}
+    shown = [s - clicked for s, what in events if what == "picture"]
+    live = [seconds for seconds in shown if seconds <= times["Looking at"] + 0.05]
+    return live[0], live[-1], times["remembered after"]
+
+
+def record(page, path):
+    """Record the page while a clip is made and played."""
+    shots = [page.screenshot()]
+    page.click("put it on the ring")
+    end = None
+    while end is None or time.monotonic() < end:
+        shots.append(page.screenshot())
+        if end is None and page.run("document.body.innerText.includes('remembered after')"):
+            end = time.monotonic() + 8
+    kept = [shots[0]]
+    for shot in shots:
+        if (shot != kept[-1]).any(axis=-1).mean() > 2e-4:
+            kept.append(shot)
+    size = WIDTH, round(WIDTH * kept[0].shape[0] / kept[0].shape[1])
+    small = [Image.fromarray(s).resize(size, Image.Resampling.LANCZOS) for s in kept]
+    palette = small[len(small) // 2].quantize(128)
+    pictures = [s.quantize(palette=palette, dither=Image.Dither.NONE) for s in small]
+    durations = [800, *[125] * (len(pictures) - 2), 2500]
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True
+    )
+    print(f"{path}: {len(pictures)} pictures, {path.stat().st_size / 1e6:.1f} MB")
+
+
+def main():
+    """Time clips, then record one."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--clips", type=int, default=5)
+    parser.add_argument("--gif", type=Path)
+    given = parser.parse_args()
+    with (
+        tempfile.TemporaryDirectory() as name,
+        playing(Path(name) / "runs", "--seed", "0") as url,
+        browse(url, Path(name), size=(1180, 1000)) as page,
+    ):
+        page.wait_for_text("put it on the ring")
+        time.sleep(3)
+        page.run("document.querySelector('[class*=Notification] button')?.click()")
+        if given.gif is not None:
+            record(page, given.gif)
+            page.click("undo")
+            page.wait_for_text("0: The beginning")
+        page.run(WATCH)
+        times = []
+        for number in range(given.clips):
+            times.append(make_clip(page, "put it on the ring" if number % 2 else "lift it"))
+            print("first {:.2f} s, last {:.2f} s, state {:.2f} s".format(*times[-1]), flush=True)
+            time.sleep(4)  # until it has been played
+        for column, name in enumerate(("first", "last", "state") if times else ()):
+            values = [row[column] for row in times[1:] or times]
+            print(f"median {name}: {statistics.median(values):.2f} s")
+
+
+if __name__ == "__main__":
+    main()
