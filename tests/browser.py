@@ -71,12 +71,16 @@ class Page:
             path.write_bytes(data)
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
+    def boxes(self):
+        """Return x, y, width and height of each image element that is shown, from the top down."""
+        return self.run("""[...document.querySelectorAll('img')]
+            .filter(e => e.src.startsWith('blob:'))
+            .map(e => e.getBoundingClientRect()).map(r => [r.x, r.y, r.width, r.height])""")
+
     def pictures(self):
         """Return a picture of each image element that is shown, from the top down."""
-        code = """[...document.querySelectorAll('img')].filter(e => e.src.startsWith('blob:'))
-            .map(e => e.getBoundingClientRect()).map(r => [r.x, r.y, r.width, r.height])"""
         names = ("x", "y", "width", "height")
-        return [self.screenshot(**dict(zip(names, r, strict=True))) for r in self.run(code)]
+        return [self.screenshot(**dict(zip(names, box, strict=True))) for box in self.boxes()]
 
 
 @contextmanager

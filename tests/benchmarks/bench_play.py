@@ -4,7 +4,7 @@
 
 Prints, for each clip, the seconds from the click to the first and the last frames that the browser
 has received, and to the state's update; then their medians without the first clip. The recording
-shows one clip that is made and played.
+shows the page before one clip, with each of its frames, and after it.
 """
 
 import argparse
@@ -13,8 +13,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
+from egosim_jax.io.video import read_video
 from tests.browser import browse, playing
 
 WATCH = """(() => {
@@ -46,28 +48,40 @@ def make_clip(page, button):
     return live[0], live[-1], times["remembered after"]
 
 
-def record(page, path):
-    """Record the page while a clip is made and played."""
-    shots = [page.screenshot()]
+def record(page, runs, path):
+    """Record the page while a clip is made: shots before and after, and its pictures as played."""
+    before = page.screenshot()
     page.click("put it on the ring")
-    end = None
-    while end is None or time.monotonic() < end:
-        shots.append(page.screenshot())
-        if end is None and page.run("document.body.innerText.includes('remembered after')"):
-            end = time.monotonic() + 8
-    kept = [shots[0]]
-    for shot in shots:
-        if (shot != kept[-1]).any(axis=-1).mean() > 2e-4:
-            kept.append(shot)
-    size = WIDTH, round(WIDTH * kept[0].shape[0] / kept[0].shape[1])
-    small = [Image.fromarray(s).resize(size, Image.Resampling.LANCZOS) for s in kept]
-    palette = small[len(small) // 2].quantize(128)
-    pictures = [s.quantize(palette=palette, dither=Image.Dither.NONE) for s in small]
+    page.wait_for_text("remembered after")
+    page.click("save")
+    page.wait_for_text("episode.zip")
+    (video,) = runs.glob("*/episode.mp4")
+    boxes = page.boxes()
+    write_gif(path, before, page.screenshot(), boxes, read_video(video).frames)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+def write_gif(path, before, after, boxes, frames):
+    """Write a GIF: the page before a clip, then with each frame, then after it.
+
+    `frames` have the generated and the true picture side by side, `boxes` where the page has them.
+    """
+    shots = [Image.fromarray(before)]
+    for number, frame in enumerate(frames):
+        shot = Image.fromarray(before if number < len(frames) - 1 else after)
+        for picture, (x, y, width, height) in zip(np.split(frame, 2, axis=1), boxes, strict=True):
+            size = round(width), round(height)
+            large = Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
+            shot.paste(large, (round(x), round(y)))
+        shots.append(shot)
+    size = WIDTH, round(WIDTH * before.shape[0] / before.shape[1])
+    small = [shot.resize(size, Image.Resampling.LANCZOS) for shot in shots]
+    palette = small[len(small) // 2].quantize(160)
+    pictures = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in small]
     durations = [800, *[125] * (len(pictures) - 2), 2500]
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True
     )
-    print(f"{path}: {len(pictures)} pictures, {path.stat().st_size / 1e6:.1f} MB")
 
 
 def main():
@@ -83,9 +97,8 @@ def main():
     ):
         page.wait_for_text("put it on the ring")
         time.sleep(3)
-        page.run("document.querySelector('[class*=Notification] button')?.click()")
         if given.gif is not None:
-            record(page, given.gif)
+            record(page, Path(name) / "runs", given.gif)
             page.click("undo")
             page.wait_for_text("0: The beginning")
         page.run(WATCH)
