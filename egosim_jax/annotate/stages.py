@@ -35,6 +35,8 @@ from egosim_jax.perception.estimates import (
 from egosim_jax.types import Cameras, InputError
 
 SIDES = ("left", "right")
+MAX_MIRRORED = 0.35
+"""Largest share of a hand's frames in which its joints may be those of the other side."""
 KEY_FRAMES = 6
 """Frames that a fused scene is made of."""
 HAND_PHRASES = ("hand", "arm")
@@ -87,7 +89,23 @@ def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
             f"{least:.0%}. (--min-hands)",
             {"visible": share},
         )
+    _check_sides(hands, seen, config.side)
     return record.add("hands", notes, hands=hands)
+
+
+def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
+    """Raise `RefusedError` if a hand is often drawn as the mirror of itself, unless asked for."""
+    if hands.mirrored is None or side != "auto":
+        return
+    shares = hands.mirrored.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    if (worst := float(shares.max())) > MAX_MIRRORED:
+        raise RefusedError(
+            "hands",
+            f"hands: the joints of the {SIDES[int(shares.argmax())]} hand are those of the other "
+            f"side in {worst:.0%} of its frames, more than {MAX_MIRRORED:.0%}: its fingers are "
+            "hidden. Give the side if there is one hand. (--side)",
+            {"mirrored": worst},
+        )
 
 
 def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:

@@ -81,6 +81,8 @@ class Candidates:
     """Probability that it is a right hand, by where its forearm enters the picture."""
     palm: Float[np.ndarray, " n"]
     """Confidence from 0 to 1 that its palm was detected where its joints say."""
+    again: Bool[np.ndarray, " n"]
+    """True for other joints of a hand that was found already (`find_other_side`)."""
 
     def __len__(self) -> int:
         """Return the number of candidates."""
@@ -173,6 +175,7 @@ def find_other_side(
         found = replace(
             found,
             palm=hands.palm,
+            again=np.ones(len(hands), bool),
             forearm_right=right_by_forearm(found.joints_px, *frames.shape[1:3]),
         )
         wanted = (found.presence >= min_presence) & (found.seems_right == right)
@@ -277,6 +280,7 @@ def _find_joints(
         right=right,
         bend_right=right_by_bend(meters),
         palm=np.zeros(len(numbers)),
+        again=np.zeros(len(numbers), bool),
         forearm_right=np.full(len(numbers), 0.5),
     )
     return found.take(presence >= min_presence)

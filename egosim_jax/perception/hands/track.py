@@ -66,12 +66,24 @@ def choose_tracks(
 ) -> Int[np.ndarray, "f 2"]:
     """Return the index of the candidate of the left and right hand in each frame, or -1."""
     first = replace(config, forearm=0.0, bend=0.0)
-    path = _of_one_side(candidates, _cheapest(candidates, frames, first, same_hand), first)
+    path = _of_chosen(candidates, ~candidates.again, frames, first, same_hand)
     path = _without_false(candidates, path, config)
-    there = np.flatnonzero(_near_chosen(candidates, path, config))
-    hands = (path >= 0).sum(1)
-    sided = _cheapest(candidates.take(there), frames, config, same_hand, hands)
-    return _of_one_side(candidates, np.where(sided >= 0, np.append(there, -1)[sided], -1), config)
+    near = _near_chosen(candidates, path, config)
+    return _of_chosen(candidates, near, frames, config, same_hand, (path >= 0).sum(1))
+
+
+def _of_chosen(
+    candidates: Candidates,
+    some: np.ndarray,
+    frames: int,
+    config: TrackConfig,
+    same_hand: float,
+    hands: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the path of least cost among some of the candidates, each hand on one side."""
+    index = np.flatnonzero(some)
+    path = _cheapest(candidates.take(index), frames, config, same_hand, hands)
+    return _of_one_side(candidates, np.where(path >= 0, np.append(index, -1)[path], -1), config)
 
 
 def _cheapest(

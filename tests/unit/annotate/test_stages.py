@@ -1,6 +1,6 @@
 """Stages of an annotation."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -10,7 +10,7 @@ from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.scene import STAGES, check_prior, to_triplet
 from egosim_jax.annotate.sources import Source, open_source
-from egosim_jax.annotate.stages import drop_flashes, hold_hands, visible
+from egosim_jax.annotate.stages import drop_flashes, find_hands, hold_hands, visible
 from egosim_jax.perception.estimates import LEFT, RIGHT
 from tests.unit.annotate.stubs import StubHands, config, textured_video, write
 
@@ -71,6 +71,33 @@ def test_all_hands_are_of_the_given_side(tmp_path):
     hands = stages_of(tmp_path, config(side="left"), last="hands").require("hands")
     assert visible(hands).all(axis=0).tolist() == [True, False]
     assert (hands.presence[:, LEFT] == 0.9).all()
+
+
+@dataclass(frozen=True)
+class MirroredHands:
+    """The stub's hand, whose joints are those of the other side in some of nine frames."""
+
+    frames: int
+
+    def __call__(self, frames):
+        hands = StubHands(1.0, None)(frames)
+        mirrored = np.zeros(hands.presence.shape, bool)
+        mirrored[: self.frames, RIGHT] = True
+        return replace(hands, mirrored=mirrored)
+
+
+def sides_checked(tmp_path, frames, **options):
+    settings = config(**options)
+    record = stages_of(tmp_path, settings, last="hands")
+    parts = replace(settings.build(), hands=MirroredHands(frames))
+    return find_hands(record, parts, settings).notes["hands"]["mirrored"]
+
+
+def test_a_hand_that_is_mirrored_in_many_frames_is_refused_unless_its_side_is_given(tmp_path):
+    assert sides_checked(tmp_path, 3) == {"left": 0, "right": 3}
+    with pytest.raises(RefusedError, match=r"the right hand .* 44% of its frames.*\(--side\)"):
+        sides_checked(tmp_path, 4)
+    assert sides_checked(tmp_path, 4, side="right") == {"left": 0, "right": 4}
 
 
 def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):

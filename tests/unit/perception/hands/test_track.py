@@ -20,7 +20,7 @@ from egosim_jax.perception.hands.track import (
 from tests.hands import PaintedHands, hand_px, paint
 
 
-def candidates(*hands, forearm=0.5, bend=0.5):
+def candidates(*hands, forearm=0.5, bend=0.5, again=False):
     """Return candidates of (frame, center, probability of a right hand, presence, palm)."""
     frame, centers, right, presence, palm = zip(*hands, strict=True)
     joints = np.array([hand_px(center=center) for center in centers])
@@ -32,6 +32,7 @@ def candidates(*hands, forearm=0.5, bend=0.5):
         right=np.array(right, float),
         palm=np.array(palm, float),
         forearm_right=np.broadcast_to(np.asarray(forearm, float), (len(hands),)),
+        again=np.broadcast_to(again, (len(hands),)),
         bend_right=np.broadcast_to(np.asarray(bend, float), (len(hands),)),
     )
 
@@ -66,6 +67,14 @@ def test_of_two_readings_of_a_hand_the_one_whose_fingers_bend_as_on_its_side_is_
     hands = [(f, (100 + d, 100), 0.6, 0.9, 0.9) for d in (0, 30) for f in range(6)]
     found = candidates(*hands, forearm=0.95, bend=[0.05] * 6 + [0.95] * 6)
     assert chosen(found, 6)[:, RIGHT].tolist() == list(range(6, 12))
+
+
+def test_other_joints_of_a_hand_are_no_second_hand():
+    hands = [(f, (100 + d, 100), r, 0.9, 0.9) for d, r in ((0, 0.9), (90, 0.1)) for f in range(6)]
+    assert (chosen(candidates(*hands), 6) >= 0).all()
+    path = chosen(candidates(*hands, again=[False] * 6 + [True] * 6), 6)
+    assert path[:, RIGHT].tolist() == list(range(6))
+    assert (path[:, LEFT] == -1).all()
 
 
 def test_hands_that_cross_keep_their_sides():
