@@ -50,30 +50,40 @@ def _messages() -> dict[str, dict[str, Any]]:
     }
 
 
-def _make(folder: Path) -> None:
+def _files() -> dict[str, bytes]:
+    """Messages as MessagePack, and as the JSON bodies of HTTP."""
+    found = {}
     for name, message in _messages().items():
-        (folder / f"{name}.bin").write_bytes(wire.pack(message))
+        found[f"{name}.bin"] = wire.pack(message)
+        found[f"{name}.json"] = wire.pack_json(message)
+    return found
+
+
+def _make(folder: Path) -> None:
+    for name, data in _files().items():
+        (folder / name).write_bytes(data)
 
 
 def _read(folder: Path) -> Any:
     """Send all messages; the session that they name is there again before each of them."""
     names = []
-    for name in _messages():
-        data = (folder / f"{name}.bin").read_bytes()
-        if data == wire.pack(_messages()[name]) and name != "status":
+    for name, unchanged in _files().items():
+        data = (folder / name).read_bytes()
+        if data == unchanged and name != "status.bin":
             continue  # only what was changed, so that a case is one message
-        names.append(_send(data))
+        names.append(_send(data, json=name.endswith(".json")))
     return names
 
 
-def _send(data: bytes) -> str:
+def _send(data: bytes, *, json: bool) -> str:
     service = _service()
     store = service.store
     if SESSION not in store.sessions:
         store.create({"session": SESSION, "seed": 3})
     try:
-        reply = asyncio.run(service.handle(wire.unpack(data, limit=wire.MAX_BYTES)))
-        wire.pack(reply)
+        message = wire.unpack_json(data) if json else wire.unpack(data, limit=wire.MAX_BYTES)
+        reply = asyncio.run(service.handle(message))
+        wire.pack_json(reply) if json else wire.pack(reply)
     except RequestError as error:
         if error.code == "internal":
             raise (error.__cause__ or error) from None
@@ -92,7 +102,7 @@ TARGETS = [
         name="message",
         make=_make,
         read=_read,
-        files=("*.bin",),
+        files=("*.bin", "*.json"),
         lossy="a changed message may be another valid one",
         mutations=(json_value,),
     )

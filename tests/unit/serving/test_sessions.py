@@ -285,6 +285,57 @@ def test_limits_are_kept(tmp_path):
     store.close()
 
 
+def test_a_full_queue_and_a_busy_session_are_refused_and_nothing_is_lost(tmp_path):
+    store = Store(tmp_path, painted(pause=0.3), Limits(queue=2), Metrics())
+    one, two, three = (store.create({"session": name}) for name in ("one", "two", "three"))
+    runs = [store.step({"session": s.id, "step_id": 1, "actions": rows(s)}) for s in (one, two)]
+    for session, number, code in ((one, 2, "queue_full"), (three, 1, "queue_full")):
+        with pytest.raises(RequestError) as refused:
+            step(store, session, number)
+        assert (refused.value.status, refused.value.code) == (429, code)
+        assert refused.value.retry_after_s
+    store.limits = Limits()
+    with pytest.raises(RequestError, match="one at a time") as refused:
+        step(store, one, 1, rows(one, 5))  # of another client
+    assert (refused.value.status, refused.value.code) == (409, "session_busy")
+    assert [run.result().step_id for run in runs] == [1, 1]
+    assert step(store, three, 1).step_id == 1
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"row": np.full(7, np.nan)}, "Row 0 of the actions has nan as right x: all must be"),
+        ({"row": np.full(7, np.inf)}, "must be finite"),
+        ({"row": np.zeros(63)}, "must be \\(1 to 4, 7\\)"),
+        ({"row": [0.1, 0.2, 0.1, 0, 0, 0, 2]}, "2 as right closure: it must be from 0 to 1"),
+        ({"row": [150, 20, 160, 0, 0, 0, 0]}, "150 as right x.*Positions are in meters"),
+        ({"row": [0.1, 0.2, 0.1, 0, 0, 180, 0]}, "180 as right rz.*rotations in radians"),
+        ({"rows": 5}, "must be \\(1 to 4, 7\\)"),
+    ],
+)
+def test_an_invalid_action_is_refused_with_rule_and_value(store, change, message):
+    made = store.create({"seed": 3})
+    row = np.asarray(change.get("row", made.actions.rest), float)
+    with pytest.raises(RequestError, match=message) as refused:
+        step(store, made, 1, np.tile(row, (change.get("rows", 1), 1)))
+    assert (refused.value.status, refused.value.code) == (422, "invalid")
+    assert (made.committed, made.pending, made.busy.locked()) == (0, False, False)
+    assert step(store, made, 1).step_id == 1
+
+
+def test_an_action_out_of_view_is_refused(store):
+    made = store.create({"actions": {"workspace_m": [[-9, -9, -9], [9, 9, 9]]}})
+    behind = made.actions.rest + 8 * np.eye(7)[1] * -1
+    assert step(store, made, 1, behind[None]).step_id == 1  # it begins in view
+    with pytest.raises(RequestError, match="view") as refused:
+        step(store, made, 2, behind[None])
+    assert refused.value.status == 422
+    store.reset({"session": made.id}).result()
+    assert step(store, made, 2).step_id == 2
+
+
 def test_a_second_store_of_a_folder_is_refused(store):
     import subprocess
     import sys
