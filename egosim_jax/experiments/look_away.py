@@ -22,7 +22,6 @@ from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generator import Generator
 from egosim_jax.geometry import invert, transform
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import read_json
 from egosim_jax.metrics import region
 from egosim_jax.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.metrics.update import ON_SURFACE_M, distance_to_mesh
@@ -30,11 +29,18 @@ from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rollout import Rollout, load_clip
 from egosim_jax.simulator import Simulator
-from egosim_jax.types import Action, SceneState, VideoSpec, check_counts
-from egosim_jax.worlds.tabletop import Script, TabletopClip, World, make_scripts, to_episode
+from egosim_jax.state.fuse import fuse
+from egosim_jax.types import Action, Clip, SceneState, VideoSpec, check_counts
+from egosim_jax.worlds.tabletop import (
+    Script,
+    TabletopClip,
+    World,
+    make_scripts,
+    to_action,
+    to_episode,
+)
 from egosim_jax.worlds.tabletop.attempts import LOOKING, turn
 from egosim_jax.worlds.tabletop.clips import film_scenes
-from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 CASES = ("seen", "unseen")
 """Moves in view, and moves while the wearer looks elsewhere."""
@@ -46,6 +52,8 @@ FRAMES_BACK = 4
 """Last frames of the last clip, which are scored."""
 NEAR_PERCENT = 5.0
 """Farthest a kept object may be from its true place in the picture, in percent of the width."""
+TRUE = "ground truth, classical"
+"""Row of the ground-truth frames and of the state that classical perception makes of them."""
 SHEET_SCENES = 3
 """Scenes of each case on the contact sheet."""
 MEASURES = {
@@ -57,12 +65,15 @@ MEASURES = {
 DEFINITIONS = {
     "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the picture's width of its true "
     f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
-    "object_error": "distance of the centroid of the object, segmented by color, from that of its "
-    "ground-truth ids, in percent of the width, median over those frames",
+    "object_error": "distance of the centroid of the object, segmented by color among the colors "
+    "of all bodies, from that of its ground-truth ids, in percent of the width, median over those "
+    "frames",
     "region_psnr": "dB over the pixels of those frames where the object is or was before the move",
     "state_accuracy": "share of the object's points in the last state within 1 cm of its true "
     "surface; 0 if there are none",
     "seen, unseen": "the object is carried in view, or while the wearer looks elsewhere",
+    "ground truth": "frames of the true world, which test how the object is found, and the state "
+    "that classical perception makes of them",
     "differences": "from no update, on the same scenes; mean and 95 % interval",
 }
 
@@ -82,25 +93,32 @@ class Story:
     background: UInt8[np.ndarray, "f h w 3"]
     """Last frames without hands and object."""
 
-    def score(self, frames: UInt8[np.ndarray, "f h w 3"], state: SceneState) -> dict[str, float]:
-        """Return every measure of a video of the last clip, and of the state after it."""
+    def score(self, frames: UInt8[np.ndarray, "f h w 3"]) -> dict[str, float]:
+        """Return every measure of a video of the last clip.
+
+        A pixel belongs to the object if its color is nearest to the object's and not to that of
+        the background, a hand or any other body, since these may be misplaced, too.
+        """
         clip, last = self.clips[-1], slice(-FRAMES_BACK, None)
         number = clip.body_ids[self.target]
         here = clip.ids[last] == number
-        movers = {n: c for n, c in clip.paints.items() if n == number or n >= FIRST_HAND}
-        found = region.label(frames[last], self.background, movers) == number
+        found = region.label(frames[last], self.background, clip.paints) == number
         errors = region.centroid_errors(region.open_mask(found), here)
         error = 100 * float(np.median(errors)) / frames.shape[2] if len(errors) else np.nan
-        part = clip.parts[self.target]
-        surface = transform(clip.world_from_body[self.target][-1], part.vertices_m), part.triangles
-        points = state.points_m[state.object_ids == number]
-        near = distance_to_mesh(points, surface) <= ON_SURFACE_M if len(points) else np.zeros(1)
         return {
             "kept": 100.0 * (error <= NEAR_PERCENT),
             "region_psnr": region.region_psnr(frames[last], clip.frames[last], here | self.before),
             "object_error": error,
-            "state_accuracy": 100 * float(near.mean()),
         }
+
+    def score_state(self, state: SceneState) -> dict[str, float]:
+        """Return the accuracy of the object in the last state."""
+        clip = self.clips[-1]
+        part, number = clip.parts[self.target], clip.body_ids[self.target]
+        surface = transform(clip.world_from_body[self.target][-1], part.vertices_m), part.triangles
+        points = state.points_m[state.object_ids == number]
+        near = distance_to_mesh(points, surface) <= ON_SURFACE_M if len(points) else np.zeros(1)
+        return {"state_accuracy": 100 * float(near.mean())}
 
 
 def run(settings: LookAway) -> None:
@@ -112,13 +130,13 @@ def run(settings: LookAway) -> None:
     jobs = [(case, seed) for case in CASES for seed in seeds]
     scores: dict[str, list[dict[str, float]]] = {}
     for case, seed in track(jobs, "scenes", total=len(jobs)):
-        story = None
+        story = make_story(seed, spec, case)
+        found = {TRUE: story.score(story.clips[-1].frames) | _perceive_true(story, spec)}
         for method in METHODS:
             folder = settings.out / case / method.replace(", ", "_").replace(" ", "_") / str(seed)
-            if not (folder / "scores.json").exists():
-                story = story or make_story(seed, spec, case)
-                write_json(folder / "scores.json", _simulate(story, generator, method, folder))
-            scores.setdefault(f"{case}: {method}", []).append(read_json(folder / "scores.json"))
+            found[method] = _simulate(story, generator, method, folder)
+        for method, values in found.items():
+            scores.setdefault(f"{case}: {method}", []).append(values)
     _report(settings.out, seeds, scores)
     _draw(settings.out, seeds[:SHEET_SCENES], spec)
 
@@ -152,7 +170,16 @@ def _simulate(story: Story, generator: Generator, method: str, folder: Path) -> 
         episode.state, episode.actions, seed=story.seed, first_frame=episode.first_frame
     )
     *_, last = steps
-    return story.score(last.clip.frames, last.state)
+    return story.score(last.clip.frames) | story.score_state(last.state)
+
+
+def _perceive_true(story: Story, spec: VideoSpec) -> dict[str, float]:
+    """Return the accuracy of the state that classical perception makes of the true clips."""
+    perceive, state = registry.parse("classical").build(), story.clips[0].state
+    for clip in story.clips:
+        seen = Clip(frames=clip.frames, fps=spec.fps)
+        state = fuse(state, perceive(seen, to_action(clip), state))
+    return story.score_state(state)
 
 
 def _seeds(settings: LookAway, spec: VideoSpec) -> Iterator[int]:
