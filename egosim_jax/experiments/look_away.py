@@ -174,7 +174,7 @@ def _simulate(story: Story, generator: Generator, method: str, folder: Path) -> 
 
 
 def _perceive_true(story: Story, spec: VideoSpec) -> dict[str, float]:
-    """Return the accuracy of the state that classical perception makes of the true clips."""
+    """Return the accuracy of the state that classical perception makes of the ground truth."""
     perceive, state = registry.parse("classical").build(), story.clips[0].state
     for clip in story.clips:
         seen = Clip(frames=clip.frames, fps=spec.fps)

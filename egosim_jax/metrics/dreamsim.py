@@ -261,8 +261,12 @@ def _adapt(
     for layer in {name for index, name, _ in lora if index == number}:
         key = f"{layer}.weight"
         down, up = (lora.get((number, layer, factor)) for factor in "AB")
-        fits = down is not None and up is not None and down.shape[0] == up.shape[1]
-        if not fits or weights.get(key, up).shape != (len(up), down.shape[1]):
+        if (
+            down is None
+            or up is None
+            or down.shape[0] != up.shape[1]
+            or weights.get(key, up).shape != (len(up), down.shape[1])
+        ):
             raise InputError(
                 f"The LoRA of DreamSim does not fit {BACKBONES[number].file}: {quote(layer)} is "
                 "missing or has another size. Take both from one release. (--dreamsim)"

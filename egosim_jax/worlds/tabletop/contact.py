@@ -109,7 +109,12 @@ def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"]) -> Contact:
     contact = _let_go(contact, [grasp for grasp in contact.grasps if grasp not in kept])
     there = frozenset(pair for pair in contact.released if pair[0] < len(joints_m))
     contact = replace(contact, released=there)
-    return _appear(contact, joints_m, np.isfinite(joints_m).all(axis=(1, 2)))
+    return _appear(contact, joints_m, _present(joints_m))
+
+
+def _present(joints_m: Float[np.ndarray, "n j 3"]) -> Bool[np.ndarray, " n"]:
+    """Return which hands have all their joints."""
+    return np.asarray(np.isfinite(joints_m).all(axis=(1, 2)))
 
 
 def _appear(
@@ -132,7 +137,7 @@ def advance(
     kind: Kind,
 ) -> Contact:
     """Return the contact after all hands moved in straight lines; a missing hand holds nothing."""
-    there, here = (np.isfinite(joints).all(axis=(1, 2)) for joints in (before_m, after_m))
+    there, here = _present(before_m), _present(after_m)
     seen = there & here
     contact = _let_go(contact, [grasp for grasp in contact.grasps if not seen[grasp.hand]])
     gone = set(np.flatnonzero(~seen).tolist())
