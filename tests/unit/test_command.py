@@ -184,7 +184,8 @@ def test_help_needs_no_jax():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-GROUPED = [Annotate, Evaluate, Generate, Serve, Simulate, *{type(r) for _, r in RECIPES.values()}]
+TRAININGS = list(dict.fromkeys(type(recipe) for _, recipe in RECIPES.values()))
+GROUPED = [Annotate, Evaluate, Generate, Serve, Simulate, *TRAININGS]
 
 
 @pytest.mark.parametrize("kind", GROUPED)
