@@ -29,7 +29,16 @@ class FineTuning(Recipe):
 
     help_groups: ClassVar[HelpGroups] = {
         "preflight report": ("json", "search"),
-        "method": ("rank", "times", "navigation", "remat", "attention", "dtype", "samples"),
+        "method": (
+            "rank",
+            "times",
+            "max_difference",
+            "navigation",
+            "remat",
+            "attention",
+            "dtype",
+            "samples",
+        ),
     }
     config: str
     """Name of the model."""
