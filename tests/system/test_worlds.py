@@ -16,7 +16,7 @@ def test_looking_away_reports_each_case_and_method_and_resumes(weights, tmp_path
     command = ["experiment", "look_away", *fixed, "--scenes", "1"]
     assert main(command) == 0
     report = json.loads((out / "report.json").read_text("utf-8"))
-    methods = {"update, oracle", "update, classical", "no update"}
+    methods = {"update, oracle", "update, classical", "no update", "ground truth, classical"}
     assert report["table"].keys() == {f"{c}: {m}" for c in ("seen", "unseen") for m in methods}
     assert report["table"]["seen: update, oracle"]["state_accuracy"]["mean"] > 80
     assert report["table"]["seen: no update"]["state_accuracy"]["mean"] < 20
@@ -24,10 +24,11 @@ def test_looking_away_reports_each_case_and_method_and_resumes(weights, tmp_path
     assert (out / "contact_sheet.png").exists()
     assert "after looking back" in capsys.readouterr().out
     kept = (out / "report.json").read_bytes()
-    seed = report["seeds"][0]
-    (out / "seen" / "no_update" / str(seed) / "scores.json").unlink()
+    clips = {path: path.stat().st_mtime_ns for path in out.glob("*/*/*/clip_*/frames.npz")}
+    assert len(clips) == 2 * 3 * 3
     assert main(command) == 0
     assert (out / "report.json").read_bytes() == kept
+    assert all(path.stat().st_mtime_ns == made for path, made in clips.items())
 
 
 def test_policies_are_ranked_and_the_ranking_resumes(weights, tmp_path, capsys):

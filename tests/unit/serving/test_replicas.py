@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ray.exceptions import RayActorError
 
 from egosim_jax.serving import replicas
 from egosim_jax.serving.errors import RequestError
@@ -30,6 +29,8 @@ class Handle:
 
     async def _handle(self, message):
         if self.stopped:
+            from ray.exceptions import RayActorError  # here: other tests import Ray themselves
+
             raise RayActorError
         return await self.part.handle(message)
 
