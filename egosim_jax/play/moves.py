@@ -22,8 +22,6 @@ from egosim_jax.worlds.tabletop.scene import DRAWER_M, Scene, moving_part
 Deed = Literal["carry", "lift", "open or close"]
 TRAVEL = 0.75
 """Share of a clip in which a driven hand moves; afterwards it opens or closes."""
-RELAXED = 0.25
-"""Closure of a hand that does nothing."""
 MIDDLE_M = (0.0, 0.25)
 """Middle of the objects' places on the table, in meters."""
 FIRST_M = (0.10, 0.16)
@@ -55,13 +53,9 @@ class Pose:
         )
 
     @classmethod
-    def of_grip(cls, grip: Grip, side: Side) -> Pose:
+    def of_grip(cls, grip: Grip) -> Pose:
         """Return the pose of a scripted hand."""
-        cosine, sine = np.cos(grip.yaw), np.sin(grip.yaw)
-        down, level = np.sin(grip.pitch), np.cos(grip.pitch)
-        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-        tilt = np.array([[1, 0, 0], [0, level, down], [0, -down, level]])
-        return cls(point_m=grip.point_m, rotation=turn @ tilt, closure=grip.closure)
+        return cls(point_m=grip.point_m, rotation=grip.rotation, closure=grip.closure)
 
     def row(self, side: Side, camera: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " d"]:
         """Return the row of the hand, with the numbers of the camera."""
@@ -104,21 +98,19 @@ def perform(scene: Scene, intent: Intent, before: Pose, side: Side, frames: int)
     """Return the pose of a hand in each frame but the first while it acts on a body."""
     hand = Hand(side=side, grip=before.grip())
     moments = actions.act(scene, (hand,), intent, "human", frames=frames)
-    return [Pose.of_grip(moment.hands[0].grip, side) for moment in moments[1:]]
+    return [Pose.of_grip(moment.hands[0].grip) for moment in moments[1:]]
 
 
 def reach(scene: Scene, name: str, side: Side) -> Pose:
     """Return the open hand at the place where it would grasp a body."""
     grip = actions.grip_on(scene, Intent(verb="lift", name=name), "human", side)
-    return Pose.of_grip(replace(grip, closure=actions.opened("human")), side)
+    return Pose.of_grip(replace(grip, closure=actions.opened("human")))
 
 
 def ready(scene: Scene, name: str, side: Side) -> Pose:
     """Return the hand in the air in front of a body, where hands begin in the training clips."""
     grip = actions.grip_on(scene, Intent(verb="lift", name=name), "human", side)
-    point = grip.point_m + [0.0, -0.09, 0.07]
-    relaxed = replace(grip, point_m=point, pitch=np.radians(30), closure=RELAXED)
-    return Pose.of_grip(relaxed, side)
+    return Pose.of_grip(actions.relaxed(grip.point_m + actions.BEFORE_M, side, "human"))
 
 
 def first_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] | None:
@@ -143,22 +135,10 @@ def intent_of(
     """Return a deed as the intent of a script, with its caption; `place_m` is where to carry to."""
     body = scene.body(name)
     if deed == "open or close":
-        verb = "close" if scene.openings[name] > 0.5 else "open"
-        part = "drawer" if body.shape == "drawer" else "lid"
-        return Intent(verb=verb, name=name, caption=f"{verb}s the {part} of the {name}.")
+        return actions.open_or_close(scene, body)
     if deed == "lift" or place_m is None:
-        return Intent(verb="lift", name=name, caption=f"lifts the {name} and puts it back.")
-    way = place_m - body.world_from_body[:2, 3]
-    if abs(way[0]) > abs(way[1]):
-        words = "to the right" if way[0] > 0 else "to the left"
-    else:
-        words = "to the back" if way[1] > 0 else "to the front"
-    return Intent(
-        verb="carry",
-        name=name,
-        goal_m=np.array([*place_m, 0.0]),
-        caption=f"picks up the {name} and puts it down {words}.",
-    )
+        return actions.lift(body)
+    return actions.carry(body, place_m)
 
 
 def remembered(scene: Scene, state: SceneState) -> Scene:

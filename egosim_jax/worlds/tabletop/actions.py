@@ -32,6 +32,8 @@ FLAT: tuple[str, ...] = ("box", "cylinder", "lidded box", "drawer")
 """Shapes that others can be stacked on."""
 REST_M = {"right": np.array([0.13, 0.12, 0.09]), "left": np.array([-0.13, 0.12, 0.09])}
 """Position of the grasping point of a hand at rest, in meters."""
+BEFORE_M = np.array([0.0, -0.09, 0.07])
+"""Way from the place of a grasp to where a hand is in front of it, in meters."""
 CARRY_M = (0.10, 0.20)
 """Minimum and maximum distance that a body is carried, in meters."""
 CLOSE_SHARE = 0.04
@@ -53,12 +55,15 @@ class Grip:
     closure: float
     """Closure of the hand, from open (0) to closed (1)."""
 
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """Axes of the hand in the world: y along the fingers, z out of its back."""
+        cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
+        return rotation_z(self.yaw) @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
+
     def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Return joints in the world, and the unit vector of the back of the hand."""
-        cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
-        rotation = rotation_z(self.yaw) @ np.array(
-            [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
-        )
+        rotation = self.rotation
         local = joints_of(kind, self.closure, side)
         return (local - pinch(local)[0]) @ rotation.T + self.point_m, rotation[:, 2]
 
@@ -126,11 +131,7 @@ def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) 
         if body.static or (_covered(scene, body) and body.shape != "drawer"):
             continue
         if body.articulated:
-            open_now = scene.openings[body.name] > 0.5
-            verb: Verb = "close" if open_now else "open"
-            part = "drawer of the" if body.shape == "drawer" else "lid of the"
-            caption = f"{verb}s the {part} {body.name}."
-            options += [Intent(verb=verb, name=body.name, caption=caption)] * 2
+            options += [open_or_close(scene, body)] * 2
         else:
             options += _loose_actions(scene, body, rng)
     if hand is not None:
@@ -141,9 +142,35 @@ def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) 
     return options[int(rng.integers(len(options)))]
 
 
+def open_or_close(scene: Scene, body: Body) -> Intent:
+    """Return the intent to open furniture, or to close what is open."""
+    verb: Verb = "close" if scene.openings[body.name] > 0.5 else "open"
+    part = "drawer of the" if body.shape == "drawer" else "lid of the"
+    return Intent(verb=verb, name=body.name, caption=f"{verb}s the {part} {body.name}.")
+
+
+def lift(body: Body) -> Intent:
+    """Return the intent to lift a body and put it back."""
+    return Intent(verb="lift", name=body.name, caption=f"lifts the {body.name} and puts it back.")
+
+
+def carry(body: Body, place_m: Float[np.ndarray, " 2"]) -> Intent:
+    """Return the intent to carry a body to a place on the table."""
+    way = np.asarray(place_m) - body.world_from_body[:2, 3]
+    side = "right" if way[0] > 0 else "left"
+    depth = "to the back" if way[1] > 0 else "to the front"
+    words = f"to the {side}" if abs(way[0]) > abs(way[1]) else depth
+    return Intent(
+        verb="carry",
+        name=body.name,
+        goal_m=np.array([*place_m, 0.0]),
+        caption=f"picks up the {body.name} and puts it down {words}.",
+    )
+
+
 def _loose_actions(scene: Scene, body: Body, rng: np.random.Generator) -> list[Intent]:
     name = body.name
-    options = [Intent(verb="lift", name=name, caption=f"lifts the {name} and puts it back.")]
+    options = [lift(body)]
     angle = float(rng.choice([-1, 1]) * rng.uniform(np.radians(50), np.radians(80)))
     if body.shape == "box":
         way = "left" if angle > 0 else "right"
@@ -151,14 +178,7 @@ def _loose_actions(scene: Scene, body: Body, rng: np.random.Generator) -> list[I
         options.append(Intent(verb="turn", name=name, turn=angle, caption=caption))
     place = scene.free_place(body, rng, away_m=CARRY_M)
     if place is not None:
-        here = body.world_from_body[:3, 3]
-        way = np.array([place[0] - here[0], place[1] - here[1]])
-        side = "right" if way[0] > 0 else "left"
-        depth = "to the back" if way[1] > 0 else "to the front"
-        words = f"to the {side}" if abs(way[0]) > abs(way[1]) else depth
-        caption = f"picks up the {name} and puts it down {words}."
-        goal = np.array([place[0], place[1], 0.0])
-        options += [Intent(verb="carry", name=name, goal_m=goal, caption=caption)] * 2
+        options += [carry(body, place)] * 2
     below = [
         other
         for other in scene.bodies
@@ -192,20 +212,21 @@ def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generato
     """Return the acting hand of the first clip, in the air in front of its target."""
     grasp = grip_on(scene, intent, kind, "right")
     side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.04) > 0 else "left"
-    before = grasp.point_m + [0, -0.09, 0.07] + rng.normal(0, 0.015, 3)
+    before = grasp.point_m + BEFORE_M + rng.normal(0, 0.015, 3)
     share = rng.uniform(0.0, 0.3)
     point = before + share * (REST_M[side] - before)
-    return Hand(side=side, grip=_relaxed(point, side, kind))
+    return Hand(side=side, grip=relaxed(point, side, kind))
 
 
 def waiting_hand(other: Side, rng: np.random.Generator) -> Hand:
     """Return the hand of the other side, at rest."""
     side: Side = "left" if other == "right" else "right"
     point = REST_M[side] + rng.normal(0, 0.012, 3) + [0.06 if side == "right" else -0.06, 0, -0.03]
-    return Hand(side=side, grip=_relaxed(point, side, "human"))
+    return Hand(side=side, grip=relaxed(point, side, "human"))
 
 
-def _relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
+def relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
+    """Return the configuration of a hand that does nothing, at a place."""
     inward = 0.5 if side == "right" else -0.5
     closure = 0.25 if kind == "human" else 0.0
     return Grip(point_m=point, yaw=inward, pitch=np.radians(30), closure=closure)
@@ -325,7 +346,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
         ]
     last_opening = keys[-1].opening
     away = _shift(final, [0, -0.015, 0.02], closure=wide)
-    rest = _relaxed(_retreat(final.point_m, hand.side), hand.side, kind)
+    rest = relaxed(_retreat(final.point_m, hand.side), hand.side, kind)
     keys += [
         _Key(time=end + 0.05, grip=away, opening=last_opening),
         _Key(time=1.0, grip=rest, opening=last_opening),

@@ -29,9 +29,9 @@ def test_a_row_is_the_pose_that_it_was_made_of(side):
 
 def test_a_grip_is_the_pose_that_it_was_made_of():
     grip = Grip(point_m=np.array([0.1, 0.2, 0.05]), yaw=0.4, pitch=0.9, closure=0.3)
-    back = Pose.of_grip(grip, "right").grip()
+    back = Pose.of_grip(grip).grip()
     assert (back.yaw, back.pitch) == pytest.approx((0.4, 0.9))
-    np.testing.assert_array_equal(Pose.of_grip(grip, "right").row("right", np.zeros(6)).shape, 13)
+    np.testing.assert_array_equal(Pose.of_grip(grip).row("right", np.zeros(6)).shape, 13)
 
 
 def test_a_driven_hand_closes_when_it_is_there(scene):
