@@ -6,6 +6,8 @@ import re
 from random import Random
 
 INTERESTING = (0, 1, -1, 127, 128, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, -(2**63), 10**20)
+NUMBERS = (0, 1, 2, 3, 255, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1)
+"""Values for an unsigned field of 32 bits."""
 
 
 def flip(data: bytes, random: Random) -> bytes:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 Mutate = Callable[[bytes, random.Random], bytes]
 """Change a file's bytes."""
 
@@ -41,3 +43,8 @@ class Target:
     """Reason that a changed file may be read with another result unnoticed; else empty."""
     mutations: tuple[Mutate, ...] = ()
     """Changes that know the format, besides those of bytes."""
+
+
+def pixels(*shape: int) -> np.ndarray:
+    """Draw noise for a sample, the same at every call."""
+    return np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

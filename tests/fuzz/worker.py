@@ -21,7 +21,8 @@ from tests.fuzz.mutations import BYTES
 from tests.fuzz.target import Target
 
 MODULES = (
-    "targets_run", "targets_convert", "targets_media", "targets_recordings", "targets_serving",
+    "targets_run", "targets_convert", "targets_media", "targets_data", "targets_recordings",
+    "targets_serving",
 )  # fmt: skip
 MAX_SECONDS, MAX_BYTES, MAX_MESSAGE = 20, 1 << 30, 4000
 
