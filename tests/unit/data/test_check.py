@@ -1,0 +1,91 @@
+"""The check of a dataset names what is damaged."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.data.shards import ShardWriter
+from egosim_jax.io.video import encode_video
+from tests.unit.data.latent_records import (
+    damage_record,
+    first_shard,
+    latents,
+    problems,
+    rewrite_manifest,
+)
+
+
+def test_valid_shards_have_no_problems(folder):
+    assert problems(folder) == []
+
+
+def test_check_names_a_flipped_byte(folder):
+    path = damage_record(folder, 1)
+    found = problems(folder)
+    assert found[0] == f"{path}: its SHA-256 differs from the manifest"
+    assert found[1].startswith(f"{path}, record 1: cannot be read")
+    assert len(found) == 2
+
+
+def test_check_names_a_file_that_is_no_array_record(folder):
+    path = first_shard(folder)
+    path.write_bytes(b"x" * path.stat().st_size)
+    assert f"{path}: 0 records, expected 4" in problems(folder)
+
+
+def test_check_names_a_wrong_record_count(folder):
+    rewrite_manifest(folder, lambda fields: fields["shards"][0].update(records=3))
+    assert problems(folder) == [f"{first_shard(folder)}: 4 records, expected 3"]
+
+
+def test_check_names_arrays_that_are_not_as_the_manifest_says(folder):
+    def change(fields):
+        fields["arrays"]["text"]["shape"] = [5, 9]
+        fields["arrays"]["mask"]["dtype"] = "int32"
+        fields["arrays"]["hands"] = fields["arrays"].pop("target")
+
+    rewrite_manifest(folder, change)
+    found = "\n".join(problems(folder))
+    assert "text is float32 (5, 8), expected float32 (5, 9)" in found
+    assert "mask is uint8 (3, 4, 6, 4), expected int32" in found
+    assert "target is missing in the manifest" in found
+    assert "hands is missing in the record" in found
+
+
+def test_check_names_numbers_that_are_not_finite(tmp_path):
+    arrays = latents(0)
+    arrays["target"][0, 0, 0, 0] = np.nan
+    with ShardWriter(tmp_path, kind="latents") as writer:
+        writer.add(arrays, {"video_id": "a"})
+    assert problems(tmp_path) == [
+        f"{first_shard(tmp_path)}, record 0: target has values that are not finite"
+    ]
+
+
+def test_check_names_an_id_that_is_a_path(tmp_path):
+    with ShardWriter(tmp_path, kind="latents") as writer:
+        writer.add(latents(0), {"video_id": "../../etc/x"})
+    assert "'../../etc/x' is not a valid file name" in problems(tmp_path)[0]
+
+
+def as_bytes(frames):
+    return np.frombuffer(encode_video(np.zeros((frames, 32, 48, 3), np.uint8), 16), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("prior", "hands", "message"),
+    [
+        (as_bytes(10), as_bytes(10), "prior of 10 frames cannot be encoded"),
+        (as_bytes(9), as_bytes(5), "the frame counts disagree"),
+        (as_bytes(9), np.zeros(99, np.uint8), "hands is not a readable video"),
+    ],
+)
+def test_check_decodes_every_video(tmp_path, prior, hands, message):
+    with ShardWriter(tmp_path, kind="videos") as writer:
+        writer.add({"prior": prior, "hands": hands}, {"video_id": "a"})
+    assert any(message in problem for problem in problems(tmp_path))
+
+
+def test_check_decodes_every_image(tmp_path):
+    with ShardWriter(tmp_path, kind="videos") as writer:
+        writer.add({"first_frame": np.zeros(99, np.uint8)}, {"video_id": "a"})
+    assert "first_frame is not a readable image" in problems(tmp_path)[0]
