@@ -149,7 +149,7 @@ def test_a_checkpoint_that_orbax_cannot_list_is_named(tmp_path):
 
 
 # Orbax closes its event loop after the first array that it cannot open; TensorStore reports the
-# others to that loop, from threads of its own, at times after it is closed.
+# others to that loop, from its threads, at times after it is closed.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_without_hashes_what_orbax_cannot_read_is_named(tmp_path):
     saved_twice(tmp_path)
