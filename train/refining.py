@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from egosim_jax import configs
 from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
 from egosim_jax.train.distributed import require_single_process
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 class RefineVAE(Recipe):
     """Train the VAE of a weights folder further, all of it or its decoder.
 
+    A decoder that is narrower than the model's is widened first, without changing what it decodes.
     Writes OUT/weights, with the other networks of the folder, and log and checkpoints in OUT/vae.
     """
 
@@ -58,7 +60,6 @@ class RefineVAE(Recipe):
     @property
     def task(self) -> Refining:
         """The task of the training."""
-        from egosim_jax import configs
         from egosim_jax.train.tasks.refining import Refining
 
         model = configs.get(self.config)
@@ -85,9 +86,11 @@ class RefineVAE(Recipe):
         from egosim_jax.io.run import open_folder
         from egosim_jax.train.loop import train
         from egosim_jax.train.tasks.autoencoding import latent_statistics
+        from egosim_jax.train.wider import with_decoder_of
 
         require_single_process(self.config)
         open_folder(out, self, mutable=[*resume_mutable("vae"), "preflight", "json", "search"])
+        start = with_decoder_of(configs.get(self.config).vae, start, out / "start")
         vae = train(
             *self.stages()["vae"],
             data=frames / "train",
