@@ -105,7 +105,7 @@ def run(settings: Embodiment) -> None:
 
 
 def train_config(stage: Hyperparameters) -> TrainConfig:
-    """Return the training settings, with eight validations and checkpoints."""
+    """Return the training settings, with eight validations; a kill costs 50 updates at most."""
     every = max(1, stage.steps // 8)
     return TrainConfig(
         steps=stage.steps,
@@ -117,7 +117,7 @@ def train_config(stage: Hyperparameters) -> TrainConfig:
             schedule="cosine",
         ),
         seed=stage.seed,
-        save_every=every,
+        save_every=min(every, 50),
         validate_every=every,
     )
 

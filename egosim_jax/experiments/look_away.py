@@ -94,16 +94,12 @@ class Story:
     """Last frames without hands and object."""
 
     def score(self, frames: UInt8[np.ndarray, "f h w 3"]) -> dict[str, float]:
-        """Return every measure of a video of the last clip.
-
-        A pixel belongs to the object if its color is nearest to the object's and not to that of
-        the background, a hand or any other body, since these may be misplaced, too.
-        """
+        """Return every measure of a video of the last clip."""
         clip, last = self.clips[-1], slice(-FRAMES_BACK, None)
         number = clip.body_ids[self.target]
         here = clip.ids[last] == number
-        found = region.label(frames[last], self.background, clip.paints) == number
-        errors = region.centroid_errors(region.open_mask(found), here)
+        found = region.find(number, frames[last], self.background, clip.paints)
+        errors = region.centroid_errors(found, here)
         error = 100 * float(np.median(errors)) / frames.shape[2] if len(errors) else np.nan
         return {
             "kept": 100.0 * (error <= NEAR_PERCENT),

@@ -28,10 +28,8 @@ from egosim_jax.progress import track
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Cameras, Clip, SceneState, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Scene, Script, World, make_scripts
-from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, film_scenes
-from egosim_jax.worlds.tabletop.hands import SKIN, SLEEVE
+from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, film_scenes, paints_of, place
 from egosim_jax.worlds.tabletop.policies import POLICIES, WITHIN_M, error_m, succeeded
-from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 from egosim_jax.worlds.tabletop.world import arms_of, sides_of
 
 SHEET_SCENES = 2
@@ -55,8 +53,9 @@ DEFINITIONS = {
     "true": "share of scenes in which the executed action leaves the object within 3 cm of the "
     "goal horizontally and 2 cm vertically",
     "seen, frames": "the same by the ground-truth and by the generated frames: the centroid of the "
-    "object, segmented by color, is within 3 cm, at the goal's depth, of that of the object at the "
-    "goal; median over the last 3 frames in which the hand does not hide it; else no success",
+    "object, segmented by color among the colors of all bodies, is within 3 cm, at the goal's "
+    "depth, of that of the object at the goal; median over the last 3 frames in which the hand "
+    "does not hide it; else no success",
     "state": "the same as true by the pose of the object in the state after the generated clip",
     **ranking.DEFINITIONS,
 }
@@ -104,11 +103,9 @@ class Task:
         there = film_scenes([self._with(pose)] * LAST_FRAMES, last, arms=arms)
         goal = np.stack([picture.ids == number for picture in there])
         bare = film_scenes([script.scene] * LAST_FRAMES, last, without=name)
-        paints = {number: script.scene.body(name).parts[0].paint.color, FIRST_HAND: SKIN,
-                  FIRST_HAND + 1: SLEEVE}  # fmt: skip
         background = np.stack([picture.colors for picture in bare])
-        found = region.open_mask(region.label(frames, background, paints) == number)
-        errors = region.centroid_errors(found, goal)
+        paints = paints_of(place(script.scene, arms[-1]))
+        errors = region.centroid_errors(region.find(number, frames, background, paints), goal)
         if not len(errors):
             return {"success": 0.0}
         depth = np.median(np.stack([picture.depth_m for picture in there])[goal])

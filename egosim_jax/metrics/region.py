@@ -37,6 +37,20 @@ def label(
     return numbers[np.argmin(distances, axis=0)]
 
 
+def find(
+    number: int,
+    video: UInt8[np.ndarray, "f h w 3"],
+    background: UInt8[np.ndarray, "f h w 3"],
+    paints: Mapping[int, tuple[int, int, int]],
+) -> Bool[np.ndarray, "f h w"]:
+    """Return the silhouette of one body of a video, opened.
+
+    A pixel belongs to it if its color is nearest to the body's, and not to that of the background,
+    a hand or any other body of `paints`, all of which may be misplaced in the video.
+    """
+    return open_mask(label(video, background, paints) == number)
+
+
 def _distance(
     pixels: Float[np.ndarray, "f h w 3"], color: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "f h w"]:

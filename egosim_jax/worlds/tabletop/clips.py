@@ -104,7 +104,7 @@ def film(
         joints.append(
             [np.full((JOINTS[kind], 3), np.nan) if arm is None else arm[0] for arm in here]
         )
-        paints |= {item.number: item.part.paint.color for item in placed}
+        paints |= paints_of(placed)
         if bare:
             hidden = scene.number(target)
             placed = [x for x in placed if x.number < FIRST_HAND and x.number != hidden]
@@ -161,6 +161,11 @@ def place(scene: Scene, arms: Sequence[Arm | None]) -> list[Placed]:
         for index, arm in enumerate(arms)
         for k, part in enumerate(arm[1] if arm else ())
     ]
+
+
+def paints_of(placed: Sequence[Placed]) -> dict[int, tuple[int, int, int]]:
+    """Return the unshaded RGB color of parts by instance id."""
+    return {item.number: item.part.paint.color for item in placed}
 
 
 def provenance(seed: int) -> dict[str, str]:
