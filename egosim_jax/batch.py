@@ -27,10 +27,11 @@ from egosim_jax.data.metadata import ClipFiles, check_presence, is_safe_id
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.generator import Generator, batches
 from egosim_jax.io.atomic import append_line
+from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote_path, read_lines
-from egosim_jax.io.video import Decoding, read_video, write_video
+from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, parts

@@ -37,9 +37,9 @@ from PIL import Image
 from egosim_jax.geometry import invert, pixels_of, transform
 from egosim_jax.io.atomic import atomic_folder, atomic_write, check_replaceable
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.images import read_image
 from egosim_jax.io.npz import DAMAGE, read_arrays
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes, read_json
-from egosim_jax.io.video import read_image
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.state import snapshot
 from egosim_jax.state.depth import DEPTH_M

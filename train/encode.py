@@ -35,9 +35,9 @@ from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.generator import Inputs, batches, targets_of
+from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote
-from egosim_jax.io.video import Decoding
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import CompiledFn, shard_params

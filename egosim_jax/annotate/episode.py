@@ -9,9 +9,10 @@ import numpy as np
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.data.transforms import resize_image, resize_video
 from egosim_jax.episode import Episode
+from egosim_jax.io.images import read_image
 from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.untrusted import quote_path, read_json
-from egosim_jax.io.video import read_image, read_video
+from egosim_jax.io.video import read_video
 from egosim_jax.state import snapshot
 from egosim_jax.types import JOINTS, Action, Cameras, GroundTruth, InputError, Kind, VideoSpec
 

@@ -109,7 +109,7 @@ class MakeEpisode:
     def _scene(self, cameras: Cameras) -> tuple[SceneState, np.ndarray | None]:
         """Return the state, and the image at the size of the clips if there is one."""
         from egosim_jax.data.transforms import resize_video
-        from egosim_jax.io.video import read_image
+        from egosim_jax.io.images import read_image
         from egosim_jax.state.snapshot import load, read_ply
 
         image = None if self.image is None else read_image(self.image)

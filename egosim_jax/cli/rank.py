@@ -51,7 +51,7 @@ class Rank:
         from egosim_jax.batch import BatchJob, windows_of
         from egosim_jax.data.metadata import read_metadata
         from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.io.video import read_image
+        from egosim_jax.io.images import read_image
 
         check_counts(
             {"--seeds": self.seeds, "--steps": self.steps, "--batch-size": self.batch_size}

@@ -148,7 +148,7 @@ class Simulate:
         )
         if self.first_frame is None:
             return episode
-        from egosim_jax.io.video import read_image
+        from egosim_jax.io.images import read_image
 
         image = read_image(self.first_frame)
         if image.shape != (video.height, video.width, 3):

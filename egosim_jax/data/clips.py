@@ -32,18 +32,11 @@ from egosim_jax.data.transforms import (
     resize_mask,
 )
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.decoding import Damage, Decoding
+from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted import listing, quote, quote_path, quote_text, read_bytes
-from egosim_jax.io.video import (
-    MAX_IMAGE_BYTES,
-    Damage,
-    Decoding,
-    VideoInfo,
-    probe_video,
-    read_image,
-    read_video,
-    write_video,
-)
+from egosim_jax.io.video import VideoInfo, probe_video, read_video, write_video
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 logger = logging.getLogger(__name__)

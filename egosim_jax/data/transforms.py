@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from PIL import Image
 
-from egosim_jax.io.video import Decoding, decode_image, decode_video, probe_encoded
+from egosim_jax.io.decoding import Decoding
+from egosim_jax.io.images import decode_image
+from egosim_jax.io.video import decode_video, probe_encoded
 from egosim_jax.types import InputError, VideoSpec
 
 Resampling = Literal["first", "stride", "linspace", "rate"]

@@ -18,9 +18,9 @@ from PIL import Image
 
 from egosim_jax.episode import MAX_CLIPS, Episode, load_action, save_action
 from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.images import read_image
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import quote, quote_path, read_json
-from egosim_jax.io.video import read_image
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState, VideoSpec
 

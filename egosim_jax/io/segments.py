@@ -15,17 +15,14 @@ from av.container import InputContainer
 from av.video.frame import VideoFrame
 
 from egosim_jax.io.boxes import MAX_SAMPLES
-from egosim_jax.io.untrusted import quote_path, quote_text
-from egosim_jax.io.video import (
+from egosim_jax.io.decoding import (
     MAX_FRAMES,
     DamagedError,
     Decoding,
     File,
-    Video,
-    VideoInfo,
+    FrameBuffer,
     check_size,
     decode_packet,
-    enlarge,
     frame_rate,
     is_hdr,
     open_file,
@@ -33,6 +30,8 @@ from egosim_jax.io.video import (
     to_rgb,
     upright,
 )
+from egosim_jax.io.untrusted import quote_path, quote_text
+from egosim_jax.io.video import Video, VideoInfo
 from egosim_jax.types import InputError, check_counts
 
 
@@ -83,7 +82,7 @@ def read_segment(
     """
     check_counts({"The number of frames": count})
     name = quote_path(path)
-    kept, found = np.empty((0,), np.uint8), 0
+    kept = FrameBuffer(name)
     with open_file(path) as file:
         listing = _list(file, name)
         if start < 0 or start + count > len(listing.times):
@@ -98,21 +97,16 @@ def read_segment(
                 time = first - 1 if picture.pts is None else picture.pts
                 if time < first:
                     continue
-                if time != listing.times[start + found]:
+                if time != listing.times[start + len(kept)]:
                     break
                 frame = to_rgb(picture, decoding)
-                frame = frame if each is None else each(frame)
-                if found == len(kept):
-                    kept = enlarge(kept, frame, name)
-                kept[found] = frame
-                found += 1
+                kept.append(frame if each is None else each(frame))
                 if time >= last:
                     break
             fps = frame_rate(container.streams.video[0], name)
-    if found < count:
-        raise DamagedError(f"{name} is damaged: frame {start + found} cannot be decoded.")
-    kept.resize((count, *kept.shape[1:]), refcheck=False)
-    return Video(frames=kept, fps=fps)
+    if len(kept) < count:
+        raise DamagedError(f"{name} is damaged: frame {start + len(kept)} cannot be decoded.")
+    return Video(frames=kept.frames(), fps=fps)
 
 
 def _list(file: File, name: str) -> _Listing:

@@ -11,6 +11,7 @@ import json
 import os
 import stat
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
@@ -92,6 +93,18 @@ def read_lines(
                 raise InputError(f"{name}, line {number} is longer than {MAX_JSON_BYTES:,} bytes.")
             if (last == "read" or line.endswith(b"\n")) and line.strip():
                 yield number, parse_json(line, source=f"{name}, line {number}")
+
+
+@contextmanager
+def refusing(what: str, kind: type[InputError] = InputError) -> Iterator[None]:
+    """Turn exceptions of a decoder about untrusted bytes into `InputError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise kind(f"{what}: {quote_text(reason or type(error).__name__)}.") from error
 
 
 def quote(value: Any) -> str:

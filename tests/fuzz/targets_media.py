@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from egosim_jax.io.video import encode_video, read_image, read_video
+from egosim_jax.io.images import read_image
+from egosim_jax.io.video import encode_video, read_video
 from egosim_jax.state.ply import read_points
 from tests.fuzz.mutations import NUMBERS
 from tests.fuzz.target import Target, pixels

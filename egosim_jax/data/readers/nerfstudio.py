@@ -24,8 +24,8 @@ from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.readers.pictures import MAX_PICTURES, PictureVideo, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL
 from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.io.images import read_image
 from egosim_jax.io.untrusted import quote, quote_path, read_json
-from egosim_jax.io.video import read_image
 from egosim_jax.types import InputError
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")

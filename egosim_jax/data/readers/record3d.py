@@ -38,6 +38,7 @@ from egosim_jax.data.readers.pictures import MAX_PICTURES, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
 from egosim_jax.data.recording import DepthFiles, Recording
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.images import decode_image
 from egosim_jax.io.npz import DAMAGE
 from egosim_jax.io.untrusted import (
     open_regular,
@@ -47,7 +48,6 @@ from egosim_jax.io.untrusted import (
     quote_text,
     read_bytes,
 )
-from egosim_jax.io.video import decode_image
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 28

@@ -11,7 +11,8 @@ from PIL import Image
 
 from egosim_jax.data.clips import check_clip, load_triplet, write_clips
 from egosim_jax.data.metadata import read_metadata
-from egosim_jax.io.video import read_image, read_video, write_video
+from egosim_jax.io.images import read_image
+from egosim_jax.io.video import read_video, write_video
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
 NATIVE = VideoSpec(frames=9, height=32, width=48)
@@ -258,7 +259,7 @@ def test_damage_behind_the_first_frame_is_refused_by_row(files):
 
 def test_a_clip_may_be_larger_than_memory_should_hold(files, monkeypatch):
     whole = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=16))
-    monkeypatch.setattr("egosim_jax.io.video.MAX_KEPT", 9 * 16 * 16 * 3)
+    monkeypatch.setattr("egosim_jax.io.decoding.MAX_KEPT", 9 * 16 * 16 * 3)
     again = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=16))
     np.testing.assert_array_equal(again.prior, whole.prior)
 

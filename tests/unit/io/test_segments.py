@@ -59,7 +59,7 @@ def test_an_uneven_rate_is_measured(tmp_path):
 
 def test_a_video_longer_than_what_is_decoded_at_once_is_probed_and_read(tmp_path, monkeypatch):
     path = write(tmp_path / "video.mp4")
-    monkeypatch.setattr("egosim_jax.io.video.MAX_PIXELS", 20 * 64 * 64)
+    monkeypatch.setattr("egosim_jax.io.decoding.MAX_PIXELS", 20 * 64 * 64)
     with pytest.raises(InputError, match="pixels"):
         read_video(path)
     assert probe_long_video(path).frames == 40

@@ -1,26 +1,23 @@
-"""Videos and images in and out, and what is refused."""
+"""Videos in and out, and what is refused."""
 
 import io
 import os
 import struct
 import tempfile
-import zlib
 from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
-from PIL import Image
 
-from egosim_jax.io import video as video_io
+from egosim_jax.io import decoding
 from egosim_jax.io.boxes import check_boxes
+from egosim_jax.io.images import read_image
 from egosim_jax.io.video import (
-    decode_image,
     decode_video,
     encode_video,
     probe_encoded,
     probe_video,
-    read_image,
     read_video,
     write_video,
 )
@@ -124,7 +121,7 @@ def test_too_many_frames_are_refused():
 
 
 def test_too_many_pixels_are_refused(monkeypatch):
-    monkeypatch.setattr(video_io, "MAX_PIXELS", 5 * 32 * 48 - 1)
+    monkeypatch.setattr(decoding, "MAX_PIXELS", 5 * 32 * 48 - 1)
     with pytest.raises(InputError, match="pixels"):
         decode_video(encode_video(smooth(frames=5), 16))
 
@@ -133,35 +130,6 @@ def test_too_many_pixels_are_refused(monkeypatch):
 def test_what_420_cannot_hold_is_not_written(shape):
     with pytest.raises(InputError, match="even width and height"):
         encode_video(np.zeros(shape, np.uint8), 16)
-
-
-def test_an_image_with_transparency_reads_as_rgb(tmp_path):
-    Image.new("RGBA", (6, 4), (10, 20, 30, 128)).save(tmp_path / "a.png")
-    image = read_image(tmp_path / "a.png")
-    assert image.shape == (4, 6, 3)
-    assert (image == (10, 20, 30)).all()
-
-
-def test_an_unreadable_image_is_refused(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"a\.png is not a readable image"):
-        read_image(tmp_path / "a.png")
-
-
-def test_a_truncated_image_is_refused(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
-    Image.fromarray(noise).save(tmp_path / "a.png")
-    data = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match="is not a readable image"):
-        read_image(tmp_path / "a.png")
-
-
-def test_an_image_above_the_cap_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(video_io, "MAX_IMAGE_PIXELS", 6 * 4 - 1)
-    Image.new("RGB", (6, 4)).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match="6x4 pixels"):
-        read_image(tmp_path / "a.png")
 
 
 def detailed(frames=9):
@@ -205,8 +173,8 @@ def test_a_bit_that_breaks_the_stream_is_refused_in_most_places():
 
 def test_a_frame_marked_as_corrupt_is_refused(monkeypatch):
     data = encode_video(detailed(), 16)
-    options = {**video_io._OPTIONS, "err_detect": "0"}
-    monkeypatch.setattr(video_io, "_OPTIONS", options)  # so that FFmpeg conceals what it can
+    options = {**decoding._OPTIONS, "err_detect": "0"}
+    monkeypatch.setattr(decoding, "_OPTIONS", options)  # so that FFmpeg conceals what it can
     begin = data.index(b"mdat") + 800
     messages = []
     for at in range(begin, begin + 3000, 30):
@@ -317,7 +285,7 @@ def test_a_table_of_fifty_million_samples_is_refused_before_it_is_built():
 
 
 def test_frames_beyond_what_memory_should_hold_are_refused(monkeypatch):
-    monkeypatch.setattr(video_io, "MAX_KEPT", 4 * 32 * 48 * 3)
+    monkeypatch.setattr(decoding, "MAX_KEPT", 4 * 32 * 48 * 3)
     with pytest.raises(InputError, match="bytes of frames"):
         decode_video(encode_video(smooth(5), 16))
     smaller = decode_video(encode_video(smooth(5), 16), each=lambda frame: frame[::2, ::2])
@@ -333,45 +301,6 @@ def test_official_decoding_is_the_scalers_default():
     np.testing.assert_array_equal(official, expected)
     accurate = decode_video(data).frames
     assert 0.3 < (accurate.astype(float) - official).mean() < 2
-
-
-def test_gray_of_16_bits_keeps_its_upper_8(tmp_path):
-    levels = np.arange(0, 65536, 4096, dtype=np.uint16).reshape(4, 4)
-    Image.fromarray(levels).save(tmp_path / "a.png")
-    expected = np.repeat((levels >> 8).astype(np.uint8)[..., None], 3, axis=-1)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), expected)
-
-
-def png(*chunks):
-    """A PNG of these chunks."""
-    parts = [b"\x89PNG\r\n\x1a\n"]
-    for kind, content in chunks:
-        crc = zlib.crc32(kind + content)
-        parts.append(struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc))
-    return b"".join(parts)
-
-
-HEADER = (b"IHDR", struct.pack(">IIBBBBB", 4, 4, 8, 2, 0, 0, 0))
-PIXELS = (b"IDAT", zlib.compress(b"".join(b"\0" + bytes(12) for _ in range(4))))
-
-
-def test_a_png_with_a_text_bomb_is_refused():
-    bomb = (b"zTXt", b"a\0\0" + zlib.compress(bytes(1 << 27)))
-    with pytest.raises(InputError, match="is not a readable image"):
-        decode_image(png(HEADER, bomb, PIXELS, (b"IEND", b"")))
-
-
-def test_a_png_with_one_wrong_byte_of_pixels_is_refused():
-    data = png(HEADER, PIXELS, (b"IEND", b""))
-    at = data.index(b"IDAT") + 6
-    with pytest.raises(InputError, match="is not a readable image"):
-        decode_image(data[:at] + b"?" + data[at + 1 :])
-
-
-def test_an_image_of_32_bits_is_refused(tmp_path):
-    Image.fromarray(np.ones((4, 4), np.float32)).save(tmp_path / "a.tiff")
-    with pytest.raises(InputError, match="32 bits"):
-        read_image(tmp_path / "a.tiff")
 
 
 def test_the_groups_of_samples_of_a_phones_video_are_counted():

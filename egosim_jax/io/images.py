@@ -1,0 +1,48 @@
+"""Reading of images as uint8 RGB arrays, checked before they are decoded."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from egosim_jax.io.untrusted import quote_path, read_bytes, refusing
+from egosim_jax.types import InputError
+
+MAX_IMAGE_PIXELS = 2**25
+"""Maximum number of pixels of one image or frame: 8192 x 4096."""
+MAX_IMAGE_BYTES = 2**28
+"""Maximum size of an image file in bytes."""
+IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
+"""Image formats that can be read."""
+
+
+def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Read an image file as RGB. Raises `InputError` if it is missing, damaged or too large."""
+    return decode_image(read_bytes(path, limit=MAX_IMAGE_BYTES), name=quote_path(path))
+
+
+def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.ndarray, "h w 3"]:
+    """Decode the bytes of an image file (`read_image`); `name` replaces the path in errors.
+
+    Of 16 bits the upper 8 are taken.
+    """
+    with refusing(f"{name} is not a readable image"):
+        with Image.open(io.BytesIO(data), formats=IMAGES) as image:
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                raise InputError(
+                    f"{name} has {image.width}x{image.height} pixels, more than "
+                    f"{MAX_IMAGE_PIXELS:,}, the most that is read."
+                )
+            if image.mode in ("I", "F"):
+                raise InputError(f"{name} has 32 bits a channel; save it with 8 or 16.")
+            if image.format == "PNG":
+                image.verify()  # the CRC of every chunk; then it has to be opened again
+        with Image.open(io.BytesIO(data), formats=IMAGES) as image:
+            if image.mode.startswith("I;16"):
+                gray = (np.asarray(image) >> 8).astype(np.uint8)
+                return np.stack([gray] * 3, axis=-1)
+            return np.asarray(image.convert("RGB"))
