@@ -16,7 +16,7 @@ import tyro
 from egosim_jax import command
 from egosim_jax.train.recipes import RECIPES
 
-Recipes = Union[  # noqa: UP007 - a tuple of members
+Commands = Union[  # noqa: UP007 - a tuple of members
     tuple(
         Annotated[type(recipe), tyro.conf.subcommand(name, default=recipe, description=about)]
         for name, (about, recipe) in RECIPES.items()
@@ -31,7 +31,7 @@ def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") ->
     given = sys.argv[1:] if args is None else args
     without_training = any(arg.partition("=")[0] == "--preflight" for arg in given)
     return command.main(
-        Recipes,
+        Commands,
         program=program,
         description="Train a model. The same command resumes an interrupted run. With --preflight "
         "it only reports whether the training would fit a machine, which need not be present.",

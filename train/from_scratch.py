@@ -122,6 +122,7 @@ class FromScratch(Recipe):
         from egosim_jax.io.run import open_folder
         from egosim_jax.networks import Networks
         from egosim_jax.train.loop import train
+        from egosim_jax.train.monitor import Samples
 
         require_single_process(self.config)
         free = ("products", "preflight", "json", "search", "bundle")
@@ -149,6 +150,10 @@ class FromScratch(Recipe):
             validation=joined["test"],
             out=out / "denoiser",
             weights=self.weights,
+            samples=Samples(
+                model=self.trained_model(), latents=joined["test"], vae=out / "weights"
+            ),
+            run_folder=out,
         )
         networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
         networks.save(out / "weights", dtype=self.weights_dtype)
@@ -192,6 +197,7 @@ class FromScratch(Recipe):
             data=frames["train"],
             validation=frames["test"],
             out=out / "vae",
+            run_folder=out,
         )
         videos = (record.arrays["target"] for record in ShardReader(frames["train"]))
         vae.standardize(*latent_statistics(vae, videos))

@@ -30,13 +30,14 @@ from egosim_jax.data.loader import Loader, make_loader
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
-from egosim_jax.io.run import open_folder
+from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
+from egosim_jax.train.page import TIMES, write_page
 from egosim_jax.train.update import Programs, Task, TrainState, average, mean_metrics
 from egosim_jax.types import InputError
 
@@ -53,13 +54,15 @@ def train(
     out: Path,
     weights: Path | None = None,
     samples: Samples | None = None,
+    run_folder: Path | None = None,
 ) -> Any:
     """Train `task` on the shards in `data`, resuming the run in `out`, and return the networks.
 
     `validation` is a folder of shards whose metrics are measured with fixed noise; `weights` a
-    folder to start from instead of random weights. The run folder gets config.json,
-    environment.json, metrics.jsonl, checkpoints/ and samples/. All processes of a run call this
-    with the same arguments, and the first one writes.
+    folder to start from instead of random weights. OUT gets config.json, environment.json,
+    metrics.jsonl, times.json, checkpoints/ and samples/, and `run_folder`, OUT if not given, the
+    page index.html of this training and its other stages. All processes of a run call this with
+    the same arguments, and the first one writes.
     """
     training.check_packages()
     digests = None if weights is None else hashes(weights)
@@ -84,6 +87,7 @@ def train(
             hooks.append(Every(training.validate_every, partial(run.validate, validation)))
         if samples is not None and training.sample_every is not None:
             hooks.append(Every(training.sample_every, partial(run.sample, samples)))
+        hooks.append(Every(training.validate_every, partial(run.write_page, run_folder or out)))
         if validation is not None and int(state.step) == 0:
             run.validate(validation, 0, state)
         state = run.loop(state, hooks)
@@ -223,6 +227,15 @@ class Run:
         self.watchdog.rest()
         with self.clock.phase("sample"):
             samples.write(self.networks(state), self.out / "samples", step)
+
+    def write_page(self, folder: Path, step: int, state: TrainState) -> None:
+        """Write times.json, and the page of the run folder."""
+        self.watchdog.rest()
+        if is_first():
+            write_json(self.out / TIMES, self.clock.by_phase())
+            page = write_page(folder)
+            if step == self.training.steps:
+                log0(f"curves, sample clips and settings: {page}")
 
     def save(self, step: int, state: TrainState, *, wait: bool) -> None:
         """Write a checkpoint in the background, or wait until it is on disk."""

@@ -92,11 +92,15 @@ class Clock:
         }
         return {name: value for name, value in numbers.items() if value == value}
 
+    def by_phase(self) -> dict[str, float]:
+        """Return the seconds of each phase by its title, and those of all else."""
+        rows = {PHASES[name]: self.seconds[name] for name in PHASES if self.seconds[name]}
+        return {**rows, "other": time.monotonic() - self._began - sum(rows.values())}
+
     def table(self) -> str:
         """Return seconds and share of each phase, one per line."""
-        total = time.monotonic() - self._began
-        rows = {PHASES[name]: self.seconds[name] for name in PHASES if self.seconds[name]}
-        rows["other"] = total - sum(rows.values())
+        rows = self.by_phase()
+        total = sum(rows.values())
         return "\n".join(
             f"  {name:<24}{seconds:>10.1f} s {seconds / total:>7.1%}"
             for name, seconds in {**rows, "total": total}.items()

@@ -204,6 +204,7 @@ TABLETOP = FromTabletop(
         log_every=25,
         save_every=250,
         validate_every=500,
+        sample_every=500,
     ),
     dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
     weights_dtype="float16",
@@ -234,6 +235,7 @@ DWM_TABLETOP = FromTabletop(
         log_every=25,
         save_every=250,
         validate_every=500,
+        sample_every=500,
     ),
     dropout=ConditionDropout(prior=0.05, hands=0.1, text=0.1),
 )
@@ -282,6 +284,7 @@ REAL_TINY = FromClips(
         log_every=25,
         save_every=250,
         validate_every=500,
+        sample_every=500,
     ),
 )
 """EgoSim's architecture, small, from scratch on recorded clips: the VAE, then the denoiser.
@@ -301,7 +304,14 @@ _DEBUG = TrainConfig(
     validate_every=20,
 )
 
-DEBUG = FromClips(config="debug", vae=_DEBUG, denoiser=_DEBUG, clips=8, clip_frames=25, stride=8)
+DEBUG = FromClips(
+    config="debug",
+    vae=_DEBUG,
+    denoiser=replace(_DEBUG, sample_every=10),
+    clips=8,
+    clip_frames=25,
+    stride=8,
+)
 """The smallest training, on synthetic clips of the tabletop world, to check an installation.
 
     egosim-train debug --out runs/debug

@@ -97,6 +97,7 @@ class RefineVAE(Recipe):
             validation=frames / "test",
             out=out / "vae",
             weights=start,
+            run_folder=out,
         ).vae
         if self.part == "all":
             videos = (record.arrays["target"] for record in ShardReader(frames / "train"))

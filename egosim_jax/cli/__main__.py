@@ -8,8 +8,11 @@ interrupts.expect()
 
 import sys
 from collections.abc import Sequence
+from dataclasses import make_dataclass
+from functools import reduce
 from importlib import import_module
-from typing import Annotated
+from operator import or_
+from typing import Annotated, Any
 
 import tyro
 
@@ -80,13 +83,22 @@ def main(args: Sequence[str] | None = None) -> int:
         sys.argv = [program, *given[1:]]
         return run(program=program)
     return command.main(
-        Commands,
+        _with_programs() if any(arg.startswith("--tyro-") for arg in given) else Commands,
         program="egosim",
         description="An egocentric world simulator in JAX. `egosim train` trains a model and "
         "`egosim convert` converts weights; each has its own --help.",
         args=args,
         others=tuple(PROGRAMS),
     )
+
+
+def _with_programs() -> Any:
+    """Return the commands along with those of `PROGRAMS`, which a shell completes, too."""
+    found: list[Any] = [Commands]
+    for name, module in PROGRAMS.items():
+        kind = make_dataclass(name, [("command", import_module(module).Commands)])
+        found.append(Annotated[kind, tyro.conf.subcommand(name)])
+    return reduce(or_, found)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`egosim view`: draw a scene state, or open the recording of a simulation."""
+"""`egosim view`: draw a scene state, open a simulation, or make the page of a training."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import tyro
 from egosim_jax.command import ExitCode
 from egosim_jax.rendering.portrait import Up, up_of, write_portrait
 from egosim_jax.rendering.recording import RECORDING
+from egosim_jax.train.page import PAGE, stages_of, write_page
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -22,32 +23,39 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Draw a state or a point cloud from three sides, or open a simulation in the Rerun viewer.
+    """Draw a state or a point cloud, open a simulation in Rerun, or make a page of a training.
 
     PATH is the folder of a simulation or its simulation.rrd (needs the extra `viewer`), a folder
-    that holds a state, such as OUT/clip_1/state, or a PLY of colored points, such as EgoSim's.
+    that holds a state, such as OUT/clip_1/state, a PLY of colored points, such as EgoSim's, or the
+    folder of a training, which may still run: curves, sample clips and settings on one HTML page.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or file to view."""
     out: Path | None = None
-    """Picture to write; NAME.png in the current folder if not given."""
+    """Picture or page to write; by default NAME.png here, or index.html in a training's folder."""
     up: Up | None = None
     """Axis of the world that points up; z in the tabletop world and -y elsewhere if not given."""
     host: str = "127.0.0.1"
     """Address that the Rerun viewer listens on; by default only this machine can reach it."""
 
     def run(self) -> int:
-        """Draw the state, or open the viewer."""
+        """Draw the state, open the viewer, or write the page."""
         recording = self.path / RECORDING if self.path.is_dir() else self.path
         if recording.suffix == ".rrd" and recording.exists():
             return _open(recording, self.host)
         if self.path.is_dir() and (self.path / "report.json").exists():
+            if (page := self.path / PAGE).exists():  # of an evaluation, or of annotated clips
+                print(page)
+                return ExitCode.DONE
             raise InputError(
                 f"{self.path} has no {RECORDING}: it was simulated without Rerun. Install it (pip "
                 "install 'egosim-jax[viewer]') and run the same egosim simulate again, which adds "
                 f"it; or look at one state: {self.path / 'clip_1' / 'state'}."
             )
+        if self.path.is_dir() and stages_of(self.path):
+            print(write_page(self.path, self.out))
+            return ExitCode.DONE
         state = self._state()
         out = self.out or Path(f"{self.path.stem}.png")
         write_portrait(out, state, up=self.up or up_of(state))
@@ -66,8 +74,8 @@ class View:
         if self.path.suffix == ".ply":
             return read_ply(self.path)
         raise InputError(
-            f"{self.path} cannot be viewed: give the folder of a simulation or of a state, a .rrd "
-            "or a .ply."
+            f"{self.path} cannot be viewed: give the folder of a simulation, of a training or of a "
+            "state, a .rrd or a .ply."
         )
 
 

@@ -1,4 +1,4 @@
-"""The page of a table in a real browser; chromium is installed by .ci/run."""
+"""The pages of a table and of a training in a real browser; chromium is installed by .ci/run."""
 
 import csv
 import subprocess
@@ -10,6 +10,8 @@ from PIL import Image
 from egosim_jax import testing
 from egosim_jax.cli.table import TableCommand
 from egosim_jax.io.video import read_video, write_video
+from egosim_jax.train.page import write_page
+from tests.training.finished import write_stage
 
 pytestmark = pytest.mark.slow
 
@@ -74,3 +76,16 @@ def test_the_page_is_one_file_that_loads_nothing(page):
     assert "http://" not in text
     assert "https://" not in text
     assert len(text) < 300_000
+
+
+def test_the_browser_draws_the_curves_and_samples_of_a_training(tmp_path):
+    page = write_page(write_stage(tmp_path / "run", samples=(40,)))
+    shot = tmp_path / "page.png"
+    browse(page, f"--screenshot={shot}")
+    pixels = np.asarray(Image.open(shot).convert("RGB")).astype(int)
+    for color in ((31, 119, 180), (255, 127, 14)):  # of training and of validation
+        near = np.abs(pixels - color).max(axis=-1) < 12
+        assert near.sum() > 100
+        assert np.flatnonzero(near.any(axis=1)).max() < 420  # in the plots, which are at the top
+    red = (pixels[..., 0] > 180) & (pixels[..., 1:].max(axis=-1) < 40)
+    assert red.sum() > 3 * 64 * 96 * 0.95  # the video, and two frames on the sheet

@@ -43,6 +43,9 @@ def test_the_loss_falls_and_the_time_spent_is_reported(points, tmp_path, capsys)
     said = capsys.readouterr().err
     for phase in ("compiling", "waiting for data", "updates", "validation", "total"):
         assert phase in said
+    assert f"curves, sample clips and settings: {tmp_path / 'index.html'}" in said
+    assert "step 20 of 20" in (tmp_path / "index.html").read_text()
+    assert json.loads((tmp_path / "times.json").read_text())["updates"] > 0
 
 
 def test_an_update_that_is_not_finite_is_skipped_and_named(tmp_path, capsys):

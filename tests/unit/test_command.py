@@ -223,7 +223,15 @@ def test_grouped_options_arrive_in_their_fields(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"), [("egosim simul", "simulate"), ("egosim generate --str", "--strength")]
+    ("words", "expected"),
+    [
+        ("egosim simul", "simulate"),
+        ("egosim generate --str", "--strength"),
+        ("egosim conv", "convert"),
+        ("egosim convert weights --wid", "--widen"),
+        ("egosim train real", "real_tiny"),
+        ("egosim train debug --clip-f", "--clip-frames"),
+    ],
 )
 def test_the_printed_script_completes_commands_and_options_in_bash(
     words, expected, tmp_path, capsys

@@ -9,7 +9,7 @@ import tyro
 
 from egosim_jax.cli.__main__ import Commands
 from egosim_jax.convert.__main__ import Commands as Conversions
-from egosim_jax.train.__main__ import Recipes
+from egosim_jax.train.__main__ import Commands as Recipes
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = {"egosim": Commands, "egosim-train": Recipes, "egosim-convert": Conversions}
