@@ -48,11 +48,12 @@ class Tabletop(ModelExperiment):
 class Continuous(ModelExperiment):
     """Simulate held-out sequences with and without state updates, and compare clip by clip.
 
-    Prints a table for each method and writes report.json and curves.png. Each sequence is a
-    simulation in a separate folder; the same command resumes an interrupted experiment.
+    Prints a table for each method and the differences from no update, writes report.json and
+    curves.png. Each sequence is a simulation in a separate folder; the same command resumes an
+    interrupted experiment.
     """
 
-    sequences: int = 6
+    sequences: int = 12
     """Number of sequences, of consecutive seeds."""
     clips: int = 10
     """Clips of each sequence."""

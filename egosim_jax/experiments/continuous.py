@@ -15,7 +15,7 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import read_json
 from egosim_jax.metrics.loop import DEFINITIONS, MEASURES, score_step
-from egosim_jax.metrics.report import Summary, print_table, summarize
+from egosim_jax.metrics.report import Summary, paired_differences, print_table, summarize
 from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rollout import Rollout
@@ -25,12 +25,17 @@ from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
 Scores = Sequence[Mapping[str, float]]
 """Scores of one sequence, clip by clip."""
+NOT_UPDATED = "no update"
 METHODS: dict[str, str | None] = {
     "update, oracle": "oracle",
     "update, classical": "classical",
-    "no update": None,
+    NOT_UPDATED: None,
 }
 """Names of the methods, and their perception."""
+DIFFERENCES = {
+    "differences": "from no update, clip by clip of the same sequences; mean and 95 % interval by "
+    "the paired bootstrap"
+}
 
 
 def run(settings: Continuous) -> None:
@@ -46,11 +51,25 @@ def run(settings: Continuous) -> None:
         method: [summarize(clips, MEASURES) for clips in zip(*runs, strict=True)]
         for method, runs in scores.items()
     }
-    write_json(settings.out / "report.json", {"definitions": DEFINITIONS, "tables": tables})
-    for method, table in tables.items():
-        rows = {str(number): row for number, row in enumerate(table, start=1)}
-        title = f"{method}: mean ± spread over sequences"
-        print_table("clip", rows, MEASURES, title=title)
+    differences = {
+        method: [
+            paired_differences(*clips, MEASURES)
+            for clips in zip(
+                zip(*runs, strict=True), zip(*scores[NOT_UPDATED], strict=True), strict=True
+            )
+        ]
+        for method, runs in scores.items()
+        if method != NOT_UPDATED
+    }
+    report = {"definitions": DEFINITIONS | DIFFERENCES, "tables": tables}
+    write_json(settings.out / "report.json", {**report, "differences": differences})
+    for title, found in (
+        ("{}: mean ± spread over sequences", tables),
+        ("{}: difference from no update, with its 95 % interval", differences),
+    ):
+        for method, table in found.items():
+            rows = {str(number): row for number, row in enumerate(table, start=1)}
+            print_table("clip", rows, MEASURES, title=title.format(method))
     draw_curves(tables, settings.out / "curves.png")
     print(settings.out / "curves.png")
 

@@ -146,8 +146,14 @@ def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(
     fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
     command = ["experiment", "continuous", *fixed, "--sequences", "2", "--clips", "2"]
     assert main(command) == 0
-    tables = json.loads((out / "report.json").read_text("utf-8"))["tables"]
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    tables = report["tables"]
     assert tables.keys() == {"update, oracle", "update, classical", "no update"}
+    second, differences = tables["no update"][1]["psnr"]["mean"], report["differences"]
+    for method in ("update, oracle", "update, classical"):
+        gain = tables[method][1]["psnr"]["mean"] - second
+        assert differences[method][1]["psnr"]["mean"] == pytest.approx(gain)
+        assert differences[method][0]["psnr"]["mean"] == 0
     first = [table[0]["psnr"]["mean"] for table in tables.values()]
     assert first[0] == first[1] == first[2]  # before the first clip there is nothing to remember
     assert tables["update, oracle"][1]["prior_psnr"] != tables["no update"][1]["prior_psnr"]
