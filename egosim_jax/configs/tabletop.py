@@ -21,6 +21,7 @@ CONFIG = ModelConfig(
     ),
     vae=WanVAEConfig(
         dim=8,
+        decoder_dim=11,
         dim_mult=(1, 2, 6, 10),
         res_blocks=1,
         latent_mean=(0.0,) * 16,
