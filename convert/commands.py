@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,18 +12,19 @@ import tyro
 
 from egosim_jax import command
 from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
+from egosim_jax.convert.outputs import apart, write_file, write_sharded
 from egosim_jax.convert.pipeline import pipeline_files
 from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch
-from egosim_jax.convert.source import INDEX
-from egosim_jax.convert.stream import Weight, in_rows, write
+from egosim_jax.convert.stream import Weight, in_memory, in_rows
 from egosim_jax.convert.tables import table_of
+from egosim_jax.convert.tokenizer import tokenizer_files
 from egosim_jax.convert.widen import Widening, WidenMode, widening_of
 from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.mapped import OURS, Tensor
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import quote_path, read_bytes
+from egosim_jax.io.untrusted import quote_path
 from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
-from egosim_jax.progress import track, track_bytes
+from egosim_jax.progress import track
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -135,16 +135,12 @@ class Weights:
                 target = self.out / f"{found.network}.safetensors"
                 metadata = {"format": OURS, "config": self.config, "source": found.source.name}
                 origin = found.source.files
-                _write(target, weights, origin=origin, metadata=metadata, keep_log=keep_logs)
+                write_file(target, weights, origin=origin, metadata=metadata, keep_log=keep_logs)
             if kept:
                 with atomic_folder(self.out / config.tokenizer.kind) as temporary:
                     for name, data in kept.items():
                         (temporary / name).write_bytes(data)
         return command.ExitCode.DONE
-
-
-LARGEST = 5_000_000_000
-"""Bytes of a file above which a network is written as several."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +186,7 @@ class ToTorch:
             pipeline = pipeline_files(config, [name for name, *_ in planned])
         with lock_folder(self.out):
             for _, stem, file, converted in planned:
-                _write_sharded(stem, converted, origin=[file])
+                write_sharded(stem, converted, origin=[file])
             for path, content in pipeline.items():
                 write_json(self.out / path, content)
         return command.ExitCode.DONE
@@ -252,20 +248,15 @@ class Lora:
             metadata = exported_metadata(changes)
             for known in (*base, *filter(None, [metadata_of(self.source).get(BASE)])):
                 metadata[BASE] = known
-            weights = [
-                Weight(
-                    name=name, shape=tensor.shape, dtype=tensor.dtype, pieces=(lambda t=tensor: t,)
-                )
-                for name, tensor in exported(changes, config).items()
-            ]
+            weights = in_memory(exported(changes, config))
             with lock_folder(self.out.parent):
-                _write(self.out, weights, origin=origin, metadata=metadata)
+                write_file(self.out, weights, origin=origin, metadata=metadata)
             return command.ExitCode.DONE
         file = self.merge / "dit.safetensors"
         weights = merged(read_safetensors(file), changes, config, scale=self.scale)
         metadata = {"format": OURS, "config": self.config, "lora": quote_path(self.source.name)}
         with lock_folder(self.out):
-            _write(self.out / file.name, weights, origin=[file, *origin], metadata=metadata)
+            write_file(self.out / file.name, weights, origin=[file, *origin], metadata=metadata)
             link_others(self.out, self.merge)
         return command.ExitCode.DONE
 
@@ -284,14 +275,9 @@ class Lora:
         base = None if self.base is None else read_safetensors(self.base / "dit.safetensors")
         with lock_folder(self.out):
             for stem, tensors in checkpoint(changes, config, base).items():
-                weights = [
-                    Weight(
-                        name=name, shape=array.shape, dtype=array.dtype, pieces=(lambda a=array: a,)
-                    )
-                    for name, array in tensors.items()
-                ]
                 target = self.out / f"{stem}.safetensors"
-                _write(target, weights, origin=origin, metadata={"format": "pt"})
+                weights = in_memory(tensors)
+                write_file(target, weights, origin=origin, metadata={"format": "pt"})
         return command.ExitCode.DONE
 
 
@@ -364,36 +350,6 @@ class Verify:
         return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
 
 
-def apart(out: Path, source: Path) -> None:
-    """Raise `InputError` if the output is the input or inside it."""
-    here, there = (Path(os.path.realpath(path)) for path in (out, source))
-    if there in (here, *here.parents):
-        raise InputError(
-            f"{quote_path(out)} is {quote_path(source)} or inside it, which is the input: choose a "
-            "separate output path. (--out)"
-        )
-
-
-TOKENIZER_FILES = (
-    "tokenizer.json", "spiece.model", "tokenizer_config.json", "special_tokens_map.json",
-)  # fmt: skip
-MOST_TOKENIZER = 64 << 20
-"""Bytes of a tokenizer file."""
-
-
-def tokenizer_files(folder: Path, *, within: Path) -> dict[str, bytes]:
-    """Read the files of a tokenizer. Raises `InputError` for symlinks, which may point anywhere."""
-    files = [folder / name for name in TOKENIZER_FILES if os.path.lexists(folder / name)]
-    inner = [path for path in (folder, *folder.parents) if within in path.parents]
-    for path in (*inner, *files):
-        if path.is_symlink():
-            raise InputError(
-                f"{quote_path(path)} is a symlink; those of a tokenizer are not followed. Copy the "
-                "checkpoint folder with `cp -rL` if you trust the targets of its links."
-            )
-    return {file.name: read_bytes(file, limit=MOST_TOKENIZER) for file in files}
-
-
 def _widening(
     found: DetectedNetwork, config: ModelConfig, mode: WidenMode | None
 ) -> Widening | None:
@@ -421,37 +377,3 @@ def _same(weight: Weight, tensor: Tensor) -> bool:
         )
         for part, piece in zip(parts, weight.pieces, strict=True)
     )
-
-
-def _write(
-    target: Path,
-    weights: Sequence[Weight],
-    *,
-    origin: Sequence[Path],
-    metadata: Mapping[str, str],
-    keep_log: bool = False,
-) -> None:
-    total = sum(weight.bytes for weight in weights)
-    pieces = write(target, weights, origin=origin, metadata=metadata, keep_log=keep_log)
-    for _ in track_bytes(pieces, f"writing {target.name}", total=total):
-        pass
-    print(quote_path(target))
-
-
-def _write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Path]) -> None:
-    """Write one file or, above 5 GB, several and an index."""
-    shards: list[list[Weight]] = [[]]
-    for weight in weights:
-        if shards[-1] and sum(w.bytes for w in shards[-1]) + weight.bytes > LARGEST:
-            shards.append([])
-        shards[-1].append(weight)
-    weight_map = {}
-    for number, shard in enumerate(shards, start=1):
-        end = f"-{number:05d}-of-{len(shards):05d}" if len(shards) > 1 else ""
-        target = stem.with_name(f"{stem.name}{end}.safetensors")
-        _write(target, shard, origin=origin, metadata={"format": "pt"})
-        weight_map |= {weight.name: target.name for weight in shard}
-    if len(shards) > 1:
-        total = sum(weight.bytes for weight in weights)
-        index = {"metadata": {"total_size": total}, "weight_map": weight_map}
-        write_json(stem.with_name(f"{stem.name}{INDEX}"), index)

@@ -45,6 +45,14 @@ class Weight:
         return math.prod(self.shape) * self.dtype.itemsize
 
 
+def in_memory(arrays: Mapping[str, np.ndarray]) -> list[Weight]:
+    """Return weights of one piece each, of arrays by their names."""
+    return [
+        Weight(name=name, shape=array.shape, dtype=array.dtype, pieces=(lambda a=array: a,))
+        for name, array in arrays.items()
+    ]
+
+
 def write(
     target: Path,
     weights: Sequence[Weight],

@@ -22,7 +22,7 @@ from safetensors.numpy import load_file
 from safetensors.torch import save_file
 
 from egosim_jax import configs
-from egosim_jax.convert import commands
+from egosim_jax.convert import commands, outputs
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of, wan_dit
@@ -288,7 +288,7 @@ def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
 
 @pytest.mark.parametrize("layout", ["wan", "diffusers"])
 def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, monkeypatch):
-    monkeypatch.setattr(commands, "LARGEST", 200_000)  # bytes, so that there is more than one
+    monkeypatch.setattr(outputs, "LARGEST", 200_000)  # bytes, so that there is more than one
     assert convert(checkpoint, tmp_path / "ours") == 0
     assert back(tmp_path / "ours", tmp_path / "theirs", "--layout", layout) == 0
     for network in NETWORKS:
