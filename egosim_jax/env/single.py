@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, UInt8
 
+from egosim_jax.actions import check_action
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import Backend
 from egosim_jax.env.chunks import (
@@ -25,7 +26,7 @@ from egosim_jax.env.chunks import (
 )
 from egosim_jax.env.rewards import Outcome, RewardFn, no_reward
 from egosim_jax.env.start import Start, check_size
-from egosim_jax.episode import Episode, check_action
+from egosim_jax.episode import Episode
 from egosim_jax.simulator import Step
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError, SceneState, VideoSpec, View, check_seed

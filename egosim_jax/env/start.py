@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from egosim_jax.episode import MAX_CLIPS, Episode, load_action, save_action
+from egosim_jax.actions import load_action, save_action
+from egosim_jax.episode import MAX_CLIPS, Episode
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.images import read_image
 from egosim_jax.io.run import write_json

@@ -26,13 +26,13 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from egosim_jax.actions import check_action, load_action, save_action
 from egosim_jax.env.actions import ActionSpec, numbers
 from egosim_jax.env.backends import Backend
 from egosim_jax.env.batching import announced
 from egosim_jax.env.chunks import Chunk, last_camera, make_chunk, validity, view_of
 from egosim_jax.env.specs import spec_of, vars_of
 from egosim_jax.env.start import Start
-from egosim_jax.episode import check_action, load_action, save_action
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted import quote, quote_path, read_json

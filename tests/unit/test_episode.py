@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.episode import ORDERS, SHORTER, Episode, _bone_length, _read_ground_truth
+from egosim_jax.actions import ORDERS, SHORTER, _bone_length
+from egosim_jax.episode import Episode, _read_ground_truth
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.state.snapshot import save
 from egosim_jax.types import InputError, VideoSpec
