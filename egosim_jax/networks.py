@@ -21,6 +21,7 @@ from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
 from egosim_jax.diffusion.solver import DDIM, Euler
 from egosim_jax.diffusion.unipc import UniPC
+from egosim_jax.grid import VideoGrid
 from egosim_jax.io import weights
 from egosim_jax.models import (
     Denoiser,
@@ -37,7 +38,7 @@ from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.types import InputError, Triplet, VideoGrid, VideoSpec, check_counts
+from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
 """Role of a network in a model, which is also the stem of its file of weights."""

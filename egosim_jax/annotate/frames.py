@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from egosim_jax.data.recording import Recording
+from egosim_jax.grid import WAN_GRID
 from egosim_jax.io.untrusted import quote_path
-from egosim_jax.types import WAN_GRID, InputError, check_counts
+from egosim_jax.types import InputError, check_counts
 
 MAX_FPS = 60
 """Highest rate that is kept, in frames per second."""

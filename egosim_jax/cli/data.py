@@ -15,8 +15,9 @@ from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
 from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.command import ExitCode
+from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.progress import track
-from egosim_jax.types import WAN_GRID, VideoGrid, VideoSpec, check_counts
+from egosim_jax.types import VideoSpec, check_counts
 
 
 def _grid(name: str | None) -> VideoGrid:

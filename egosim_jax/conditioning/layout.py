@@ -22,7 +22,8 @@ from jaxtyping import Array, Float, UInt8
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.mask import Packing, pack_mask
-from egosim_jax.types import InputError, VideoGrid
+from egosim_jax.grid import VideoGrid
+from egosim_jax.types import InputError
 
 Part = Literal["noisy", "mask", "prior", "hands"]
 PACKED: dict[Packing, int] = {"space": 4, "single": 1}

@@ -29,7 +29,8 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import UInt8
 
-from egosim_jax.types import WAN_GRID, InputError, VideoGrid
+from egosim_jax.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import InputError
 
 Packing = Literal["space", "time", "single", "observed"]
 HALF_WHITE = 127

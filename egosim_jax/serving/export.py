@@ -12,12 +12,13 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.env.backends import GeneratedWorld
 from egosim_jax.env.chunks import view_of
+from egosim_jax.grid import VideoGrid
 from egosim_jax.io.untrusted import quote_path
 from egosim_jax.rendering import get
 from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.recording import Recording
 from egosim_jax.serving.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
-from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
+from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoSpec, View
 
 
 @dataclass(frozen=True, kw_only=True)

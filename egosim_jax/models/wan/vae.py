@@ -26,6 +26,7 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
+from egosim_jax.grid import VideoGrid
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.wan.vae_layers import (
     Cache,
@@ -42,7 +43,7 @@ from egosim_jax.models.wan.vae_layers import (
     init_constant_channels,
     norm,
 )
-from egosim_jax.types import InputError, VideoGrid
+from egosim_jax.types import InputError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,9 +14,10 @@ from egosim_jax import configs
 from egosim_jax.cli.data import Check, Look, Pack, Stats
 from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.grid import VideoGrid
 from egosim_jax.io.atomic import LOCK, hold_folder
 from egosim_jax.io.video import read_video
-from egosim_jax.types import InputError, VideoGrid, VideoSpec
+from egosim_jax.types import InputError, VideoSpec
 
 
 @pytest.fixture

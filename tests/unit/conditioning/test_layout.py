@@ -9,7 +9,8 @@ import pytest
 
 from egosim_jax.conditioning import ChannelLayout, Condition
 from egosim_jax.conditioning.layout import EGOSIM, WAN_INPAINT, WAN_TEXT
-from egosim_jax.types import WAN_GRID, InputError
+from egosim_jax.grid import WAN_GRID
+from egosim_jax.types import InputError
 
 GRID = (2, 3, 2, 4)
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from egosim_jax.conditioning import pack_mask
-from egosim_jax.types import InputError, VideoGrid
+from egosim_jax.grid import VideoGrid
+from egosim_jax.types import InputError
 
 
 @pytest.fixture(scope="module")

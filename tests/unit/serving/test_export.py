@@ -13,11 +13,12 @@ from PIL import Image
 from egosim_jax.cli.export import Export
 from egosim_jax.command import ExitCode
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.grid import WAN_GRID
 from egosim_jax.io.parquet import read_columns
 from egosim_jax.serving import export
 from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.store import Limits, Store
-from egosim_jax.types import WAN_GRID, InputError
+from egosim_jax.types import InputError
 from tests.painted import VIDEO, painted
 
 LOADED = """
