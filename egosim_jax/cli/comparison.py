@@ -135,14 +135,12 @@ class Options:
         **result: Any,
     ) -> Evaluation:
         """Compare, print, and write all files of the table to a folder."""
+        from egosim_jax.evaluation import page
         from egosim_jax.evaluation.files import draw, write_files
-        from egosim_jax.evaluation.page import PAGE, check_jinja, write_page
         from egosim_jax.evaluation.result import Evaluation
         from egosim_jax.evaluation.scoring import CACHE, ScoreCache, Scoring
         from egosim_jax.metrics.dreamsim import MISSING
 
-        if self.page_clips:
-            check_jinja()
         if self.page_clips < 0:
             raise InputError(
                 f"The number of clips must be at least 0, not {self.page_clips}. (--page-clips)"
@@ -160,11 +158,16 @@ class Options:
         if "dreamsim" in result["shown"] and self.dreamsim is None:
             unavailable.append(f"dreamsim: {MISSING}")
         result["shown"] = (*result["shown"], *extra)
+        paged = self.page_clips > 0 and page.can_be_written()
+        if self.page_clips and not paged:
+            unavailable.append(f"{page.PAGE}: {page.MISSING}")
         evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
         write_files(evaluation, out)
         if self.page_clips:
             draw(evaluation, out / "scores.png")
-            write_page(evaluation, methods, out / PAGE, title=title, clips=self.page_clips)
+        if paged:
+            path = out / page.PAGE
+            page.write_page(evaluation, methods, path, title=title, clips=self.page_clips)
         evaluation.print()
-        print(out / (PAGE if self.page_clips else "report.json"))
+        print(out / (page.PAGE if paged else "report.json"))
         return evaluation

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator, Sequence
 from importlib import resources
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,8 +35,8 @@ PANEL_PX = 224
 EVERY, CRF = 2, 30
 """Shown are every second frame, at this quality of x264."""
 MISSING = (
-    "A page cannot be written: it needs jinja2, which is not installed. Install "
-    "egosim-jax[metrics], or give --page-clips none."
+    "the page cannot be written: it needs jinja2, which is not installed. Install "
+    "egosim-jax[metrics]."
 )
 
 
@@ -52,12 +53,9 @@ class ShownClip(NamedTuple):
     """Title and cells of each method."""
 
 
-def check_jinja() -> None:
-    """Raise `InputError` if jinja2 is not installed."""
-    try:
-        import jinja2  # noqa: F401
-    except ImportError:
-        raise InputError(MISSING) from None
+def can_be_written() -> bool:
+    """Return whether jinja2, which a page needs, is installed."""
+    return find_spec("jinja2") is not None
 
 
 def write_page(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -73,6 +74,16 @@ def test_without_the_extra_the_column_is_absent_and_the_report_says_so(
     assert found == {"psnr", "ssim", "psnr_clip", "color_drift"}
     assert "lpips_alex" not in json.loads((run / "report.json").read_text())["splits"]["test"]
     assert "Install egosim-jax[metrics]" in capsys.readouterr().out
+
+
+def test_without_the_extra_there_is_no_page_and_the_report_says_so(clips, run, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    assert Evaluate(generated=(str(run),), metadata=clips).run() == ExitCode.DONE
+    said = capsys.readouterr().out
+    assert "index.html: the page cannot be written" in said.replace("\n", " ")
+    assert said.endswith(f"{run / 'report.json'}\n")
+    assert (run / "scores.png").exists()
+    assert not (run / "index.html").exists()
 
 
 def test_the_baselines_are_prior_fitted_prior_and_first_frame(clips, run):
