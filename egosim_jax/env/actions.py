@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from egosim_jax.env.placed import with_places
 from egosim_jax.io.untrusted import quote
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import Side, joints_of
@@ -175,15 +176,16 @@ class ActionSpec:
         """Return the action of a row per frame, and which hands are hidden.
 
         `camera` is the first camera of the episode. A hand that never comes near the view is an
-        `InputError`, or with `hide` is given as missing.
+        `InputError`, or with `hide` is given as missing, in an action that knows its place.
         """
         cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
         joints = self.joints(rows)
         lost = np.zeros(len(self.sides), bool)
         if hide:
             lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
-        joints = np.where(lost[None, :, None, None], np.nan, joints)
-        return Action(cameras=cameras, joints_m=joints, kind=self.kind, prompt=prompt), lost
+        seen = np.where(lost[None, :, None, None], np.nan, joints)
+        action = Action(cameras=cameras, joints_m=seen, kind=self.kind, prompt=prompt)
+        return with_places(action, joints) if lost.any() else action, lost
 
     def joints(self, rows: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n j 3"]:
         """Return the joints of each row's hands in the world, in meters."""

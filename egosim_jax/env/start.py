@@ -3,7 +3,8 @@
 state/          scene (state/snapshot.py)
 start.json      camera, row, prompt, seed, clips since the seed, kinds of past actions
 first_frame.png first frame without hands, if it is known
-past/1.npz ...  actions that led here from the seed, which the true world repeats
+past/1.npz ...  actions that led here from the seed, which the true world repeats; one with a hand
+                out of view has that hand's joints in 1_hands.npz
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from egosim_jax.actions import load_action, save_action
+from egosim_jax.env.placed import load_placed, save_placed
 from egosim_jax.episode import MAX_CLIPS, Episode
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.images import read_image
@@ -86,7 +87,7 @@ class Start:
             if self.first_frame is not None:
                 Image.fromarray(self.first_frame).save(temporary / FIRST_FRAME)
             for number, action in enumerate(self.past, start=1):
-                save_action(temporary / "past" / f"{number}.npz", action)
+                save_placed(temporary / "past", str(number), action)
             write_json(
                 temporary / DESCRIPTION,
                 {
@@ -131,7 +132,7 @@ class Start:
             row=np.array(written["row"], float) if written["row"] else None,
             first_frame=read_image(image) if image.exists() else None,
             past=tuple(
-                load_action(folder / "past" / f"{number}.npz", kind=kind, size=size, prompt=prompt)
+                load_placed(folder / "past", str(number), kind=kind, size=size, prompt=prompt)
                 for number, (kind, prompt) in enumerate(written["past"], start=1)
             ),
         )

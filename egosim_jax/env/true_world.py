@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import tabletop_start
+from egosim_jax.env.placed import places_of
 from egosim_jax.env.start import Start
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.perception.oracle import OracleConfig
@@ -87,7 +88,7 @@ class TrueWorld:
             scene = opening(start.seed, spec=self.video, kind=kind)[0]
             world = World(scene=scene, seed=start.seed)
         for action in start.past[known:]:
-            world = world.move(action)[1]
+            world = world.move(action, joints_m=places_of(action))[1]
         with self._changing:
             self._worlds[keys[-1]] = world
             self._worlds.move_to_end(keys[-1])
@@ -115,7 +116,8 @@ class _Execution:
     def clip(self, action: Action) -> TabletopClip:
         """Return the clip of an action."""
         if self._made is None or self._made[0] is not action:
-            clip, _ = self.world.after(self.start, action.kind).execute(action)
+            world = self.world.after(self.start, action.kind)
+            clip, _ = world.execute(action, joints_m=places_of(action))
             self._made = action, clip
         return self._made[1]
 
