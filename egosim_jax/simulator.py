@@ -9,6 +9,7 @@ Source: EgoSim, equations 1 and 2 and section 3.4.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -30,6 +31,17 @@ class VideoGenerator(Protocol):
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
         """Generate the frames of a clip, as many and as large as those of the view."""
+        ...
+
+
+@runtime_checkable
+class StreamedGenerator(VideoGenerator, Protocol):
+    """Generator of videos whose first frames are known before the last ones."""
+
+    def stream(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the frames of a clip in groups, in their order."""
         ...
 
 
@@ -59,6 +71,8 @@ class Simulator:
     """Size of the points in the view, in pixels; what the generator was trained with."""
     fusion: Fusion = field(default_factory=Fusion)
     """Settings of the fusion."""
+    show: Callable[[UInt8[np.ndarray, "g h w 3"]], None] | None = None
+    """Function that gets the frames of a clip in groups, as soon as they are known."""
 
     @property
     def renderer(self) -> Renderer:
@@ -101,10 +115,26 @@ class Simulator:
     ) -> Clip:
         """Generate the clip of an action. Raises `InputError` if its shape is not the view's."""
         image = view.frames[0] if first_frame is None else first_frame
-        frames = np.asarray(self.generator(view, action, image, seed))
+        frames = np.asarray(self._frames(view, action, image, seed))
         if frames.shape != view.frames.shape or frames.dtype != np.uint8:
             raise InputError(
                 f"The generator returned {frames.dtype} {frames.shape} for a view of uint8 "
                 f"{view.frames.shape}: it must return as many frames of the same size."
             )
         return Clip(frames=frames, fps=self.fps)
+
+    def _frames(
+        self, view: View, action: Action, image: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return the generator's frames; show them, all at once if it does not stream."""
+        if self.show is None:
+            return self.generator(view, action, image, seed)
+        if not isinstance(self.generator, StreamedGenerator):
+            frames = self.generator(view, action, image, seed)
+            self.show(frames)
+            return frames
+        groups = []
+        for frames in self.generator.stream(view, action, image, seed):
+            self.show(frames)
+            groups.append(frames)
+        return np.concatenate(groups)

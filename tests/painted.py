@@ -18,7 +18,7 @@ from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import GeneratedWorld, tabletop_start
 from egosim_jax.env.batching import Batcher
 from egosim_jax.rendering import reference
-from egosim_jax.types import Clip, VideoSpec
+from egosim_jax.types import VideoSpec
 
 VIDEO = VideoSpec(frames=5, height=32, width=48, fps=8)
 
@@ -50,13 +50,14 @@ class BatchPainter(Painter):
     def condition(self, view, action, first_frame):
         return view, action
 
-    def generate(self, conditions, seeds):
+    def groups(self, conditions, seeds):
         time.sleep(self.pause)
         print(f"a batch of {len(seeds)}", file=sys.stderr, flush=True)
-        return [
-            Clip(frames=self.paint(*condition, seed), fps=VIDEO.fps)
-            for condition, seed in zip(conditions, seeds, strict=True)
-        ]
+        pairs = zip(conditions, seeds, strict=True)
+        frames = np.stack([self.paint(*condition, seed) for condition, seed in pairs])
+        yield frames[:, :1]
+        time.sleep(self.pause)
+        yield frames[:, 1:]
 
 
 class PaintedWorld(GeneratedWorld):

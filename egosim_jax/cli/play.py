@@ -83,11 +83,11 @@ class Play:
 
         def begin(seed: int) -> Played:
             check_seed(seed, name="table")
-            return Played(streamer, world, self.out, world.start(seed, spec), self.hand)
+            return Played(world, self.out, world.start(seed, spec), self.hand)
 
         with lock_folder(self.out):
             server = self._serve()
-            Page(server, begin, Played(streamer, world, self.out, start, self.hand))
+            Page(server, begin, Played(world, self.out, start, self.hand))
             print(f"http://127.0.0.1:{server.get_port()}", flush=True)
             _wait()
             server.stop()

@@ -48,6 +48,7 @@ def backend_of(
     from egosim_jax import configs
     from egosim_jax.env.backends import GeneratedWorld
     from egosim_jax.env.batching import Batcher
+    from egosim_jax.env.streaming import Streamer
     from egosim_jax.env.true_world import TrueWorld
     from egosim_jax.generator import Generator
     from egosim_jax.sharding import make_mesh, parts
@@ -61,7 +62,7 @@ def backend_of(
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
     folder = configs.weights_of(config, None if weights is None else Path(weights))
-    generator = Generator.load(model, folder, mesh=mesh)
+    generator = Streamer(Generator.load(model, folder, mesh=mesh), mesh)
     unit = parts("batch", mesh)
     batcher = Batcher(generator, most=max(batch, unit), unit=unit)
     for size in batcher.sizes if compile else ():

@@ -11,22 +11,23 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple, Protocol, runtime_checkable
+from queue import SimpleQueue
+from typing import Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.rendering import Renderer
 from egosim_jax.simulator import VideoGenerator
-from egosim_jax.types import Action, Clip, InputError, Triplet, View, check_counts, check_seed
+from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
 
 
 @runtime_checkable
 class BatchGenerator(VideoGenerator, Protocol):
-    """Generator of several clips in one program (`generator.Generator`)."""
+    """Generator of several clips in one program (`streaming.Streamer`)."""
 
     renderer: Renderer
 
@@ -36,8 +37,10 @@ class BatchGenerator(VideoGenerator, Protocol):
         """Return the conditions of a clip."""
         ...
 
-    def generate(self, triplets: Sequence[Triplet], seeds: Sequence[int]) -> list[Clip]:
-        """Generate a clip for each triplet."""
+    def groups(
+        self, triplets: Sequence[Triplet], seeds: Sequence[int]
+    ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
+        """Yield the frames of a clip of each triplet in groups, as they are decoded."""
         ...
 
     def fingerprint(self) -> str:
@@ -45,15 +48,37 @@ class BatchGenerator(VideoGenerator, Protocol):
         ...
 
 
-class _Request(NamedTuple):
+@no_type_check
+@dataclass(eq=False, kw_only=True)
+class _Request:
+    """Clip that a caller waits for, and its frames as they come."""
+
     triplet: Triplet
     seed: int
-    since: float
-    result: Future[UInt8[np.ndarray, "f h w 3"]]
+    since: float = field(default_factory=time.monotonic)
+    _groups: SimpleQueue = field(default_factory=SimpleQueue)
+    _sent: int = 0
+
+    def send(self, number: int, frames: UInt8[np.ndarray, "g h w 3"]) -> None:
+        """Pass a group on, unless the caller has it from an earlier run of its clip."""
+        if number == self._sent:
+            self._groups.put(frames)
+            self._sent += 1
+
+    def end(self, error: Exception | None = None) -> None:
+        """Let the caller continue after the last group, or raise an error there."""
+        self._groups.put(error)
+
+    def receive(self) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the groups, in the caller's thread."""
+        while (found := self._groups.get()) is not None:
+            if isinstance(found, Exception):
+                raise found
+            yield found
 
 
 class Batcher:
-    """Generator that gathers the clips of several threads (`simulator.VideoGenerator`)."""
+    """Generator that gathers the clips of several threads (`simulator.StreamedGenerator`)."""
 
     def __init__(
         self, generator: BatchGenerator, *, most: int = 8, unit: int = 1, wait_s: float = 0.05
@@ -113,16 +138,21 @@ class Batcher:
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
         """Generate one clip together with those of other threads."""
+        return np.concatenate(list(self.stream(view, action, first_frame, seed)))
+
+    def stream(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the frames of one clip in groups, as the program of its batch decodes them."""
         check_seed(seed, name="seed")
-        triplet = self._generator.condition(view, action, first_frame)
-        request = _Request(triplet, seed, time.monotonic(), Future())
+        request = _Request(triplet=self._generator.condition(view, action, first_frame), seed=seed)
         with self._changed:
             if self._closed:
                 raise InputError("The generator is closed: it takes no more clips.")
             self._waiting.append(request)
             self._changed.notify_all()
         self._arrive()
-        return request.result.result()
+        yield from request.receive()
 
     def close(self) -> None:
         """Generate what waits, then end."""
@@ -156,19 +186,22 @@ class Batcher:
         size = min(n for n in self.sizes if n >= len(batch))
         padded = [*batch, *[batch[-1]] * (size - len(batch))]
         try:
-            clips = self._generator.generate(
+            groups = self._generator.groups(
                 [request.triplet for request in padded], [request.seed for request in padded]
             )
+            for number, group in enumerate(groups):
+                for request, frames in zip(batch, group, strict=False):
+                    request.send(number, frames)
         except Exception as error:
             if len(batch) == 1:
-                batch[0].result.set_exception(error)
+                batch[0].end(error)
                 return
             for request in batch:  # so that one clip's failure is not the others'
                 self._run([request])
             return
         self.runs[size] += 1
-        for request, clip in zip(batch, clips, strict=False):
-            request.result.set_result(clip.frames)
+        for request in batch:
+            request.end()
 
 
 def announced(generator: VideoGenerator) -> AbstractContextManager[None]:

@@ -1,26 +1,25 @@
-"""Clips that are shown while they are decoded.
+"""Clips whose frames are known as they are decoded.
 
 A causal video VAE decodes one latent frame after the other, so the first frames of a clip are known
-before the last ones are decoded.
+before the last ones are decoded. The frames are those that decoding the whole clip gives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, UInt8
 
 from egosim_jax.conditioning.video import to_uint8
 from egosim_jax.generator import Generator
 from egosim_jax.program import CompiledFn
-from egosim_jax.types import Action, InputError, View, check_seed
-
-Frames = UInt8[np.ndarray, "g h w 3"]
+from egosim_jax.types import Action, Triplet, View, check_seed
 
 
 @runtime_checkable
@@ -35,19 +34,18 @@ class CausalCodec(Protocol):
 
 
 class Streamer:
-    """Generator of single clips that shows frames as they are decoded (`VideoGenerator`)."""
+    """Generator that yields frames as they are decoded (`simulator.StreamedGenerator`)."""
 
-    def __init__(self, generator: Generator, show: Callable[[Frames], None] = lambda _: None):
-        """`show` is called with groups of frames in their order; it can be replaced at any time."""
-        vae = generator.networks.vae
-        if not isinstance(vae, CausalCodec):
-            raise InputError(
-                f"{generator.config.name} cannot be streamed: its video VAE must decode frame by "
-                "frame, as Wan's does. (--config)"
-            )
-        self.show, self.renderer = show, generator.renderer
+    def __init__(self, generator: Generator, mesh: Mesh | None = None):
+        """`mesh` is the generator's. A VAE that is not causal gives all frames at once."""
+        self.renderer = generator.renderer
         self._generator = generator
-        self._next = CompiledFn(_decode_next, vae, cache_key=("decode next", generator.config))
+        vae = generator.networks.vae
+        self._next = (
+            CompiledFn(_decode_next, vae, mesh=mesh, cache_key=("decode next", generator.config))
+            if isinstance(vae, CausalCodec)
+            else None
+        )
 
     @cached_property
     def _fingerprint(self) -> str:
@@ -57,40 +55,55 @@ class Streamer:
         """Return the generator's content hash: streaming is no property of a clip."""
         return self._fingerprint
 
-    def compile(self) -> None:
-        """Compile all functions before the first clip."""
-        *_, (_, decode, given) = self._generator.programs(1)
-        for _, program, shapes in self._generator.programs(1):
-            if program is not decode:
-                program.compile(*shapes)
-        (whole,) = given
-        latents = jax.ShapeDtypeStruct((1, 1, *whole.shape[2:]), whole.dtype)
+    def compile(self, batch: int = 1) -> None:
+        """Compile all functions for batches of this size before the first clip."""
+        if self._next is None:
+            self._generator.compile(batch)
+            return
+        *others, (_, _, (whole,)) = self._generator.programs(batch)
+        for _, program, shapes in others:
+            program.compile(*shapes)
+        latents = jax.ShapeDtypeStruct((batch, 1, *whole.shape[2:]), whole.dtype)
         cache = None
         for _ in range(min(3, whole.shape[1])):
             self._next.compile(latents, cache)
             cache = self._next.shapes(latents, cache)[1]
 
-    def __call__(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Generate one clip; show its frames as they are decoded."""
-        check_seed(seed, name="seed")
-        parts = []
-        for frames in self.stream(view, action, first_frame, seed):
-            self.show(frames)
-            parts.append(frames)
-        return np.concatenate(parts)
+    def condition(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
+    ) -> Triplet:
+        """Return the conditions of a clip. Raises what `Generator.condition` raises."""
+        return self._generator.condition(view, action, first_frame)
+
+    def groups(
+        self, triplets: Sequence[Triplet], seeds: Sequence[int]
+    ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
+        """Yield the frames of a clip of each triplet: one, then four for each latent frame.
+
+        Raises what `Generator.generate` raises, before the first group.
+        """
+        if self._next is None:
+            clips = self._generator.generate(triplets, seeds)
+            yield np.stack([clip.frames for clip in clips])
+            return
+        latents, cache = self._generator.latents(triplets, seeds), None
+        for number in range(latents.shape[1]):
+            frames, cache = self._next(latents[:, number : number + 1], cache)
+            yield np.asarray(frames)
 
     def stream(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> Iterator[Frames]:
-        """Yield the frames of one clip in groups: one, then four for each latent frame."""
-        triplet = self._generator.condition(view, action, first_frame)
-        latents = self._generator.latents([triplet], [seed])
-        cache = None
-        for number in range(latents.shape[1]):
-            frames, cache = self._next(latents[:, number : number + 1], cache)
-            yield np.asarray(frames)[0]
+    ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the frames of one clip in groups."""
+        check_seed(seed, name="seed")
+        for frames in self.groups([self.condition(view, action, first_frame)], [seed]):
+            yield frames[0]
+
+    def __call__(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        """Generate one clip."""
+        return np.concatenate(list(self.stream(view, action, first_frame, seed)))
 
 
 def _decode_next(

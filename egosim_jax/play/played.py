@@ -22,7 +22,6 @@ from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import GeneratedWorld
 from egosim_jax.env.chunks import view_of
 from egosim_jax.env.start import Start, check_size
-from egosim_jax.env.streaming import Streamer
 from egosim_jax.episode import Episode
 from egosim_jax.play.moves import Pose, first_goal, ready, remembered
 from egosim_jax.serving.session import Session
@@ -71,15 +70,10 @@ class Timing:
 class Played:
     """Episode in progress; one thread at a time may change it."""
 
-    def __init__(
-        self, streamer: Streamer, world: GeneratedWorld, folder: Path, start: Start, side: Side
-    ):
-        """Begin an episode, recorded in a new session of a folder.
-
-        `streamer` is the generator of the world.
-        """
+    def __init__(self, world: GeneratedWorld, folder: Path, start: Start, side: Side):
+        """Begin an episode, recorded in a new session of a folder."""
         check_size(start, world.video)
-        self.world, self._streamer = world, streamer
+        self.world = world
         self.side: Side = side
         self.scene = _true_scene(start, world)
         self.goal = None if self.scene is None else first_goal(self.scene, side)
@@ -160,8 +154,7 @@ class Played:
             show(frames, last)
             times.append(time.monotonic() - then)
 
-        self._streamer.show = shown
-        result = self.session.step(number, rows, caption)
+        result = self.session.step(number, rows, caption, shown)
         self.moments[self.at + 1 :] = [
             Moment(
                 start=self.session.now,

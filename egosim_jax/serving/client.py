@@ -3,20 +3,25 @@
 with Client("ws://127.0.0.1:8000") as client:
     session = client.create(seed=3)
     reply = session.step(rows)          # {"frames": ..., "row": ..., "info": ...}
+    reply = session.step(rows, show=lambda frames: ...)     # in groups, as they are decoded
 """
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from egosim_jax.serving import wire
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.types import InputError
 
+Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
+"""Function that gets the frames of a step in groups, as they are decoded."""
 REPEATABLE = ("step", "reset", "save", "load", "status")
 """Requests that have the same effect when they are sent again after a timeout."""
 
@@ -74,16 +79,17 @@ class Client:
             retry_after_s=error.get("retry_after_s"),
         )
 
-    def request(self, kind: str, /, **fields: Any) -> dict[str, Any]:
+    def request(self, kind: str, /, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
         """Return the reply to a request. Raises `RequestError` with the server's message.
 
+        `show` gets the frames of a step that is streamed, before its reply.
         If it is interrupted, or waits too long, the connection is closed: connect and attach again.
         """
         message = wire.pack({"request": kind, **fields})
         until = time.monotonic() + self._patience_s
         while True:
             try:
-                return self._ask(message)
+                return self._ask(message, show)
             except RequestError as error:
                 wait = error.retry_after_s
                 late = error.code in ("timeout", "part_restarts") and kind in REPEATABLE
@@ -92,16 +98,19 @@ class Client:
                     raise
             time.sleep(wait)
 
-    def _ask(self, message: bytes) -> dict[str, Any]:
+    def _ask(self, message: bytes, show: Show | None) -> dict[str, Any]:
         try:
             self._socket.send(message)
-            reply = self._received()
+            reply = wire.unpack(self._received())
+            while show is not None and "first_frame" in reply:
+                show(reply["frames"])
+                reply = wire.unpack(self._received())
         except RequestError:
             raise
         except BaseException:  # a late reply would be taken for that to the next request
             self.close()
             raise
-        return wire.unpack(reply)
+        return reply
 
     def create(self, **fields: Any) -> RemoteSession:
         """Create a session of a `seed` or `episode`."""
@@ -123,11 +132,17 @@ class RemoteSession:
         self.step_id: int = reply["step_id"]
         """Last committed step."""
 
-    def step(self, rows: np.ndarray, **fields: Any) -> dict[str, Any]:
-        """Make the next step."""
-        rows = np.asarray(rows, float)
+    def step(self, rows: np.ndarray, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
+        """Make the next step.
+
+        `show` gets its frames in groups as they are decoded, before the step is perceived and
+        committed; a step that the server has made already, or makes already, is not shown.
+        """
+        fields = {"actions": np.asarray(rows, float), **fields}
+        if show is not None:
+            fields["stream"] = True
         reply = self._client.request(
-            "step", session=self.id, step_id=self.step_id + 1, actions=rows, **fields
+            "step", show=show, session=self.id, step_id=self.step_id + 1, **fields
         )
         if (reply["session"], reply["step_id"]) != (self.id, self.step_id + 1):
             raise InputError(

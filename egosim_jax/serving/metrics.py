@@ -20,6 +20,12 @@ class Metrics:
         self.refused = Counter(
             "egosim_refused", "Requests that were refused.", ["code"], registry=registry
         )
+        self.first_frames = Histogram(
+            "egosim_first_frames_seconds",
+            "Seconds from a streamed step's request until its first frames are sent.",
+            buckets=SECONDS,
+            registry=registry,
+        )
         self.seconds = Histogram(
             "egosim_request_seconds",
             "Seconds of a request in its thread.",

@@ -13,8 +13,8 @@ import asyncio
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncGenerator, Iterator, Mapping, Sequence
+from contextlib import aclosing, contextmanager
 from dataclasses import dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +26,7 @@ from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
 from egosim_jax.serving.errors import RequestError
 from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.server import make_app
-from egosim_jax.serving.service import FIELDS, open_service, refusal
+from egosim_jax.serving.service import FIELDS, is_streamed, open_service, refusal
 from egosim_jax.serving.store import Limits
 from egosim_jax.types import InputError, check_counts
 
@@ -143,6 +143,15 @@ class Part:
         except Exception as error:
             return {"error": self._service.refused(error).body()}
 
+    async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield each `reply` to a streamed step, or the `error` for the client."""
+        async with aclosing(self._service.replies(message)) as replies:
+            try:
+                async for reply in replies:
+                    yield {"reply": reply}
+            except Exception as error:
+                yield {"error": self._service.refused(error).body()}
+
     def __del__(self) -> None:
         """Finish the steps under way; Ray calls it before it stops a replica."""
         if hasattr(self, "_service"):
@@ -185,23 +194,20 @@ class Entrance:
             message = {**message, "session": session}
         return await self._ask(part_of(str(session), len(self._parts)), message)
 
-    async def _ask(self, number: int, message: Any) -> dict[str, Any]:
-        from ray.exceptions import RayError
+    async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the reply of the part that has the session, after frames that it streams."""
+        if not is_streamed(message):
+            yield await self.handle(message)
+            return
+        number = part_of(str(message.get("session")), len(self._parts))
+        with _restarts(number):
+            streamed = self._parts[number].replies.options(stream=True).remote(message)
+            async for found in streamed:
+                yield _opened(found)
 
-        try:
-            found = await self._parts[number].handle.remote(message)
-        except RayError as error:
-            raise RequestError(
-                503,
-                "part_restarts",
-                f"The replica of part {number} has stopped; Ray starts it again and it resumes its "
-                "sessions. Send the same request again.",
-                retry_after_s=5.0,
-            ) from error
-        if "error" in found:
-            body = dict(found["error"])
-            raise RequestError(body.pop("status"), body.pop("code"), body.pop("message"), **body)
-        return found["reply"]
+    async def _ask(self, number: int, message: Any) -> dict[str, Any]:
+        with _restarts(number):
+            return _opened(await self._parts[number].handle.remote(message))
 
     async def _status(self, message: Mapping[str, Any]) -> dict[str, Any]:
         """Return the sessions of all parts."""
@@ -212,6 +218,31 @@ class Entrance:
             "damaged": [name for reply in found for name in reply["damaged"]],
             "draining": any(reply["draining"] for reply in found),
         }
+
+
+@contextmanager
+def _restarts(number: int) -> Iterator[None]:
+    """Turn the error of Ray for a part that has stopped into that for the client."""
+    from ray.exceptions import RayError
+
+    try:
+        yield
+    except RayError as error:
+        raise RequestError(
+            503,
+            "part_restarts",
+            f"The replica of part {number} has stopped; Ray starts it again and it resumes its "
+            "sessions. Send the same request again.",
+            retry_after_s=5.0,
+        ) from error
+
+
+def _opened(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the reply that a part has sent. Raises its error."""
+    if "error" in found:
+        body = dict(found["error"])
+        raise RequestError(body.pop("status"), body.pop("code"), body.pop("message"), **body)
+    return found["reply"]
 
 
 def app(args: dict[str, str]) -> Any:

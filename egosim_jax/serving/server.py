@@ -1,8 +1,9 @@
 """HTTP and websocket server of sessions: FastAPI on uvicorn.
 
 The websocket at / speaks OpenPI's protocol: the server sends a map that describes it, then each
-binary message is a request and gets one reply, a map as a binary message or an error as text. HTTP
-has the same requests as JSON. All that is refused has a status, a code and a message.
+binary message is a request and gets one reply, a map as a binary message or an error as text; only
+a step that asks for it gets its frames first. HTTP has the same requests as JSON. All that is
+refused has a status, a code and a message.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import asyncio
 import json
 import socket
 import threading
-from contextlib import AbstractContextManager
+from collections.abc import AsyncGenerator
+from contextlib import AbstractContextManager, aclosing
 from importlib import metadata
 from typing import Annotated, Any, Protocol, runtime_checkable
 
@@ -71,6 +73,10 @@ class Requests(Protocol):
 
     async def handle(self, message: Any) -> dict[str, Any]:
         """Return the reply to a request."""
+        ...
+
+    def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the reply to a request, after the frames of a step that is streamed."""
         ...
 
 
@@ -225,11 +231,19 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
         if data is None:
             raise InputError("The message is text: it must be binary, packed as MessagePack.")
         message = await asyncio.to_thread(wire.unpack, data, limit=wire.MAX_BYTES)
-        reply = await asyncio.to_thread(wire.pack, await service.handle(message))
     except Exception as error:
         await socket.send_text(json.dumps(service.refused(error).body()))
         return
-    await socket.send_bytes(reply)
+    async with aclosing(service.replies(message)) as replies:
+        while True:
+            try:
+                reply = await asyncio.to_thread(wire.pack, await anext(replies))
+            except StopAsyncIteration:
+                return
+            except Exception as error:
+                await socket.send_text(json.dumps(service.refused(error).body()))
+                return
+            await socket.send_bytes(reply)
 
 
 class _Server(uvicorn.Server):

@@ -1,14 +1,15 @@
-"""Requests of clients by websocket or HTTP: a map in, a map out."""
+"""Requests of clients by websocket or HTTP: a map in, a map out; before it maps of frames."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
 import threading
+import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncGenerator, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from importlib import metadata
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import UInt8
 
 from egosim_jax.env import World, backend_of
 from egosim_jax.env.actions import LAYOUTS
@@ -33,7 +35,7 @@ T = TypeVar("T")
 OBSERVATIONS = ("frames", "depth", "keypoints", "state")
 FIELDS = {
     "create": ("session", "seed", "prompt", "episode", "actions", "observe"),
-    "step": ("session", "step_id", "actions", "prompt", "observe"),
+    "step": ("session", "step_id", "actions", "prompt", "observe", "stream"),
     "reset": ("session", "seed", "prompt", "episode", "observe"),
     "save": ("session", "name"),
     "load": ("session", "name", "observe"),
@@ -105,6 +107,11 @@ class Service:
     async def handle(self, message: Any) -> dict[str, Any]:
         """Return the reply to a request. Raises what `refused` returns for the client."""
         name, request = _parsed(message)
+        if is_streamed(message):
+            raise InputError(
+                "stream is true, and this request has one reply: frames are streamed over the "
+                "websocket only. Connect there, or leave stream out. (stream)"
+            )
         observe = _observe(request.get("observe", ["frames"]))
         store = self.store
         if name == "status":
@@ -126,6 +133,44 @@ class Service:
         if name == "step":
             store.metrics.steps.inc()
         return await self._reply(session, result, observe)
+
+    async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the reply to a request, after the frames of a step that is streamed.
+
+        A step that was made before, or is under way already, has the reply alone.
+        """
+        if not is_streamed(message):
+            yield await self.handle(message)
+            return
+        then, times = time.monotonic(), []
+        request = _parsed(message)[1]
+        observe = _observe(request.get("observe", ["frames"]))
+        groups: asyncio.Queue[UInt8[np.ndarray, "g h w 3"] | None] = asyncio.Queue()
+        loop = asyncio.get_running_loop()
+
+        def show(frames: UInt8[np.ndarray, "g h w 3"]) -> None:
+            with suppress(RuntimeError):  # the loop has ended: the step is finished without it
+                loop.call_soon_threadsafe(groups.put_nowait, frames)
+
+        session, future = self.store.get(request.get("session")), self.store.step(request, show)
+        made = asyncio.ensure_future(self._wait(future))
+        made.add_done_callback(lambda _: groups.put_nowait(None))
+        try:
+            first = 0
+            while (frames := await groups.get()) is not None:
+                group = {"session": session.id, "step_id": int(request["step_id"])}
+                yield {**group, "first_frame": first, "frames": frames}
+                times.append(time.monotonic() - then)
+                first += len(frames)
+            result = await made
+        finally:
+            made.cancel()  # of a client that has vanished; the step continues
+        self.metrics.steps.inc()
+        reply = await self._reply(session, result, observe)
+        if times:
+            self.metrics.first_frames.observe(times[0])
+            reply["timing"] = {"first_frames_s": times[0], "last_frames_s": times[-1]}
+        yield reply
 
     def status(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Return where a session is, or without one the sessions of the server."""
@@ -183,6 +228,18 @@ class Service:
             view = await self._wait(self.store.submit(render, bounded=False))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
+
+
+def is_streamed(message: Any) -> bool:
+    """Return True if a request is a step whose frames are asked for as they are decoded.
+
+    Raises `InputError` if it does not say so by true or false.
+    """
+    if not isinstance(message, dict) or message.get("request") != "step":
+        return False
+    if not isinstance(stream := message.get("stream", False), bool):
+        raise InputError(f"stream is {quote(stream)}: it must be true or false. (stream)")
+    return stream
 
 
 def refusal(error: Exception, metrics: Metrics) -> RequestError:

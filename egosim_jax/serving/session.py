@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,6 +44,8 @@ from egosim_jax.types import Action, Cameras, InputError, SceneState
 SETTINGS, CLOSED = "session.json", "closed.json"
 INFO, REQUEST, ACTION = "info.json", "request.json", "action.npz"
 FIRST = "first"
+Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
+"""Function that gets the frames of a step in groups, as soon as they are known."""
 DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
 """Errors of reading a session whose files are damaged."""
 
@@ -202,10 +204,13 @@ class Session:
         starts = [int(p.name) for p in (self.folder / "starts").iterdir() if p.name.isdigit()]
         return self.folder / "starts" / str(max(n for n in starts if n < number))
 
-    def step(self, step_id: int, rows: object, prompt: str | None) -> Result:
+    def step(
+        self, step_id: int, rows: object, prompt: str | None, show: Show | None = None
+    ) -> Result:
         """Make a step, or return the result of the same one that was made before.
 
-        Raises `RequestError` for a step out of order, or for another action under a used number.
+        The frames of a step that is made are shown, those of a repeated one are not. Raises
+        `RequestError` for a step out of order, or for another action under a used number.
         """
         request = request_hash(rows, prompt)
         if step_id <= self.committed:
@@ -221,7 +226,7 @@ class Session:
         chunk = make_chunk(self.actions, rows, start=now, frames=video.frames, prompt=prompt)
         check_action(chunk.action, state=now.state, fps=video.fps, continued=True)
         self._accept(step_id, chunk, request)
-        return self.finish()
+        return self.finish(show)
 
     def _again(self, step_id: int, request: str) -> Result:
         if self.request(step_id) != request:
@@ -247,22 +252,22 @@ class Session:
         write_json(folder / REQUEST, about)
         save_action(folder / ACTION, chunk.action)
 
-    def finish(self) -> Result:
+    def finish(self, show: Show | None = None) -> Result:
         """Make the step whose request is on disk, from its last finished phase; commit it.
 
         After an error the request is removed.
         """
         try:
-            self.result = self._made = self._finished(self.committed + 1)
+            self.result = self._made = self._finished(self.committed + 1, show)
         except Exception:
             self._drop(self.committed + 1)
             raise
         self.committed += 1
         return self.result
 
-    def _finished(self, number: int) -> Result:
+    def _finished(self, number: int, show: Show | None) -> Result:
         folder, action, now = self._step(number), self.action(number), self.now
-        simulator = self.backend.simulator(now)
+        simulator = replace(self.backend.simulator(now), show=show)
         with announced(simulator.generator):
             (step,) = Rollout(simulator, folder / "rollout").run(
                 now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame

@@ -32,6 +32,7 @@ from egosim_jax.serving.session import (
     SETTINGS,
     Result,
     Session,
+    Show,
     check_world,
     request_hash,
 )
@@ -206,8 +207,8 @@ class Store:
         check_size(start, self.backend.video)
         return start if prompt is None else replace(start, prompt=prompt)
 
-    def step(self, request: Mapping[str, Any]) -> Future[Result]:
-        """Queue a step of a session."""
+    def step(self, request: Mapping[str, Any], show: Show | None = None) -> Future[Result]:
+        """Queue a step of a session, whose frames are shown unless it is a repeated one."""
         session = self.get(request.get("session"))
         step_id, prompt = _whole(request.get("step_id"), "step_id"), _prompt(request)
         if step_id < 1:
@@ -228,7 +229,7 @@ class Store:
         key = step_id, request_hash(rows, prompt)
         if flight is not None and flight[0] == key and not flight[1].done():
             return flight[1]  # a client that vanished and came back waits for its step
-        run = partial(session.step, step_id, rows, prompt)
+        run = partial(session.step, step_id, rows, prompt, show)
         if step_id <= session.committed:
             return self.submit(run)
         future = self.submit(run, changes=session)

@@ -41,6 +41,7 @@ def _messages() -> dict[str, dict[str, Any]]:
     return {
         "create": {"request": "create", "seed": 7, "actions": {"layout": "gripper"}, "prompt": "x"},
         "step": {"request": "step", "step_id": 1, "actions": rows, **own},
+        "stream": {"request": "step", "step_id": 1, "actions": rows, "stream": True, **own},
         "json_step": {"request": "step", "step_id": 1, "actions": rows.tolist(), **own},
         "reset": {"request": "reset", "seed": 3, **own},
         "save": {"request": "save", "session": SESSION, "name": "a"},
@@ -82,8 +83,7 @@ def _send(data: bytes, *, json: bool) -> str:
         store.create({"session": SESSION, "seed": 3})
     try:
         message = wire.unpack_json(data) if json else wire.unpack(data, limit=wire.MAX_BYTES)
-        reply = asyncio.run(service.handle(message))
-        wire.pack_json(reply) if json else wire.pack(reply)
+        asyncio.run(_reply(service, message, json=json))
     except RequestError as error:
         if error.code == "internal":
             raise (error.__cause__ or error) from None
@@ -95,6 +95,15 @@ def _send(data: bytes, *, json: bool) -> str:
         for name in set(store.sessions) - {SESSION, WATCH}:
             store.remove({"session": name}).result()
     return "done"
+
+
+async def _reply(service: Any, message: Any, *, json: bool) -> None:
+    """Pack what a client gets: over HTTP one reply, over the websocket also frames before it."""
+    if json:
+        wire.pack_json(await service.handle(message))
+        return
+    async for reply in service.replies(message):
+        wire.pack(reply)
 
 
 TARGETS = [

@@ -15,9 +15,13 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from egosim_jax.serving.client import Client
 
 ROOT = Path(__file__).parents[2]
 STEPS = 4
@@ -174,6 +178,43 @@ def test_clients_continue_after_a_kill_to_the_same_states(tmp_path, kind):
     before, after, killed = kill_and_continue(kind, command, tmp_path)
     check_kept(before, after, killed)
     assert after == straight(kind, command, tmp_path)
+
+
+@pytest.mark.slow
+def test_two_streams_of_a_batch_come_as_they_are_decoded_and_survive_a_kill(tmp_path):
+    command = ["tests.painted", "--pause", "0.5", "--batch", "2"]
+    server, known = Server(tmp_path, command), {}
+
+    def stream(name, step_id, shown):
+        with Client(f"ws://127.0.0.1:{server.port}") as one:
+            session = one.create(session=name, seed=3) if step_id == 1 else one.attach(name)
+            known[name] = session.reply.get("row", known.get(name))
+            rows = np.tile(known[name], (4, 1)) + 0.01 * step_id
+            return session.step(rows, show=shown.append)
+
+    shown = {name: [] for name in "ab"}
+    with ThreadPoolExecutor(2) as threads:
+        replies = [threads.submit(stream, name, 1, shown[name]) for name in "ab"]
+        for name, reply in zip("ab", replies, strict=True):
+            found = reply.result()
+            np.testing.assert_array_equal(np.concatenate(shown[name]), found["frames"])
+            times = found["timing"]
+            assert times["last_frames_s"] - times["first_frames_s"] > 0.4
+        parts = []
+        broken = threads.submit(stream, "a", 2, parts)
+        while not parts:
+            time.sleep(0.01)
+        server.end(signal.SIGKILL)
+        assert broken.exception() is not None
+    server = Server(tmp_path, command)
+    again = []
+    with Client(f"ws://127.0.0.1:{server.port}") as one:
+        session = one.attach("a")
+        session.step_id = 1
+        reply = session.step(np.tile(known["a"], (4, 1)) + 0.02, show=again.append)
+    np.testing.assert_array_equal(reply["frames"][:1], parts[0])
+    assert not again  # the step was on disk: the restarted server makes it before it is asked
+    assert server.end(signal.SIGTERM) == 0
 
 
 @pytest.mark.slow

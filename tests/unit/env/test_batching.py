@@ -11,7 +11,7 @@ import pytest
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.batching import Batcher
 from egosim_jax.rendering import reference
-from egosim_jax.types import Clip, InputError
+from egosim_jax.types import InputError
 from tests.painted import painted
 
 
@@ -27,12 +27,16 @@ class Counting:
     def condition(self, view, action, first_frame):
         return action
 
-    def generate(self, triplets, seeds):
+    def groups(self, triplets, seeds):
         self.held.wait()
         self.batches.append(list(seeds))
         if 13 in seeds:
             raise FloatingPointError("clip 13")
-        return [Clip(frames=np.full((1, 32, 48, 3), seed, np.uint8), fps=8) for seed in seeds]
+        frames = np.tile(np.array(seeds, np.uint8)[:, None, None, None, None], (1, 2, 32, 48, 3))
+        yield frames[:, :1]
+        if 14 in seeds:
+            raise FloatingPointError("clip 14")
+        yield frames[:, 1:]
 
     def fingerprint(self):
         return "counting"
@@ -106,6 +110,23 @@ def test_one_failing_clip_does_not_fail_the_others(generator):
     assert found[0].result() == 1
     with pytest.raises(FloatingPointError, match="clip 13"):
         found[1].result()
+    batcher.close()
+
+
+def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator):
+    batcher = Batcher(generator, most=2, wait_s=5.0)
+
+    def stream(seed):
+        with batcher.announced():
+            time.sleep(0.02)
+            return [int(frames[0, 0, 0, 0]) for frames in batcher.stream(*inputs(), seed)]
+
+    with ThreadPoolExecutor(2) as threads:
+        good, bad = threads.submit(stream, 1), threads.submit(stream, 14)
+        assert good.result(timeout=10) == [1, 1]
+        with pytest.raises(FloatingPointError, match="clip 14"):
+            bad.result(timeout=10)
+    assert [len(batch) for batch in generator.batches] == [2, 1, 1]
     batcher.close()
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from egosim_jax.env.actions import ActionSpec
 from egosim_jax.env.backends import tabletop_start
-from egosim_jax.env.streaming import Streamer
 from egosim_jax.play.moves import intent_of, perform
 from egosim_jax.play.played import Played
 from egosim_jax.serving.session import Session
@@ -19,28 +18,20 @@ from tests.painted import VIDEO, PaintedWorld, Painter
 STILL = np.zeros(6)
 
 
-class Showing(Streamer):
-    """Painter that shows its frames in two groups."""
+class Showing(Painter):
+    """Painter of two groups of frames."""
 
-    def __init__(self):
-        self.renderer = Painter.renderer
-
-    def fingerprint(self):
-        return "painter"
-
-    def __call__(self, view, action, first_frame, seed):
-        frames = Painter()(view, action, first_frame, seed)
-        self.show(frames[:1])
-        self.show(frames[1:])
-        return frames
+    def stream(self, view, action, first_frame, seed):
+        frames = self(view, action, first_frame, seed)
+        yield frames[:1]
+        yield frames[1:]
 
 
 @pytest.fixture
 def played(tmp_path):
-    painter = Showing()
-    world = PaintedWorld(generator=painter, video=VIDEO, perception=None)
+    world = PaintedWorld(generator=Showing(), video=VIDEO, perception=None)
     start = tabletop_start(0, ActionSpec(camera=True), VIDEO)
-    return Played(painter, world, tmp_path, start, "right")
+    return Played(world, tmp_path, start, "right")
 
 
 def carry(played, show=lambda frames, last: None):

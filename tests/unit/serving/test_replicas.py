@@ -26,13 +26,23 @@ class Handle:
             SimpleNamespace(remote=self._handle),
             SimpleNamespace(remote=part.describe),
         )
+        streamed = SimpleNamespace(remote=self._replies)
+        self.replies = SimpleNamespace(options=lambda *, stream: stream and streamed)
 
-    async def _handle(self, message):
+    def _check(self):
         if self.stopped:
             from ray.exceptions import RayActorError  # here: other tests import Ray themselves
 
             raise RayActorError
+
+    async def _handle(self, message):
+        self._check()
         return await self.part.handle(message)
+
+    async def _replies(self, message):
+        self._check()
+        async for found in self.part.replies(message):
+            yield found
 
 
 @pytest.fixture
@@ -66,6 +76,27 @@ def test_each_session_is_in_the_part_that_its_id_chooses(entrance, tmp_path):
     new = ask(entrance, "create")["session"]
     assert (tmp_path / f"part-{replicas.part_of(new, PARTS)}" / new).is_dir()
     assert asyncio.run(entrance.describe())["parts"] == PARTS
+
+
+async def collect(replies):
+    return [reply async for reply in replies]
+
+
+def test_the_frames_of_a_part_are_passed_on(entrance):
+    row = ask(entrance, "create", session="a", seed=3)["row"]
+    message = {"request": "step", "session": "a", "step_id": 1, "actions": row[None]}
+    group, reply = asyncio.run(collect(entrance.replies({**message, "stream": True})))
+    assert (group["session"], group["first_frame"]) == ("a", 0)
+    np.testing.assert_array_equal(group["frames"], reply["frames"])
+    (alone,) = asyncio.run(collect(entrance.replies(message)))
+    assert alone["info"] == reply["info"]
+    wrong = {**message, "stream": True, "step_id": 9}
+    with pytest.raises(RequestError, match="Send step 2") as refused:
+        asyncio.run(collect(entrance.replies(wrong)))
+    assert refused.value.status == 409
+    entrance._parts[replicas.part_of("a", PARTS)].stopped = True
+    with pytest.raises(RequestError, match="resumes its sessions"):
+        asyncio.run(collect(entrance.replies(wrong)))
 
 
 @pytest.mark.parametrize(

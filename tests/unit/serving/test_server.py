@@ -7,6 +7,7 @@ import socket
 import threading
 import urllib.error
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -24,14 +25,15 @@ from egosim_jax.serving.server import _Server, bind, make_app, serve
 from egosim_jax.serving.service import Service
 from egosim_jax.serving.store import Limits, Store
 from egosim_jax.types import InputError
-from tests.painted import painted
+from tests.painted import VIDEO, PaintedWorld, Painter, painted
 
 TOKEN = "secret"  # noqa: S105
 
 
-def run(folder, token=None, limits=None):
+def run(folder, token=None, limits=None, world=None):
     """A service, its port, and the thread that serves it."""
-    service = Service(Store(folder, painted(), limits or Limits(), Metrics()), world="painted")
+    store = Store(folder, world or painted(), limits or Limits(), Metrics())
+    service = Service(store, world="painted")
     ports, ready = [], threading.Event()
 
     def note(port):
@@ -98,6 +100,134 @@ def test_a_client_that_vanishes_loses_nothing(server):
         found = again.attach(session.id)
         found.step_id = 0
         assert found.step(rows)["step_id"] == 1
+
+
+class Gated(Painter):
+    """Painter whose last frames wait until they are asked for."""
+
+    def __init__(self):
+        super().__init__()
+        object.__setattr__(self, "opened", threading.Event())
+
+    def stream(self, view, action, first_frame, seed):
+        frames = self(view, action, first_frame, seed)
+        yield frames[:1]
+        assert self.opened.wait(30)
+        yield frames[1:]
+
+
+@pytest.fixture
+def gated(tmp_path):
+    painter = Gated()
+    world = PaintedWorld(generator=painter, video=VIDEO, perception=None)
+    service, port, _ = run(tmp_path, world=world)
+    yield painter, service, port
+    painter.opened.set()
+    service.store.close()
+
+
+def test_a_streamed_step_is_shown_before_it_is_decoded(gated):
+    painter, service, port = gated
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        session, shown = client.create(seed=3), []
+        rows = np.tile(session.reply["row"], (4, 1))
+
+        def show(frames):
+            shown.append(frames)
+            assert service.store.get(session.id).committed == 0
+            painter.opened.set()
+
+        reply = session.step(rows, show=show)
+        assert [len(frames) for frames in shown] == [1, 4]
+        np.testing.assert_array_equal(np.concatenate(shown), reply["frames"])
+        timing = reply.pop("timing")
+        assert 0 < timing["first_frames_s"] <= timing["last_frames_s"]
+        session.step_id = 0
+        shown.clear()
+        again = session.step(rows, show=show)
+        assert not shown
+        assert again.keys() == reply.keys()
+        assert again["info"] == reply["info"]
+    assert b"egosim_first_frames_seconds_count 1.0" in http(port, "/metrics")[1]
+
+
+def test_the_messages_of_a_streamed_step(gated):
+    painter, _, port = gated
+    painter.opened.set()
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        session = client.create(seed=3)
+        fields = {"session": session.id, "step_id": 1, "actions": session.reply["row"][None]}
+        client._socket.send(wire.pack({"request": "step", "stream": True, "observe": [], **fields}))
+        found = [wire.unpack(client._socket.recv(timeout=30)) for _ in range(3)]
+        for number, count in ((0, 1), (1, 4)):
+            group = found[number]
+            assert group.keys() == {"session", "step_id", "first_frame", "frames"}
+            assert (group["step_id"], group["first_frame"]) == (1, number)
+            assert group["frames"].shape == (count, 32, 48, 3)
+        assert (found[2]["step_id"], "frames" in found[2]) == (1, False)
+
+
+def test_a_client_that_vanishes_in_a_stream_leaves_its_step_to_be_made(gated):
+    painter, service, port = gated
+    client = Client(f"ws://127.0.0.1:{port}")
+    session = client.create(seed=3)
+    rows = np.tile(session.reply["row"], (4, 1))
+
+    def vanish(frames):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        session.step(rows, show=vanish)
+    with Client(f"ws://127.0.0.1:{port}") as again:
+        same = again.attach(session.id)
+        shown = []
+        with ThreadPoolExecutor(1) as thread:
+            reply = thread.submit(same.step, rows, show=shown.append)
+            painter.opened.set()
+            assert reply.result()["step_id"] == 1
+        assert not shown  # the step is under way for the client that vanished
+    assert service.store.get(session.id).committed == 1
+
+
+def test_an_error_ends_a_stream_and_the_connection_stays(gated, monkeypatch):
+    painter, _, port = gated
+
+    def fail(*_):
+        yield np.zeros((1, 32, 48, 3), np.uint8)
+        raise FloatingPointError
+
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        session, shown = client.create(seed=3), []
+        rows = np.tile(session.reply["row"], (4, 1))
+        with monkeypatch.context() as patched:
+            patched.setattr(Gated, "stream", fail)
+            with pytest.raises(RequestError, match="not finite"):
+                session.step(rows, show=shown.append)
+        assert len(shown) == 1
+        with pytest.raises(RequestError, match="stream is 1: it must be true or false"):
+            client.request("step", session=session.id, step_id=1, actions=rows, stream=1)
+        painter.opened.set()
+        assert session.step(rows, show=shown.append)["step_id"] == 1
+
+
+def test_a_world_that_does_not_stream_shows_a_clip_at_once(server):
+    with Client(f"ws://127.0.0.1:{server[1]}") as client:
+        session, shown = client.create(seed=3), []
+        reply = session.step(np.tile(session.reply["row"], (4, 1)), show=shown.append)
+        assert len(shown) == 1
+        np.testing.assert_array_equal(shown[0], reply["frames"])
+
+
+def test_http_does_not_stream(server):
+    _, port = server
+    session = json.loads(http(port, "/sessions", {"seed": 3})[1])
+    fields = {"step_id": 1, "actions": [session["row"]], "stream": True}
+    status, body = http(port, f"/sessions/{session['session']}/step", fields)
+    error = json.loads(body)
+    assert (status, error["code"]) == (422, "invalid")
+    assert "Connect there, or leave stream out. (stream)" in error["message"]
+    fields["stream"] = False
+    assert http(port, f"/sessions/{session['session']}/step", fields)[0] == 200
 
 
 def test_http_has_the_same_requests(server):
