@@ -199,7 +199,7 @@ def test_two_streams_of_a_batch_come_as_they_are_decoded_and_survive_a_kill(tmp_
             found = reply.result()
             np.testing.assert_array_equal(np.concatenate(shown[name]), found["frames"])
             times = found["timing"]
-            assert times["last_frames_s"] - times["first_frames_s"] > 0.4
+            assert 0 < times["first_frames_s"] < times["last_frames_s"]
         parts = []
         broken = threads.submit(stream, "a", 2, parts)
         while not parts:
