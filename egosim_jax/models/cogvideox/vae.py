@@ -23,10 +23,18 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from einops import rearrange, repeat
+from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
+from egosim_jax.models.cogvideox.vae_layers import (
+    Cache,
+    Downsample,
+    GroupNorm,
+    Upsample,
+    causal_conv,
+    fit,
+)
 from egosim_jax.models.conv import Conv
 from egosim_jax.models.layers import Linear
 from egosim_jax.types import InputError, check_counts
@@ -34,8 +42,6 @@ from egosim_jax.types import InputError, check_counts
 CHUNK = 2
 """Latent frames of a chunk after the first, which has one more."""
 CUBE = (3, 3, 3)
-Cache = Any
-"""Last input frames of a layer's convolutions over time; None at the start of a video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,41 +103,12 @@ class CogVideoXVAEConfig:
         return CogVideoXVAE(self, rngs=rngs)
 
 
-def causal_conv(
-    conv: Conv, x: Float[Array, "b f h w i"], cache: Cache
-) -> tuple[Float[Array, "b f h w o"], Cache]:
-    """Convolve each frame with the two before it; before the first, it is repeated."""
-    x = x.astype(conv.dtype)
-    if cache is None:
-        cache = jnp.repeat(x[:, :1], 2, axis=1)
-    x = jnp.concatenate([cache, x], axis=1)
-    return conv(x), x[:, -2:]
-
-
-class GroupNorm(nnx.Module):
-    """Group norm over the frames of a chunk, rows, columns and a group's channels, in float32."""
-
-    def __init__(self, dim: int, config: CogVideoXVAEConfig):
-        self.groups, self.eps = config.groups, config.eps
-        self.scale = nnx.Param(jnp.ones(dim), axes=(None,))
-        self.bias = nnx.Param(jnp.zeros(dim), axes=(None,))
-
-    def __call__(self, x: Float[Array, "b f h w c"]) -> Float[Array, "b f h w c"]:
-        """Normalize; the result is float32."""
-        y = rearrange(x.astype(jnp.float32), "b f h w (g c) -> b f h w g c", g=self.groups)
-        axes = (1, 2, 3, 5)
-        y = y - y.mean(axes, keepdims=True)
-        y = y * jax.lax.rsqrt(jnp.square(y).mean(axes, keepdims=True) + self.eps)
-        y = rearrange(y, "b f h w g c -> b f h w (g c)")
-        return y * self.scale[...].astype(jnp.float32) + self.bias[...].astype(jnp.float32)
-
-
 class SpatialNorm(nnx.Module):
     """Group norm whose output is scaled and shifted by the latents (Zheng et al. 2022, MoVQ)."""
 
     def __init__(self, dim: int, config: CogVideoXVAEConfig, *, rngs: nnx.Rngs):
         sizes, axes = (config.z_dim, dim), (None, "mlp")
-        self.norm = GroupNorm(dim, config)
+        self.norm = GroupNorm(dim, groups=config.groups, eps=config.eps)
         self.scale = Linear(*sizes, axes=axes, dtype=config.dtype, rngs=rngs)
         self.shift = Linear(*sizes, axes=axes, dtype=config.dtype, rngs=rngs)
 
@@ -140,19 +117,6 @@ class SpatialNorm(nnx.Module):
     ) -> Float[Array, "b f h w c"]:
         """Normalize; each pixel reads the latent cell that it is in."""
         return self.norm(x) * fit(self.scale(z), x.shape) + fit(self.shift(z), x.shape)
-
-
-def fit(z: Float[Array, "b f h w c"], shape: tuple[int, ...]) -> Float[Array, "b f2 h2 w2 c"]:
-    """Repeat latent cells to the frames, rows and columns of a shape.
-
-    With an odd number of frames above one, the first latent frame is not repeated in time.
-    """
-    _, frames, height, width, _ = shape
-    z = repeat(z, "b f h w c -> b f (h i) (w j) c", i=height // z.shape[2], j=width // z.shape[3])
-    if frames > 1 and frames % 2:
-        times = (frames - 1) // (z.shape[1] - 1)
-        return jnp.concatenate([z[:, :1], jnp.repeat(z[:, 1:], times, axis=1)], axis=1)
-    return jnp.repeat(z, frames // z.shape[1], axis=1)
 
 
 class ResidualBlock(nnx.Module):
@@ -170,7 +134,9 @@ class ResidualBlock(nnx.Module):
         dtype = config.dtype
 
         def norm(dim: int) -> SpatialNorm | GroupNorm:
-            return SpatialNorm(dim, config, rngs=rngs) if spatial_norm else GroupNorm(dim, config)
+            if spatial_norm:
+                return SpatialNorm(dim, config, rngs=rngs)
+            return GroupNorm(dim, groups=config.groups, eps=config.eps)
 
         self.norm1, self.norm2 = norm(in_dim), norm(out_dim)
         self.conv1 = Conv(CUBE, in_dim, out_dim, dtype=dtype, rngs=rngs)
@@ -193,37 +159,6 @@ class ResidualBlock(nnx.Module):
         return (x if self.shortcut is None else self.shortcut(x)) + y, (cache1, cache2)
 
 
-class Downsample(nnx.Module):
-    """Average pairs of frames, if `temporal`, and halve rows and columns by a convolution."""
-
-    def __init__(self, dim: int, *, temporal: bool, dtype: str, rngs: nnx.Rngs):
-        self.conv = Conv((3, 3), dim, dim, dtype=dtype, rngs=rngs)
-        self.temporal = temporal
-
-    def __call__(self, x: Float[Array, "b f h w c"]) -> Float[Array, "b g y x c"]:
-        """Downsample; of an odd number of frames the first stays as it is."""
-        if self.temporal:
-            odd = x.shape[1] % 2
-            pairs = rearrange(x[:, odd:], "b (f two) h w c -> b f two h w c", two=2).mean(axis=2)
-            x = jnp.concatenate([x[:, :odd], pairs], axis=1)
-        return self.conv.downsample2x(x)
-
-
-class Upsample(nnx.Module):
-    """Double rows and columns and, if `temporal`, frames; then convolve images."""
-
-    def __init__(self, dim: int, *, temporal: bool, dtype: str, rngs: nnx.Rngs):
-        self.conv = Conv((3, 3), dim, dim, dtype=dtype, rngs=rngs)
-        self.temporal = temporal
-
-    def __call__(self, x: Float[Array, "b f h w c"]) -> Float[Array, "b g y x c"]:
-        """Upsample; of an odd number of frames the first is not doubled."""
-        if self.temporal:
-            odd = x.shape[1] % 2
-            x = jnp.concatenate([x[:, :odd], jnp.repeat(x[:, odd:], 2, axis=1)], axis=1)
-        return self.conv(repeat(x, "b f h w c -> b f (h i) (w j) c", i=2, j=2))
-
-
 class Encoder(nnx.Module):
     """Encoder of a chunk to 2 `z_dim` channels of moments."""
 
@@ -239,7 +174,7 @@ class Encoder(nnx.Module):
         self.levels = nnx.List(layers)
         middle = _blocks(dims[-1], dims[-1], 2, config, spatial_norm=False, rngs=rngs)
         self.middle = nnx.List(middle)
-        self.norm_out = GroupNorm(dims[-1], config)
+        self.norm_out = GroupNorm(dims[-1], groups=config.groups, eps=config.eps)
         self.conv_out = Conv(CUBE, dims[-1], 2 * config.z_dim, dtype=dtype, rngs=rngs)
 
     def __call__(
