@@ -34,7 +34,8 @@ from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.transforms import decode_record, record_length
-from egosim_jax.generator import Inputs, batches, targets_of
+from egosim_jax.encoding import Inputs
+from egosim_jax.generator import batches, targets_of
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote

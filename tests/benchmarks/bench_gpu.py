@@ -32,7 +32,8 @@ import jax.numpy as jnp
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.generator import Generator, Inputs
+from egosim_jax.encoding import Inputs
+from egosim_jax.generator import Generator
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiT

@@ -21,7 +21,8 @@ from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
+from egosim_jax.encoding import Inputs, encode_condition
+from egosim_jax.generator import Generator, denoise
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config

@@ -12,7 +12,8 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
-from egosim_jax.generator import Generator, Inputs, denoise, encode_condition
+from egosim_jax.encoding import Inputs, encode_condition
+from egosim_jax.generator import Generator, denoise
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import CompiledFn
 from egosim_jax.types import InputError, Triplet, VideoSpec

@@ -12,7 +12,8 @@ from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.layout import DWM
 from egosim_jax.diffusion import Guidance
-from egosim_jax.generator import Generator, Inputs, encode_condition
+from egosim_jax.encoding import Inputs, encode_condition
+from egosim_jax.generator import Generator
 from egosim_jax.networks import Networks
 from egosim_jax.program import CompiledFn
 from egosim_jax.testing import random_triplet
