@@ -125,7 +125,7 @@ class Simulator:
 
     def _frames(
         self, view: View, action: Action, image: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> UInt8[np.ndarray, "f h w 3"]:
+    ) -> np.ndarray:
         """Return the generator's frames; show them, all at once if it does not stream."""
         if self.show is None:
             return self.generator(view, action, image, seed)

@@ -93,7 +93,8 @@ def test_the_configs_of_an_old_run_are_those_of_today(tmp_path):
         folder = tmp_path / name
         folder.mkdir()
         (folder / "config.json").write_text(json.dumps(OLD_RUN[name]))
-        open_folder(folder, {"task": task, "training": config, "weights": None})
+        record = {"task": task, "training": config, "weights": None}
+        open_folder(folder, record, mutable=resume_mutable("training"))
 
 
 def test_a_training_resumes_though_its_model_samples_in_other_steps(tmp_path):

@@ -133,8 +133,9 @@ def test_a_streamed_step_is_shown_before_it_is_decoded(gated):
         rows = np.tile(session.reply["row"], (4, 1))
 
         def show(frames):
+            if not shown:
+                assert service.store.get(session.id).committed == 0
             shown.append(frames)
-            assert service.store.get(session.id).committed == 0
             painter.opened.set()
 
         reply = session.step(rows, show=show)
