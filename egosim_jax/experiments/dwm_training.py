@@ -9,10 +9,10 @@ after the first frame, or a box. A base model of images sees the first frame, th
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,14 +22,17 @@ from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.convert.widen import Widening
 from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.data.mixing import write_mixture
 from egosim_jax.data.pack import clip_metadata
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.experiments.config import DWM, Hyperparameters
 from egosim_jax.experiments.dwm_variants import (
     BASES,
+    MIXED,
     VARIANTS,
     Base,
     Camera,
+    Cameras,
     Hands,
     Variant,
     poses_of,
@@ -51,7 +54,7 @@ from egosim_jax.types import Triplet
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
-Split = Camera | str
+Split = Camera | Literal["held_out"]
 CROP = (64, 80)
 """Most rows and columns of the crops that the autoencoder is trained on."""
 SPLITS = 10_000
@@ -68,12 +71,12 @@ class Training:
     def __init__(self, settings: DWM):
         self.settings, self.out = settings, settings.out
         self.config = replace(configs.get(settings.config), steps=settings.steps)
-        counts = {
+        counts: dict[Split, int] = {
             "held_out": settings.held_out,
             "moving": settings.moving_scenes,
             "fixed": settings.fixed_scenes,
         }
-        self.seeds = {
+        self.seeds: dict[Split, range] = {
             split: range(start := settings.first_scene + number * SPLITS, start + count)
             for number, (split, count) in enumerate(counts.items())
         }
@@ -82,7 +85,7 @@ class Training:
         """Return the config of a base model."""
         return with_layout(self.config, BASES[base], base)
 
-    def frames(self, split: str) -> Path:
+    def frames(self, split: Split) -> Path:
         """Make the clips of a split with their static twins and hand meshes."""
         out = self.out / "frames" / split
         plan = DatasetConfig(
@@ -120,23 +123,22 @@ class Training:
             weights.save(path, vae)
         return path.parent
 
-    def latents(self, kind: Base | Hands, splits: Sequence[str]) -> Path:
-        """Encode the clips of splits as a kind of training needs them; return the shards."""
-        out = self.out / "latents" / "_".join((kind, *splits))
+    def latents(self, kind: Base | Hands, split: Split) -> Path:
+        """Encode the clips of a split as a kind of training needs them; return the shards."""
+        out = self.out / "latents" / f"{kind}_{split}"
         if (out / MANIFEST).exists():
             return out
         model = self._encoded_as(kind)
-        sources = [ShardReader(self.frames(split)) for split in splits]
+        source = ShardReader(self.frames(split))
         folder = self.autoencoder()
         encode = Encoding(model, Networks.load(model, folder, only=model.cached_networks))
         provenance = {
             "kind": kind,
-            "sources": [source.manifest.fingerprint for source in sources],
+            "sources": [source.manifest.fingerprint],
             "encoders": weights.hashes(folder, only=model.cached_networks),
         }
         clips = [
             changed(clip, kind, self.clip(split, seed) if kind == "poses" else None)
-            for split, source in zip(splits, sources, strict=True)
             for seed, clip in zip(self.seeds[split], _clips(source), strict=True)
         ]
         size = self.settings.batch_size
@@ -152,7 +154,16 @@ class Training:
                     writer.add(arrays, clip_metadata(clip))
         return out
 
-    def clip(self, split: str, seed: int) -> TabletopClip:
+    def mixture(self, kind: Base | Hands, cameras: Cameras) -> Path:
+        """Return shards of latents of clips with these cameras, drawn in proportion to weights."""
+        parts = {self.latents(kind, camera): weight for camera, weight in cameras}
+        if len(parts) == 1:
+            return next(iter(parts))
+        out = self.out / "latents" / "_".join((kind, *dict(cameras)))
+        write_mixture(out, parts)
+        return out
+
+    def clip(self, split: Split, seed: int) -> TabletopClip:
         """Return the events of a clip, in tiny frames."""
         spec = replace(self.config.video, height=16, width=16)
         return next(make_sequence(seed, spec=spec, fixed_camera=split == "fixed"))
@@ -173,8 +184,8 @@ class Training:
                 dropout=ConditionDropout(prior=nothing, text=self.settings.text_dropout),
             ),
             self.settings.base,
-            data=self.latents(base, ("moving", "fixed")),
-            validation=self.latents(base, ("held_out",)),
+            data=self.mixture(base, MIXED),
+            validation=self.latents(base, "held_out"),
         )
 
     def start(self, name: str, variant: Variant) -> Path:
@@ -206,8 +217,8 @@ class Training:
                 rank=rank,
             ),
             self.settings.adaptation,
-            data=self.latents(variant.hands, variant.data),
-            validation=self.latents(variant.hands, ("held_out",)),
+            data=self.mixture(variant.hands, variant.data),
+            validation=self.latents(variant.hands, "held_out"),
             start=start,
         )
         return (done, None) if rank is None else (start, done)

@@ -27,6 +27,12 @@ Hands = Literal["mesh", "mask", "poses"]
 Camera = Literal["moving", "fixed"]
 """Clips by their camera: DWM's synthetic ones have a moving head, its real ones a tripod."""
 
+Cameras = tuple[tuple[Camera, float], ...]
+"""Clips by their cameras, each with the weight with which it is mixed."""
+MOVING: Cameras = (("moving", 1.0),)
+MIXED: Cameras = (("moving", 5.0), ("fixed", 2.0))
+"""Hybrid of moving and fixed cameras."""
+
 SIDES, JOINTS = ("left", "right"), 21
 POSE_DIM = len(SIDES) * (1 + 3 * JOINTS)
 """Numbers of the poses of both hands in a frame."""
@@ -52,7 +58,7 @@ class Variant:
     """Input channels of the denoiser."""
     hands: Hands = "mesh"
     """Rendering of the hands that it reads."""
-    data: tuple[Camera, ...] = ("moving", "fixed")
+    data: Cameras = MIXED
     """Clips that it is trained on."""
     poses: Literal["frame", "global"] | None = None
     """Joints that modulate a token: those of its latent frame, or of all frames."""
@@ -95,22 +101,22 @@ def poses_of(clip: TabletopClip) -> Float32[np.ndarray, "f p"]:
 VARIANTS: Mapping[str, Variant] = {
     "full": Variant(title="DWM"),
     "no_hands": Variant(title="fine-tuned without hands", layout=STATIC),
-    "moving_only": Variant(title="moving cameras alone", data=("moving",)),
+    "moving_only": Variant(title="moving cameras alone", data=MOVING),
     "adaln_global": Variant(
         title="joints, all frames alike, moving alone",
         layout=STATIC,
         hands="poses",
         poses="global",
-        data=("moving",),
+        data=MOVING,
     ),
     "adaln_frame": Variant(
         title="joints by frame, moving alone",
         layout=STATIC,
         hands="poses",
         poses="frame",
-        data=("moving",),
+        data=MOVING,
     ),
-    "hand_mask": Variant(title="hands as masks, moving alone", hands="mask", data=("moving",)),
+    "hand_mask": Variant(title="hands as masks, moving alone", hands="mask", data=MOVING),
     "untrained": Variant(title="DWM, 0 updates", trained=False),
     "image_base": Variant(
         title="from the image model", base="image", layout=IMAGE_HANDS, adapter=False
