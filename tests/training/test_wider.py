@@ -31,25 +31,26 @@ def narrow(tmp_path):
     return vae, folder
 
 
+def load_wide(folder, out, *, decoder_dim):
+    config = replace(NARROW, decoder_dim=decoder_dim)
+    vae = abstract(config)
+    weights.load(with_decoder_of(config, folder, out) / "vae.safetensors", vae)
+    return vae
+
+
 def test_it_decodes_what_the_narrower_one_does(narrow, tmp_path):
     vae, folder = narrow
-    config = replace(NARROW, decoder_dim=5)
-    made = with_decoder_of(config, folder, tmp_path / "wide")
-    wide = abstract(config)
-    weights.load(made / "vae.safetensors", wide)
+    wide = load_wide(folder, tmp_path / "wide", decoder_dim=5)
     latents = jax.random.normal(jax.random.key(1), (1, 2, 2, 3, 16))
     decode = nnx.jit(lambda vae: vae.decode_whole(latents))
     expected, found = decode(vae), decode(wide)
     assert np.linalg.norm(found - expected) <= ERROR * np.linalg.norm(expected)
-    assert (made / "text.safetensors").read_bytes() == b"text"
+    assert (tmp_path / "wide" / "text.safetensors").read_bytes() == b"text"
 
 
 def test_every_new_channel_is_trained(narrow, tmp_path):
     _, folder = narrow
-    config = replace(NARROW, decoder_dim=6)
-    made = with_decoder_of(config, folder, tmp_path / "wide")
-    wide = abstract(config)
-    weights.load(made / "vae.safetensors", wide)
+    wide = load_wide(folder, tmp_path / "wide", decoder_dim=6)
     latents = jax.random.normal(jax.random.key(1), (1, 2, 2, 3, 16))
     loss = lambda vae: (vae.decode_whole(latents) ** 2).mean()  # noqa: E731
     gradients = nnx.jit(nnx.grad(loss))(wide)
