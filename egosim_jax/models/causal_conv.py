@@ -5,8 +5,7 @@
 The caller puts the frames of the past in front of `x`. TPUs have a kernel for it. cuDNN turns
 videos into another layout and back, and XLA's CPU backend has a good kernel for images only, so
 that there the sum over k is one over images: of convolutions or, where x has few channels, of
-channels, with the frames' channels side by side. The CPU is also slow at the gradient for large
-images,
+channels, with the frames' channels side by side. The CPU is also slow at the gradient
 
     dW[k, s] = sum_(t, p) x[t + k, p + s] dy[t, p]
 
@@ -29,8 +28,6 @@ from egosim_jax.sharding import platform
 
 FEW_CHANNELS = 8
 """Up to this many input channels, the CPU puts the frames' channels side by side."""
-LARGE_IMAGE = 32 * 32
-"""From this many pixels on, the CPU takes the kernel's gradient as a product of matrices."""
 
 
 def convolve(
@@ -87,10 +84,7 @@ def _backward(saved: tuple[Array, Array], dy: Array) -> tuple[Array, Array]:
     past = kernel.shape[0] - 1
     padded = jnp.pad(dy, ((0, 0), (past, past), (0, 0), (0, 0), (0, 0)))
     flipped = rearrange(kernel[::-1, ::-1, ::-1], "t h w i o -> t h w o i")
-    dx = sum_of_images(padded, flipped)
-    if x.shape[2] * x.shape[3] >= LARGE_IMAGE:
-        return dx, _kernel_gradient(x, padded, kernel)
-    return dx, *jax.vjp(lambda kernel: sum_of_images(x, kernel), kernel)[1](dy)
+    return sum_of_images(padded, flipped), _kernel_gradient(x, padded, kernel)
 
 
 by_image.defvjp(_forward, _backward)
