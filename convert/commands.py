@@ -1,4 +1,4 @@
-"""Subcommands of `egosim-convert`."""
+"""Subcommands of `egosim convert`."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Weights:
         names = self.only or tuple(dict.fromkeys(found.network for found in folder.found))
         if not names:
             raise InputError(
-                f"{quote_path(self.source)} holds no known network. (egosim-convert inspect)"
+                f"{quote_path(self.source)} holds no known network. (egosim convert inspect)"
             )
         apart(self.out, self.source)
         planned = []

@@ -37,7 +37,7 @@ class RefineVAE(Recipe):
     vae: TrainConfig
     """Hyper-parameters of the VAE's training."""
     frames: Path | None = None
-    """Folder with shards of decoded clips, `train` and `test`, as `egosim-train tabletop` makes."""
+    """Folder with shards of decoded clips, `train` and `test`, as `egosim train tabletop` makes."""
     weights: Path | None = None
     """Weights folder to start from."""
     part: Literal["all", "decoder"] = "all"

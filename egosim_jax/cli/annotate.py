@@ -28,7 +28,7 @@ class Annotate:
     VIDEO is a video file, a recording (`egosim data import`), or a folder of either. Hands,
     cameras, depth and scale are estimated, without network weights unless a folder of them is
     given; what a recording knows is taken from it. Writes metadata.csv, which `egosim data pack`,
-    `egosim generate` and `egosim-train` read, a folder for each clip, report.json, and index.html
+    `egosim generate` and `egosim train` read, a folder for each clip, report.json, and index.html
     to look at. A video that gives no clip is reported with the reason (exit code 3). The same
     command resumes an interrupted one. Prints the folder.
     """

@@ -1,6 +1,6 @@
 """DWM's architecture with small sizes, for static twins of the tabletop world on a CPU.
 
-CogVideoX's networks, a VAE and a text encoder included, trained from scratch by `egosim-train
+CogVideoX's networks, a VAE and a text encoder included, trained from scratch by `egosim train
 dwm_tabletop`. Clips of 17 frames of 160 x 96; 10 DDIM steps, guided by the empty prompt.
 """
 

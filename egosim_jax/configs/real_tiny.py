@@ -1,7 +1,7 @@
 """EgoSim's architecture with small sizes, for clips of 17 frames of 160 x 96 on a CPU.
 
 Text and image encoder are small too, read bytes and 56 x 56 pixels, and are trained together with
-the denoiser. `egosim-train real_tiny` trains all of it.
+the denoiser. `egosim train real_tiny` trains all of it.
 """
 
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer

@@ -1,6 +1,6 @@
 """Model that comes with the package: small, and trained on the tabletop world alone.
 
-Trained from scratch by `egosim-train tabletop`; its weights are in the package and its card
+Trained from scratch by `egosim train tabletop`; its weights are in the package and its card
 in `weights/tabletop/README.md`.
 """
 

@@ -51,7 +51,7 @@ class Release:
     revision: str | None
     """Commit to fetch; None if unknown, then the first fetch records it."""
     widen: Literal["copy", "polarity"] | None
-    """Widening of the input channels in the conversion (`egosim-convert weights --widen`)."""
+    """Widening of the input channels in the conversion (`egosim convert weights --widen`)."""
     files: Mapping[str, str | None]
     """Paths, or patterns of them, and their SHA-256; None if unknown, as for the revision."""
 
@@ -292,7 +292,7 @@ def _ask(release: Release, call: Callable[[], T]) -> T:
 
 def _by_hand(release: Release) -> str:
     widen = f" --widen {release.widen}" if release.widen else ""
-    return f"egosim-convert weights FOLDER --config {release.config}{widen} --out WEIGHTS"
+    return f"egosim convert weights FOLDER --config {release.config}{widen} --out WEIGHTS"
 
 
 def _mismatch(release: Release, path: str, have: str, expected: str) -> str:

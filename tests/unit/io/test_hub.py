@@ -103,7 +103,7 @@ def test_a_file_that_the_first_fetch_hashed_must_stay_the_same(served, tmp_path)
 
 def test_a_missing_file_is_named_with_the_command_that_converts_by_hand(served):
     release = replace(RELEASE, files={"other.bin": None})
-    with pytest.raises(InputError, match=r"no file other\.bin.*egosim-convert weights FOLDER"):
+    with pytest.raises(InputError, match=r"no file other\.bin.*egosim convert weights FOLDER"):
         hub.list_files(release)
 
 
