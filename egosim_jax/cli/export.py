@@ -16,15 +16,16 @@ from egosim_jax.types import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Export the sessions of `egosim serve`: to LeRobot, to training shards, or to Rerun.
+    """Export the sessions of `egosim serve` or `egosim play` to LeRobot, training shards or Rerun.
 
-    lerobot: a dataset of version 3.0, an episode for each stretch between resets. shards: a clip
-    for each step, whose target is the generated clip. rerun: OUT/SESSION.rrd of each session, for
-    `egosim view`. A damaged session is reported and skipped (exit code 3). Prints OUT.
+    lerobot: a dataset of version 3.0, an episode for each stretch between resets (extra `video`).
+    shards: a clip for each step, whose target is the generated clip. rerun: OUT/SESSION.rrd of each
+    session, for `egosim view` (extra `viewer`). A damaged session is reported and skipped (exit
+    code 3). Prints OUT.
     """
 
     sessions: Annotated[Path, tyro.conf.Positional]
-    """Folder of the sessions, --out of egosim serve."""
+    """Folder of the sessions: --out of `egosim serve` or `egosim play`."""
     out: Path
     """Folder to write."""
     to: Literal["lerobot", "shards", "rerun"] = "lerobot"

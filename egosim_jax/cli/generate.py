@@ -35,7 +35,7 @@ class Generate:
         "run": ("batch_size", "skip_existing", "reconstruct"),
     }
     config: str
-    """Name of the model."""
+    """Name of the model (`egosim models list`)."""
     metadata: Path | None = None
     """CSV or JSONL in EgoSim's columns, or a list of DWM; without it, scenes of the tabletop world.
 

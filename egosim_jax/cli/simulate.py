@@ -44,7 +44,7 @@ class Simulate:
         "loop": ("weights", "steps", "perception", "update", "renderer"),
     }
     config: str = "tabletop"
-    """Name of the model."""
+    """Name of the model (`egosim models list`)."""
     episode: Path | None = None
     """Folder or .zip of an episode (`egosim episode make`); the tabletop world if not given."""
     clips: int | None = None
@@ -54,7 +54,9 @@ class Simulate:
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     perception: str = "classical"
-    """Perception pipeline by name, with its options: classical, oracle, or a registered one."""
+    """Perception pipeline by name, with its options, which 'NAME --help' lists.
+
+    classical, networks, recorded, oracle, or a registered one, MODULE:NAME."""
     update: Literal["full", "none"] = "full"
     """Update the state from the clips, or keep it as it was before the first."""
     renderer: RendererName = "jax"

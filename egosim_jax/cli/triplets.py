@@ -195,8 +195,8 @@ class ToDwm:
 class Mix:
     """Mix shards by weight for training, such as rendered and recorded ones. Prints the folder.
 
-    The folder holds only the names of the others and their weights; training reads it as
-    `--latents`.
+    The folder holds only the names of the others and their weights; training reads it by the option
+    --latents.
     """
 
     shards: tuple[Path, ...]

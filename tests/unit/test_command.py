@@ -71,7 +71,7 @@ def test_egosim_alone_shows_what_to_do_next(capsys):
     assert egosim([]) == command.ExitCode.DONE
     shown = capsys.readouterr().out
     lines = [line.split("  ")[1].split() for line in shown.splitlines()[2:-2]]
-    assert len(lines) == 8
+    assert len(lines) == 9
     for program, *words in lines:
         assert program == "egosim"
         assert command._mistyped(Commands, words, program, ["train"]) is None
@@ -211,6 +211,31 @@ def test_the_groups_of_options_are_in_the_help(capsys, monkeypatch):
         for text in ("--config", "--seed", "sampling options", "--steps", "mesh options")
     ]
     assert places == sorted(places)
+
+
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        ("simulate", "Act several times in a scene that remembers what was done"),
+        ("data annotate", "Make clips with prior, mask, hands"),
+        ("train debug", "Train `debug` for a few updates"),
+        ("convert weights", "Convert every network of a checkpoint folder"),
+    ],
+)
+def test_the_help_of_a_command_begins_with_its_description(words, first, capsys):
+    with pytest.raises(SystemExit):
+        egosim([*words.split(), "--help"])
+    usage, description, *_ = capsys.readouterr().out.split("\n\n")
+    assert usage.startswith("usage: egosim ")
+    assert description.startswith(first)
+
+
+def test_the_groups_of_a_subcommand_are_named_without_its_field(capsys):
+    with pytest.raises(SystemExit):
+        egosim(["data", "annotate", "--help"])
+    shown = capsys.readouterr().out
+    assert " format options " in shown
+    assert "command" not in "".join(line for line in shown.splitlines() if "options ─" in line)
 
 
 def test_grouped_options_arrive_in_their_fields(monkeypatch):
