@@ -52,6 +52,8 @@ def finite(value: Any) -> Any:
     """Return a value for JSON with null for what could not be measured (NaN)."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
