@@ -31,8 +31,8 @@ PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
 VARIABLES = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
 TRACED = (
-    "conditioning", "diffusion", "models", "encoding.py", "generator.py", "grid.py", "networks.py",
-    "program.py", "sharding.py", "types.py",
+    "conditioning", "diffusion", "models", "encoding.py", "env/streaming.py", "generator.py",
+    "grid.py", "networks.py", "program.py", "sharding.py", "types.py",
 )  # fmt: skip
 """Modules that run while a function is traced, and so determine what is compiled."""
 FOLDER, MAX_FILES = "executables", 64
