@@ -205,16 +205,20 @@ class BundleRun:
         return state
 
     def save(self, state: TrainState) -> None:
-        """Write the state and the weights, each as a folder of parts."""
-        with TemporaryDirectory(dir=self.out) as folder:
-            path = Path(folder) / STATE
-            weights.write(path, {name: np.asarray(leaf) for name, leaf in _named(state)})
-            parts.cut([path], self.out / CHECKPOINT)
+        """Write the weights and the state, each as a folder of parts.
+
+        The state comes last: a run that is killed between both repeats its last updates, and writes
+        the weights again.
+        """
         networks = nnx.merge(self.programs.graph, state.eval_params, self.frozen)
         with TemporaryDirectory(dir=self.out) as folder:
             networks.save(Path(folder), dtype=self.recipe.dtype)
             vae = self.bundle / WEIGHTS / "vae.safetensors"
             parts.cut([*sorted(Path(folder).glob("*.safetensors")), vae], self.out / WEIGHTS)
+        with TemporaryDirectory(dir=self.out) as folder:
+            path = Path(folder) / STATE
+            weights.write(path, {name: np.asarray(leaf) for name, leaf in _named(state)})
+            parts.cut([path], self.out / CHECKPOINT)
 
     def _restore(self) -> TrainState:
         with TemporaryDirectory(dir=self.out) as folder:

@@ -15,6 +15,7 @@ from egosim_jax.command import ExitCode
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.generator import Generator
+from egosim_jax.io import parts
 from egosim_jax.testing import write_latents, write_weights
 from egosim_jax.train import bundle, bundled
 from egosim_jax.train.bundle import write_bundle
@@ -126,6 +127,27 @@ def test_pieces_on_a_bare_machine_repeat_the_whole_run(written, trained, tmp_pat
     assert losses(out) == losses(trained)
     for path in (*trained.glob("checkpoint/*"), *trained.glob("weights/*")):
         assert (out / path.relative_to(trained)).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_kill_between_checkpoint_and_weights_loses_neither(
+    written, trained, tmp_path, monkeypatch
+):
+    out, cut, folders = tmp_path / "run", parts.cut, []
+
+    def killed(files, folder):
+        if folders:
+            raise KeyboardInterrupt
+        folders.append(folder)
+        cut(files, folder)
+
+    monkeypatch.setattr(parts, "cut", killed)
+    command = ["train", "--bundle", str(written), "--out", str(out)]
+    assert main(command) != ExitCode.DONE
+    monkeypatch.setattr(parts, "cut", cut)
+    assert main(command) == ExitCode.DONE
+    for path in trained.glob("weights/*"):
+        assert (out / "weights" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_a_wider_model_on_a_gpu_starts_from_random_weights(written):
