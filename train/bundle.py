@@ -77,7 +77,7 @@ def write_bundle(
         for split, source in latents.items():
             for number, arrays in enumerate(_shards(ShardReader(source))):
                 path = folder / LATENTS / f"{split}-{number:03d}.npz"
-                np.savez(path, allow_pickle=False, **arrays)
+                np.savez(path, **arrays)
         changes = differing(task, Denoising(model=configs.get(task.model.name)))
         recipe = {
             "config": task.model.name,
@@ -112,7 +112,7 @@ def check_new(out: Path) -> None:
         raise InputError(f"{out} exists: a bundle is written to a new folder. (--bundle)")
 
 
-def _shards(source: ShardReader) -> Iterator[dict[str, np.ndarray]]:
+def _shards(source: ShardReader) -> Iterator[dict[str, Any]]:
     """Yield the records of a split, stacked, as many at a time as fit into a shard."""
     rows: list[Mapping[str, np.ndarray]] = []
     size = 0

@@ -42,7 +42,7 @@ def save(path: Path, perceived: Perceived) -> None:
         "interacted_frames": np.array([perceived.interacted_frames[n] for n in interacted], bool),
     }
     with atomic_write(path) as temporary:
-        np.savez(temporary, allow_pickle=False, **arrays)
+        np.savez(temporary, **arrays)
 
 
 def load(path: Path) -> Perceived:

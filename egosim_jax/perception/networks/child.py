@@ -39,7 +39,7 @@ def main() -> None:
             with np.load(folder / "request.npz", allow_pickle=False) as found:
                 arrays = {name: found[name] for name in found.files}
             arrays, value = run(arrays, request["options"])
-            np.savez(folder / "reply.npz", allow_pickle=False, **arrays)
+            np.savez(folder / "reply.npz", **arrays)
             return None, value
 
         _guarded(replies, serve)
