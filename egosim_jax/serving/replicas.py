@@ -98,7 +98,8 @@ def read_settings(given: Mapping[str, Any]) -> Replicas:
 
 def part_of(session: str, parts: int) -> int:
     """Return the part that has a session."""
-    return int.from_bytes(hashlib.sha256(session.encode()).digest()[:8]) % parts
+    name = session.encode("utf-8", "surrogatepass")  # of JSON, which may have half a pair
+    return int.from_bytes(hashlib.sha256(name).digest()[:8]) % parts
 
 
 def keep_parts(settings: Replicas) -> None:
@@ -184,9 +185,10 @@ class Entrance:
 
     async def handle(self, message: Any) -> dict[str, Any]:
         """Return the reply of the part that has the session."""
-        if not isinstance(message, dict) or message.get("request") not in FIELDS:
+        name = message.get("request") if isinstance(message, dict) else None
+        if not isinstance(name, str) or name not in FIELDS:
             return await self._ask(0, message)  # which refuses it
-        name, session = message["request"], message.get("session")
+        session = message.get("session")
         if name == "status" and session is None:
             return await self._status(message)
         if name == "create" and session is None:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,6 +24,7 @@ from egosim_jax.episode import Episode
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.untrusted import quote, quote_path
 from egosim_jax.serving.errors import RequestError, as_request_error
+from egosim_jax.serving.fields import check_name, mapping, prompt_of, whole
 from egosim_jax.serving.metrics import Metrics
 from egosim_jax.serving.session import (
     CLOSED,
@@ -39,8 +39,6 @@ from egosim_jax.serving.session import (
 from egosim_jax.types import InputError, check_counts
 
 T = TypeVar("T")
-NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-"""Names of sessions and of what is saved."""
 UNFINISHED = re.compile(r"starts|\.session\..*")
 """Names that a crash during the creation of a session leaves in its folder."""
 MOST_SEED = 2**63 - 1_000_000
@@ -132,17 +130,12 @@ class Store:
                 "damaged_session",
                 f"Session {session_id} could not be resumed: {self.damaged[session_id]}",
             )
-        raise RequestError(
-            404,
-            "unknown_session",
-            f"There is no session {quote(session_id)}: session must be an id that create has "
-            "returned and that is not closed. Create one.",
-        )
+        raise _unknown(session_id)
 
     def create(self, request: Mapping[str, Any]) -> Session:
         """Create a session of a seed or episode, with the id that is asked for or a new one."""
         self._check_open()
-        actions = spec_of(_mapping(request.get("actions", {}), "actions"))
+        actions = spec_of(mapping(request.get("actions", {}), "actions"))
         name = check_name(request.get("session", secrets.token_hex(8)), "session")
         folder = self._reserve(name)
         try:
@@ -192,8 +185,8 @@ class Store:
 
         Without either it is the default, by default that of seed 0.
         """
-        prompt = _prompt(request)
-        seed = 0 if (chosen := request.get("seed")) is None else _whole(chosen, "seed")
+        prompt = prompt_of(request)
+        seed = 0 if (chosen := request.get("seed")) is None else whole(chosen, "seed")
         if not 0 <= seed <= MOST_SEED:
             raise InputError(f"seed is {quote(seed)}: it must be from 0 to {MOST_SEED}.")
         if (data := request.get("episode")) is not None:
@@ -210,7 +203,7 @@ class Store:
     def step(self, request: Mapping[str, Any], show: Show | None = None) -> Future[Result]:
         """Queue a step of a session, whose frames are shown unless it is a repeated one."""
         session = self.get(request.get("session"))
-        step_id, prompt = _whole(request.get("step_id"), "step_id"), _prompt(request)
+        step_id, prompt = whole(request.get("step_id"), "step_id"), prompt_of(request)
         if step_id < 1:
             raise InputError(
                 f"step_id is {step_id}: it must be one more than the last committed step. Send "
@@ -322,6 +315,9 @@ class Store:
                     "Wait for its reply, then send this one again.",
                     retry_after_s=0.5,
                 )
+            if changes is not None and self.sessions.get(changes.id) is not changes:
+                changes.busy.release()  # it was closed after it was found
+                raise _unknown(changes.id)
             self._queued += 1
             self.metrics.queued.set(self._queued)
         return self._threads.submit(self._run, run, changes)
@@ -362,35 +358,14 @@ class Store:
             )
 
 
-def check_name(name: object, what: str) -> str:
-    """Return a name that is safe as a folder's. Raises `InputError` for any other."""
-    if not isinstance(name, str) or not NAMES.fullmatch(name):
-        raise InputError(
-            f"{what} is {quote(name)}: it must have 1 to 64 letters, digits, _ or -, and begin "
-            "with a letter or digit."
-        )
-    return name
+def _unknown(session_id: object) -> RequestError:
+    return RequestError(
+        404,
+        "unknown_session",
+        f"There is no session {quote(session_id)}: session must be an id that create has returned "
+        "and that is not closed. Create one.",
+    )
 
 
 def _is_unfinished(folder: Path) -> bool:
     return all(UNFINISHED.fullmatch(path.name) for path in folder.iterdir())
-
-
-def _whole(value: object, what: str) -> int:
-    """Return a whole number, also one of NumPy's."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise InputError(f"{what} is {quote(value)}: it must be a whole number.")
-    return int(value)
-
-
-def _prompt(request: Mapping[str, Any]) -> str | None:
-    prompt = request.get("prompt")
-    if prompt is not None and not (isinstance(prompt, str) and len(prompt) <= 2000):
-        raise InputError(f"prompt is {quote(prompt)}: it must be a text of at most 2000.")
-    return prompt
-
-
-def _mapping(value: object, what: str) -> Mapping[str, Any]:
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise InputError(f"{what} is {quote(value)}: it must be a map from names to values.")
-    return value

@@ -101,7 +101,13 @@ def test_the_frames_of_a_part_are_passed_on(entrance):
 
 @pytest.mark.parametrize(
     ("message", "status"),
-    [([1], 422), ({"request": "fly"}, 422), ({"request": "step", "session": "x"}, 404)],
+    [
+        ([1], 422),
+        ({"request": "fly"}, 422),
+        ({"request": [1]}, 422),
+        ({"request": "step", "session": "x"}, 404),
+        ({"request": "step", "session": "\ud800"}, 404),
+    ],
 )
 def test_errors_of_a_part_are_those_of_the_entrance(entrance, message, status):
     with pytest.raises(RequestError) as refused:

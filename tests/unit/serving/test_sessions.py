@@ -50,6 +50,14 @@ def test_a_repeated_step_returns_the_same_result(store):
     assert session.committed == 2
 
 
+def test_a_session_that_is_closed_after_it_was_found_is_not_changed(store):
+    session = store.create({"seed": 3})
+    store.remove({"session": session.id}).result()
+    with pytest.raises(RequestError, match="There is no session"):
+        store.submit(lambda: session.step(1, rows(session), None), changes=session)
+    assert not session.folder.exists()
+
+
 @pytest.mark.parametrize(("number", "code"), [(3, "step_out_of_order"), (1, "step_used")])
 def test_a_step_out_of_order_or_of_another_action_is_refused(store, number, code):
     session = store.create({"seed": 3})
