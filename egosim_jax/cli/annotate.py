@@ -98,7 +98,7 @@ class Annotate:
     focal: float | None = None
     """Focal length of the video in its pixels, instead of estimating it."""
     rung: Rung | None = None
-    """Method of camera estimation, instead of trying them in order."""
+    """Only method of cameras to try: static, incremental, focal, global or rotation."""
     depth: str = "sweep"
     """Depth: sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER.
 

@@ -30,11 +30,11 @@ class MakeEpisode:
     """Make an episode of the tabletop world, or of your own cameras, hands and scene.
 
     Without --actions it is drawn by the seed, at the length and size of a model's clips, with
-    ground truth. With --actions there is one .npz or .json file per clip, of world_from_camera
-    (f, 4, 4), intrinsics_px (3, 3) and joints_m (f, hands, 21 or 3, 3), in meters and OpenCV axes;
-    null or NaN where a hand is missing. Intrinsics are those of the clip's size, in pixels: scale
-    them with the video. A .json file may also have a prompt. The scene is a
-    --state, or an --image without hands with its --depth, seen from the first camera.
+    ground truth. With --actions there is one .npz or .json file per clip, in meters and OpenCV
+    axes: world_from_camera (f, 4, 4), intrinsics_px (3, 3), joints_m (f, hands, 21 or 3, 3), null
+    or NaN where a hand is missing. Intrinsics are those of the clip's size, in pixels: scale them
+    with the video. A .json file may also have a prompt. The scene is given by --state, or by
+    --image, without hands, and its --depth, seen from the first camera.
     """
 
     out: Path

@@ -40,13 +40,15 @@ class Generate:
     """CSV or JSONL in EgoSim's columns, or a list of DWM; without it, scenes of the tabletop world.
 
     The columns are ego_prior_video, hand_keypoint_video, first_frame, prompt, video_id, and video
-    if the ground truth is known. The scene is written to OUT/scenes."""
+    if the ground truth is known. Scenes are written to OUT/scenes."""
     robot: bool = False
     """Make the scene with a robot gripper instead of human hands."""
     out: Path | None = None
     """Folder to write to; runs/CONFIG_SEED if not given."""
     weights: Path | None = None
-    """Folder of weights; by default `tabletop` uses those it ships with and `debug` random ones."""
+    """Folder of weights, by default those that ship with the package or were fetched.
+
+    The model `debug` has random ones."""
     lora: Path | None = None
     """LoRA of the video transformer, in PEFT's, diffusers', kohya's or ComfyUI's names."""
     lora_scale: float = 1.0

@@ -39,13 +39,13 @@ class Play:
     seed: int = 0
     """Seed of the tabletop scene."""
     episode: Path | None = None
-    """Episode to begin in the scene of, instead of a seed's."""
+    """Episode whose scene is played in, instead of a seed's."""
     hand: Literal["right", "left"] = "right"
     """Hand that acts."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
-    """Folder of weights, if not those that come with the package."""
+    """Folder of weights, by default those that ship with the package or were fetched."""
     perception: str = "classical"
     """Perception pipeline by name, with its options."""
     steps: int | None = None

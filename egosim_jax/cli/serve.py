@@ -36,7 +36,7 @@ class Serve:
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
-    """Folder of weights, if not those that come with the package."""
+    """Folder of weights, by default those that ship with the package or were fetched."""
     world: Literal["generated", "true"] = "generated"
     """World of the sessions: the model's, or the tabletop world itself."""
     perception: str = "classical"

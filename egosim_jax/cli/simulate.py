@@ -68,7 +68,7 @@ class Simulate:
     out: Path | None = None
     """Folder to write to; runs/simulate_SEED if not given."""
     weights: Path | None = None
-    """Folder of weights, if not those that come with the package."""
+    """Folder of weights, by default those that ship with the package or were fetched."""
 
     def run(self) -> int:
         """Simulate; write videos, states and scores."""
