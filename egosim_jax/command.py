@@ -6,6 +6,7 @@ import difflib
 import errno
 import logging
 import os
+import select
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -204,11 +205,29 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
         interrupts.print_how_to_continue()
         return ExitCode.FAILED
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _reader_ended():
+            return ExitCode.FAILED
         if (reason := system_failure(error)) is not None:
             print(f"error: {reason}", file=sys.stderr)
         else:  # a defect of the program: show where
             traceback.print_exc()
         return ExitCode.FAILED
+    finally:
+        _reader_ended()  # also after --help, which exits
+
+
+def _reader_ended() -> bool:
+    """Return True if nobody reads stdout any more, as behind `head`, and discard what is left."""
+    try:
+        number = sys.stdout.fileno()
+    except (AttributeError, OSError, ValueError):  # closed, or replaced by what is no file
+        return False
+    pipe = select.poll()
+    pipe.register(number, 0)
+    if not any(event & select.POLLERR for _, event in pipe.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+    return True
 
 
 def system_failure(error: BaseException) -> str | None:

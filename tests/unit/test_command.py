@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import os
 import runpy
 import shlex
 import subprocess
@@ -173,6 +174,17 @@ def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):
     assert command.run_with_exit_codes(run) == command.ExitCode.FAILED
     said = "interrupted; to continue: egosim data make --out 'a folder'\n"
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize("words", ["generate --help", "--version", "convert --version"])
+def test_a_reader_that_ends_early_gets_no_traceback(words):
+    code = f"from egosim_jax.cli.__main__ import main; raise SystemExit(main({words.split()!r}))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    assert b"BrokenPipe" not in done.stderr
+    assert b"Traceback" not in done.stderr
 
 
 def test_help_needs_no_jax():
