@@ -71,7 +71,8 @@ class Worker:
             deadline = time.monotonic() + timeout_s
             try:
                 child = self._running(deadline)
-                np.savez(child.folder / "request.npz", **arrays)
+                given: dict[str, Any] = dict(arrays)
+                np.savez(child.folder / "request.npz", **given)
                 value = child.exchange({"options": dict(options)}, deadline)
                 with np.load(child.folder / "reply.npz", allow_pickle=False) as found:
                     return {name: found[name] for name in found.files}, value
