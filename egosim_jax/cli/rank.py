@@ -56,6 +56,7 @@ class Rank:
         check_counts(
             {"--seeds": self.seeds, "--steps": self.steps, "--batch-size": self.batch_size}
         )
+        check_seed(self.seed)
         check_seed(self.seed + self.seeds)
         if (self.goal_image is None) == (self.goal_text is None):
             raise InputError(

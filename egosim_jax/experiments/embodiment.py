@@ -40,7 +40,7 @@ from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.train.fine_tuning import write_trained
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.types import Kind, check_counts
+from egosim_jax.types import Kind, check_counts, check_seed
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 Videos = Mapping[str, Sequence[np.ndarray]]
@@ -78,6 +78,7 @@ def run(settings: Embodiment) -> None:
             "--steps": settings.steps,
         }
     )
+    check_seed(settings.first_scene, name="--first-scene")
     for stage in (settings.human, settings.full, settings.lora, settings.scratch):
         train_config(stage)  # raises for invalid values before any work
     experiment = _Experiment(settings)

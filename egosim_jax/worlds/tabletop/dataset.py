@@ -20,7 +20,7 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import quote_path
 from egosim_jax.processes import run_in_processes
-from egosim_jax.types import InputError, Kind, SceneState, VideoSpec
+from egosim_jax.types import InputError, Kind, SceneState, VideoSpec, check_seed
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
@@ -76,12 +76,13 @@ class DatasetConfig:
         )
 
     def __post_init__(self) -> None:
-        """Raise `InputError` if the dataset would be empty."""
+        """Raise `InputError` if the dataset would be empty, or a setting is out of range."""
         if not self.seeds or self.clips < 1:
             raise InputError(
                 f"The dataset is empty: it has {len(self.seeds)} scenes of {self.clips} clips; "
                 "both must be at least 1. (--scenes, --clips)"
             )
+        check_seed(min(self.seeds))
         if self.attempts is not None and not 0 <= self.attempts <= 1:
             raise InputError(
                 f"{self.attempts:g} is no share of the scenes: it must be between 0 and 1. "

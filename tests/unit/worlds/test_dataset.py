@@ -76,9 +76,10 @@ def test_every_fourth_mixed_scene_has_a_robot(tmp_path):
     assert [record.metadata["extra"]["kind"] for record in records] == ["human", "robot", "human"]
 
 
-def test_an_empty_dataset_is_refused():
-    with pytest.raises(InputError, match="--scenes"):
-        DatasetConfig(seeds=(), clips=1, spec=SPEC, kind="human")
+@pytest.mark.parametrize(("seeds", "message"), [((), "--scenes"), ((-1, 0), "--seed must be")])
+def test_a_dataset_that_is_empty_or_of_a_negative_seed_is_refused(seeds, message):
+    with pytest.raises(InputError, match=message):
+        DatasetConfig(seeds=seeds, clips=1, spec=SPEC, kind="human")
 
 
 def test_the_manifest_has_the_grid_that_the_clips_fit(tmp_path):
