@@ -35,7 +35,7 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.metrics.report import paired_differences, print_table
 from egosim_jax.progress import track
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError, check_counts, check_seed
 
 CAMERAS: tuple[Camera, ...] = ("moving", "fixed")
 REFERENCE = "full"
@@ -54,7 +54,7 @@ REPORT_DEFINITIONS = {
     **DEFINITIONS,
     "spread": "standard deviation over scenes (n - 1), each a mean over seeds",
     "differences": "DWM minus the row, of the means over seeds of each scene; mean over scenes and "
-    "95 % interval by Student's t",
+    "95 % interval by the paired bootstrap",
     "paper": "figures of Kim et al. 2026, on other data: only their order can be compared",
 }
 
@@ -100,6 +100,7 @@ def _check(settings: DWM) -> tuple[str, ...]:
     """Return the models to compare. Raises `InputError` for invalid settings before any work."""
     counts = ("moving_scenes", "fixed_scenes", "held_out", "seeds", "steps", "batch_size", "rank")
     check_counts({f"--{name.replace('_', '-')}": getattr(settings, name) for name in counts})
+    check_seed(settings.first_scene, name="--first-scene")
     for stage in (settings.autoencoder, settings.base, settings.adaptation):
         train_config(stage)
     if unknown := sorted({*settings.only} - {*VARIANTS}):
