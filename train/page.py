@@ -70,15 +70,15 @@ def write_page(run: Path, out: Path | None = None) -> Path:
     stages = stages_of(run)
     if not stages:
         raise InputError(
-            f"{run} is not the folder of a training: it needs {METRICS}, or folders of stages that "
-            "have it. Give the --out of egosim train."
+            f"{run} is not the folder of a training: it needs {METRICS} and {CONFIG}, or folders "
+            "of stages that have both. Give the --out of egosim train."
         )
     name = run.resolve().name
     parts = [_HEAD.format(title=escape(f"Training {name}")), f"<h1>Training {escape(name)}</h1>"]
     for stage in stages:
         parts += stage.sections()
-    if (settings := run / CONFIG).exists() and stages[0].folder != run:
-        parts += _details("Settings of the whole run", upgrade(read_json(settings)))
+    if stages[0].folder != run:
+        parts += _details("Settings of the whole run", Stage(run).json(CONFIG))
     path = out or run / PAGE
     write_text(path, "\n".join([*parts, "</body></html>\n"]))
     return path
@@ -86,14 +86,12 @@ def write_page(run: Path, out: Path | None = None) -> Path:
 
 def stages_of(run: Path) -> list[Stage]:
     """Return the trainings in a run folder: its own, or those of its stages, in their order."""
-    if (run / METRICS).exists():
-        return [Stage(run)]
-    folders = [path.parent for path in sorted(run.glob(f"*/{METRICS}"))]
-    order = list(read_json(run / CONFIG)) if (run / CONFIG).exists() else []
-    places = {name: place for place, name in enumerate(order)}
-    return [
-        Stage(folder) for folder in sorted(folders, key=lambda f: places.get(f.name, len(order)))
-    ]
+    if (alone := Stage(run)).is_training:
+        return [alone]
+    found = (Stage(path.parent) for path in sorted(run.glob(f"*/{METRICS}")))
+    stages = [stage for stage in found if stage.is_training]
+    places = {name: place for place, name in enumerate(alone.json(CONFIG))}
+    return sorted(stages, key=lambda stage: places.get(stage.folder.name, len(places)))
 
 
 @dataclass(frozen=True)
@@ -103,6 +101,11 @@ class Stage:
     folder: Path
     """Folder with metrics.jsonl, config.json, and samples/ if there are sample clips."""
 
+    @property
+    def is_training(self) -> bool:
+        """True if a training has written the folder: evaluations have such files, too."""
+        return (self.folder / METRICS).exists() and "training" in self.json(CONFIG)
+
     def sections(self) -> Iterator[str]:
         """Yield the HTML of the training."""
         yield f"<h2>{escape(self.title)}</h2>"
@@ -110,19 +113,19 @@ class Stage:
             yield f'<img alt="curves" src="{_data("image/svg+xml", draw_curves(self.curves))}">'
         yield '<div class="row"><div><h3>Last values</h3>'
         yield _table({name: f"{y[-1]:.6g}" for name, (_, y) in self.metrics.items()})
-        if times := self._json(TIMES):
+        if times := self.json(TIMES):
             total = sum(times.values())
             yield "</div><div><h3>Seconds since the last start</h3>"
             yield _table({name: f"{s:.1f} ({s / total:.0%})" for name, s in times.items()})
         yield "</div></div>"
         yield from self._samples()
-        yield from _details("Settings", self._json(CONFIG))
-        yield from _details("Versions and devices", self._json(ENVIRONMENT))
+        yield from _details("Settings", self.json(CONFIG))
+        yield from _details("Versions and devices", self.json(ENVIRONMENT))
 
     @property
     def title(self) -> str:
         """Name of the training, with its progress."""
-        steps = self._json(CONFIG).get("training", {}).get("steps")
+        steps = self.json(CONFIG).get("training", {}).get("steps")
         last = max((int(x[-1]) for x, _ in self.metrics.values()), default=0)
         progress = f"step {last:,}" + ("" if steps is None else f" of {steps:,}")
         return f"{self.folder.resolve().name}: {progress}"
@@ -156,7 +159,8 @@ class Stage:
         first = [name for name in ("loss", "lr", "grad_norm") if name in plots]
         return {name: plots[name] for name in [*first, *(n for n in plots if n not in first)]}
 
-    def _json(self, name: str) -> dict[str, Any]:
+    def json(self, name: str) -> dict[str, Any]:
+        """Return the values of a file under today's names; none if it is not there."""
         path = self.folder / name
         value = upgrade(read_json(path)) if path.exists() else {}
         return value if isinstance(value, dict) else {}

@@ -59,6 +59,15 @@ def test_stages_are_in_the_order_of_the_recipe(tmp_path):
     assert "Settings of the whole run" in page
 
 
+def test_the_scores_of_an_evaluation_are_no_training(tmp_path):
+    write_stage(tmp_path / "denoiser")
+    for folder in (tmp_path / "generated", tmp_path):
+        folder.mkdir(exist_ok=True)
+        (folder / "metrics.jsonl").write_text('{"video_id": "a", "generated": {"psnr": 20.0}}\n')
+        (folder / "config.json").write_text('{"model": {}, "seed": 0}')
+    assert [stage.folder.name for stage in stages_of(tmp_path)] == ["denoiser"]
+
+
 def test_a_long_log_is_drawn_by_means(tmp_path):
     steps = np.arange(1, 10 * MAX_POINTS + 1)
     short = draw_curves({"loss": {"training": (steps[:MAX_POINTS], np.sin(steps[:MAX_POINTS]))}})
