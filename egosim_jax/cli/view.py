@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from egosim_jax.command import ExitCode
+from egosim_jax.io.journal import NAME as JOURNAL
 from egosim_jax.rendering.portrait import Up, up_of, write_portrait
 from egosim_jax.rendering.recording import RECORDING
 from egosim_jax.train.page import PAGE, stages_of, write_page
@@ -44,10 +45,10 @@ class View:
         recording = self.path / RECORDING if self.path.is_dir() else self.path
         if recording.suffix == ".rrd" and recording.exists():
             return _open(recording, self.host)
-        if self.path.is_dir() and (self.path / "report.json").exists():
-            if (page := self.path / PAGE).exists():  # of an evaluation, or of annotated clips
-                print(page)
-                return ExitCode.DONE
+        if (self.path / "report.json").exists() and (page := self.path / PAGE).exists():
+            print(page)  # of an evaluation, or of annotated clips
+            return ExitCode.DONE
+        if (self.path / JOURNAL).exists():
             raise InputError(
                 f"{self.path} has no {RECORDING}: it was simulated without Rerun. Install it (pip "
                 "install 'egosim-jax[viewer]') and run the same egosim simulate again, which adds "
@@ -67,9 +68,9 @@ class View:
         return ExitCode.DONE
 
     def _state(self) -> SceneState:
-        from egosim_jax.state.snapshot import load, read_ply
+        from egosim_jax.state.snapshot import DESCRIPTION, load, read_ply
 
-        if self.path.is_dir():
+        if (self.path / DESCRIPTION).exists():
             return load(self.path)
         if self.path.suffix == ".ply":
             return read_ply(self.path)
