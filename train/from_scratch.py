@@ -11,10 +11,10 @@ from __future__ import annotations
 import os
 import sys
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax import configs
 from egosim_jax.command import ExitCode, HelpGroups
@@ -27,11 +27,14 @@ from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.data.metadata import ClipFiles
     from egosim_jax.models.wan.vae import WanVAE
     from egosim_jax.networks import ModelConfig
 
 ENCODE_BATCH = 8
 """Clips that are encoded together."""
+HELD_OUT = 8
+"""Number of clips of which one validates, in metadata that names none for it."""
 SYNTHETIC_CLIPS = Path("clips") / "metadata.csv"
 """Metadata of the synthetic clips, in the run folder."""
 FIRST_TRAINED = 1000
@@ -247,7 +250,7 @@ class FromClips(FromScratch):
 
     help_groups: ClassVar[HelpGroups] = {"data": ("clip_frames",), **FromScratch.help_groups}
     metadata: Path | None = None
-    """CSV or JSONL in EgoSim's columns, with video and split."""
+    """CSV or JSONL in EgoSim's columns; if no clip has the split test, every eighth is held out."""
     clips: int = 0
     """Synthetic clips to make instead, of the tabletop world; every fourth is for testing."""
     clip_frames: int = 61
@@ -264,7 +267,10 @@ class FromClips(FromScratch):
         metadata = self.metadata or out / SYNTHETIC_CLIPS
         if self.metadata is None and not metadata.exists():
             self._make_clips(metadata.parent)
-        return {split: self._pack(metadata, split, out) for split in ("train", "test")}
+        return {
+            "train": self._pack(metadata, "train", out),
+            "test": self._pack(metadata, "test", out),
+        }
 
     def _make_clips(self, folder: Path) -> None:
         from egosim_jax.data.clips import write_clips
@@ -276,14 +282,14 @@ class FromClips(FromScratch):
         clips = (replace(clip, extra=extra) for clip, extra in zip(made, splits, strict=True))
         write_clips(folder, clips, fps=spec.fps)
 
-    def _pack(self, metadata: Path, split: str, out: Path) -> Path:
+    def _pack(self, metadata: Path, split: Literal["train", "test"], out: Path) -> Path:
         from egosim_jax.data.manifest import MANIFEST
-        from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.data.metadata import read_metadata
         from egosim_jax.data.pack import pack
 
         frames = out / "frames" / split
         if not (frames / MANIFEST).exists():
-            items = select(read_metadata(metadata), where=f"split={split}")
+            items = of_split(read_metadata(metadata), split)
             model = configs.get(self.config)
             progress = pack(
                 items,
@@ -296,6 +302,28 @@ class FromClips(FromScratch):
                 if problem:
                     print(f"skipped: {problem}", file=sys.stderr)
         return frames
+
+
+def of_split(items: Sequence[ClipFiles], split: Literal["train", "test"]) -> list[ClipFiles]:
+    """Return the clips to train on, or those to validate on.
+
+    If all are to be trained on, by their column `split` or without it, every eighth clip is held
+    out, or else the last. Raises `InputError` for a single clip and for other splits.
+    """
+    from egosim_jax.data.metadata import select
+
+    if {item.extra.get("split", "train") for item in items} != {"train"}:
+        return select(items, where=f"split={split}")
+    if len(items) < 2:
+        raise InputError(
+            "The metadata has one clip: another one is needed to validate on. Cut the video into "
+            "shorter clips, or add one. (--metadata)"
+        )
+    held_out = items[HELD_OUT - 1 :: HELD_OUT] or items[-1:]
+    if split == "test":
+        print(f"no clip has the split test: {len(held_out)} of {len(items)} are held out")
+        return list(held_out)
+    return [item for item in items if item not in held_out]
 
 
 @dataclass(frozen=True, kw_only=True)
