@@ -30,7 +30,7 @@ from egosim_jax.io.atomic import append_line
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted import listing, quote_path, read_lines
+from egosim_jax.io.untrusted import listing, quote, quote_path, read_lines
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import ModelConfig, Networks
@@ -213,12 +213,24 @@ class BatchJob:
                     )
 
     def _list(self, windows: Sequence[Window]) -> None:
-        """Report existing clips whose results an interruption prevented."""
+        """Report existing clips whose results an interruption prevented.
+
+        Raises `InputError` if one is of another window or prompt, and would be taken for this one.
+        """
         results = read_results(self.out) or {}
-        done = {name for name, line in results.items() if line.get("status") == "done"}
         for window in windows:
-            if window.output_id not in done:
+            line = results.get(window.output_id, {})
+            if line.get("status") != "done":
                 self._report(window, status="done", seed=seed_of(self.seed, window.output_id))
+                continue
+            own = {"source_id": window.files.video_id, "start": window.start,
+                   "prompt": window.files.prompt}  # fmt: skip
+            if differing := [name for name in own if line.get(name, own[name]) != own[name]]:
+                raise InputError(
+                    f"{self._video(window)} exists and cannot be skipped, because it has another "
+                    f"{differing[0]}: {quote(line[differing[0]])}, not {quote(own[differing[0]])}. "
+                    "Choose another --out, or remove the clip. (--skip-existing)"
+                )
 
     def _check(self, windows: Sequence[Window]) -> tuple[list[Window], list[Failure]]:
         """Return the windows whose inputs are valid, and the others with their problems."""

@@ -1,17 +1,20 @@
 """`egosim generate`: input that is refused before anything is compiled."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
 from egosim_jax import configs
+from egosim_jax.batch import BatchJob, windows_of
 from egosim_jax.cli.__main__ import main
 from egosim_jax.command import ExitCode
 from egosim_jax.data.clips import write_clips
+from egosim_jax.data.metadata import read_metadata
 from egosim_jax.testing import write_weights
-from egosim_jax.types import VideoSpec
+from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 
@@ -38,3 +41,24 @@ def test_two_clips_that_would_write_one_file_are_refused(clip, other, tmp_path, 
     assert main(["generate", *args]) == ExitCode.USAGE
     assert f"The clips x and {other} would both write {other}.mp4" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("prompt", "starts", "message"),
+    [("Pour the tea.", (0,), "another prompt"), ("", (4,), "another start: 0, not 4")],
+)
+def test_a_clip_of_another_prompt_or_window_is_not_taken_for_this_one(
+    clip, prompt, starts, message, tmp_path
+):
+    clip = replace(clip, prompt="Lift the cup.")
+    out, job = tmp_path / "out", partial(BatchJob, model=configs.get("debug"), weights=None)
+    changed = replace(clip, prompt=prompt or clip.prompt)
+    before, after = (
+        windows_of(read_metadata(write_clips(tmp_path / name, [one], fps=8)), chosen)
+        for name, one, chosen in (("before", clip, (0,)), ("after", changed, starts))
+    )
+    job(out=out)._report(before[0], status="done")
+    (out / f"{clip.video_id}.mp4").touch()
+    job(out=out, skip_existing=True).generate(before)
+    with pytest.raises(InputError, match=message):
+        job(out=out, skip_existing=True).generate(after)
