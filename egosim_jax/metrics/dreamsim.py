@@ -232,10 +232,13 @@ def _read_lora(
             )
         factors[int(match[1]), match[2], match[3]] = array
     settings = read_json(config)
-    if not isinstance(settings, dict) or not all(
-        isinstance(settings.get(key), (int, float)) for key in ("r", "lora_alpha")
-    ):
-        raise InputError(f"{quote_path(config)} must have the numbers r and lora_alpha.")
+    for key in ("r", "lora_alpha"):
+        value = settings.get(key) if isinstance(settings, dict) else None
+        if not (isinstance(value, (int, float)) and 0 < value < float("inf")):
+            raise InputError(
+                f"{quote_path(config)} has {quote(value)} as {key}: r and lora_alpha must be "
+                "positive numbers. Give that of release v0.2.0. (--dreamsim)"
+            )
     return factors, settings
 
 

@@ -1,6 +1,7 @@
 """DreamSim versus transformers' networks on random weights in the layout of its release."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -154,6 +155,19 @@ def test_a_folder_without_a_network_is_refused(release, tmp_path):
         DreamSim(tmp_path)
     with pytest.raises(InputError, match=r"adapter_config\.json"):
         DreamSim(tmp_path / "none")
+
+
+@pytest.mark.parametrize("rank", ["0", "NaN", "null", '"16"'])
+def test_a_lora_without_a_valid_rank_is_refused(release, tmp_path, rank):
+    folder, _ = release
+    for path in folder.iterdir():
+        if path.name != "ensemble_lora":
+            (tmp_path / path.name).symlink_to(path)
+    shutil.copytree(folder / "ensemble_lora", tmp_path / "ensemble_lora")
+    config = tmp_path / "ensemble_lora" / "adapter_config.json"
+    config.write_text(f'{{"r": {rank}, "lora_alpha": 16}}')
+    with pytest.raises(InputError, match="as r: r and lora_alpha must be positive"):
+        DreamSim(tmp_path)
 
 
 def test_a_lora_of_other_networks_is_refused(release, tmp_path):
