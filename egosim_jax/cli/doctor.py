@@ -62,7 +62,7 @@ class Doctor:
         console = Console(width=120, markup=False)
         console.print(f"egosim-jax {metadata.version('egosim-jax')}, {platform.platform()}")
         console.print(f"Python {platform.python_version()}, {os.cpu_count()} CPUs")
-        console.print(", ".join(f"{name} {metadata.version(name)}" for name in LIBRARIES))
+        console.print(", ".join(f"{name} {_version(name)}" for name in LIBRARIES))
         for device in jax.devices():
             console.print(f"device {device.id}: {device.device_kind}{_memory(device)}")
         for module, extra in EXTRAS.items():
@@ -89,6 +89,14 @@ def _default_folders() -> Iterator[Path]:
     here = sorted(HERE.iterdir()) if HERE.is_dir() else ()
     yield from (folder for folder in here if folder.is_dir())
     yield from filter(is_fetched, map(fetched_folder, configs.releases()))
+
+
+def _version(package: str) -> str:
+    """Return the version of a package; another one may have its module, as OpenCV has several."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _memory(device: object) -> str:

@@ -2,9 +2,18 @@
 
 from pathlib import Path
 
+from egosim_jax.cli import doctor
 from egosim_jax.cli.doctor import Doctor
 from egosim_jax.configs import releases
 from egosim_jax.io import hub
+
+
+def test_a_package_that_is_installed_under_another_name_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(doctor, "LIBRARIES", ("jax", "opencv-by-another-name"))
+    monkeypatch.setattr(doctor, "_print_models", lambda *_: None)
+    assert Doctor().run() == 0
+    assert "opencv-by-another-name not installed" in " ".join(capsys.readouterr().out.split())
 
 
 def test_fetched_weights_are_listed_and_files_are_not(tmp_path, monkeypatch):
