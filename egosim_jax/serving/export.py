@@ -47,7 +47,7 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
             f"{', '.join(list(known)[:10]) or 'none'}. (--session)"
         )
     found, damaged = [], {}
-    for path in [known[name] for name in names] or paths:
+    for path in [known[name] for name in dict.fromkeys(names)] or paths:
         try:
             session = Session(path, _recorded(path))
             session.check()

@@ -111,6 +111,10 @@ def test_a_recording_is_written(folder, tmp_path):
     assert (tmp_path / "one.rrd").stat().st_size > 1000
 
 
+def test_a_session_that_is_named_twice_is_exported_once(folder):
+    assert [s.id for s in export.open_sessions(folder, ["one", "one"])[0]] == ["one"]
+
+
 def test_an_unknown_session_is_refused(folder, tmp_path):
     with pytest.raises(InputError, match="no session 'two'"):
         export.open_sessions(folder, ["two"])
