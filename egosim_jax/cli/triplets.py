@@ -57,8 +57,9 @@ class Static:
         from egosim_jax.conditions import repeated, static_of, static_triplet
         from egosim_jax.data.clips import write_clips
         from egosim_jax.io.video import read_video
-        from egosim_jax.types import InputError
+        from egosim_jax.types import InputError, check_counts
 
+        check_counts({"--fps": self.fps})
         action = read_action(self.action, height=self.height, width=self.width, prompt=self.prompt)
         target = None if self.video is None else read_video(self.video).frames
         if self.scene is not None:

@@ -126,6 +126,8 @@ def test_a_fixed_camera_repeats_the_first_frame(clip, action, tmp_path):
     assert near(triplet.prior, clip.frames[:1].repeat(5, axis=0))
     with pytest.raises(InputError, match="There is no scene"):
         Static(**files).run()
+    with pytest.raises(InputError, match="--fps must be at least 1, not 0"):
+        Static(video=tmp_path / "clip.mp4", fps=0, **files).run()
     write_video(tmp_path / "short.mp4", clip.frames[:4], 8)
     with pytest.raises(InputError, match=r"must be uint8 \(5, 48, 80, 3\)"):
         Static(video=tmp_path / "short.mp4", **files).run()
