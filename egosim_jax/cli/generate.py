@@ -152,6 +152,11 @@ class Generate:
         check_seed(self.seed + (self.limit or 0))
         if min(self.start) < 0:
             raise InputError(f"--start must be at least 0, not {min(self.start)}.")
+        if self.robot and self.metadata is not None:
+            raise InputError(
+                "--robot is of the tabletop world: the clips of --metadata have their own hands. "
+                "Omit one of them. (--robot, --metadata)"
+            )
         if self.lora is not None and self._weights is None:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
 

@@ -63,6 +63,11 @@ class Rank:
                 "Candidates are ranked by one goal: either a picture or a text of it, not "
                 f"{'both' if self.goal_text else 'neither'}. (--goal-image, --goal-text)"
             )
+        if self.goal_image is not None and self.xclip is not None:
+            raise InputError(
+                "A picture is compared by LPIPS, not by X-CLIP: omit the network, or give a text "
+                "of the goal. (--xclip, --goal-image)"
+            )
         if self.goal_image is not None:
             goal, measure = str(self.goal_image), "-LPIPS of the last frame to the goal"
             score = ranking.by_picture(read_image(self.goal_image))

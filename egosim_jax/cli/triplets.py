@@ -81,7 +81,8 @@ class Static:
         from egosim_jax.rendering.mano import mano_hands, read_mano, read_poses
         from egosim_jax.types import InputError
 
-        if self.mano_poses is None and self.mano_right is None and self.mano_left is None:
+        given = (self.mano_poses, self.mano_right, self.mano_left)
+        if given == (None, None, None) and not self.add_mean:
             return None
         if self.mano_poses is None or self.mano_right is None:
             raise InputError(

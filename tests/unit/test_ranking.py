@@ -36,6 +36,7 @@ def test_a_text_without_a_network_is_refused_with_the_way_out():
         ((), "not neither"),
         (("--goal-text", "a cup", "--goal-image", "goal.png"), "not both"),
         (("--goal-text", "a cup"), "folder of an X-CLIP model"),
+        (("--goal-image", "goal.png", "--xclip", "clip"), "compared by LPIPS, not by X-CLIP"),
         (("--goal-image", "goal.png", "--seeds", "0"), "--seeds must be at least 1, not 0"),
         (("--goal-image", "goal.png", "--seed", "-1"), "--seed must be a whole number from 0"),
     ],

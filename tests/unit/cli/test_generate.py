@@ -33,6 +33,12 @@ def clip():
     return to_triplet(next(make_sequence(0, spec=VideoSpec(frames=9, height=64, width=96))))
 
 
+def test_a_robot_cannot_be_given_to_recorded_clips(tmp_path, capsys):
+    options = ["--metadata", "a.csv", "--robot", "--out", str(tmp_path / "out")]
+    assert main(["generate", "--config", "debug", *options]) == ExitCode.USAGE
+    assert "have their own hands" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("other", ["x_cmp", "x_vae"])
 def test_two_clips_that_would_write_one_file_are_refused(clip, other, tmp_path, capsys):
     clips = [replace(clip, video_id=name) for name in ("x", other)]

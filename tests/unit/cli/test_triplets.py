@@ -154,6 +154,8 @@ def test_hands_of_mano_replace_those_of_keypoints(clip, action, tmp_path):
     assert (drawn[:, 0] > drawn[:, 1]).mean() > 0.9  # only the right hand, in red
     with pytest.raises(InputError, match="give both"):
         Static(**files, mano_right=mano["mano_right"]).run()
+    with pytest.raises(InputError, match="give both"):
+        Static(**files, add_mean=True).run()
     np.savez(tmp_path / "poses.npz", **{n: v[:4] if n != "betas" else v for n, v in poses.items()})
     with pytest.raises(InputError, match="hands have 4 frames, the cameras 5"):
         Static(**files, **mano).run()
