@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,11 +12,16 @@ from jaxtyping import Float
 from egosim_jax.geometry import invert, pixels_of, transform
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.untrusted import quote, read_json
 from egosim_jax.state.depth import DEPTH_M
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
 
 MAX_SPEED_M_S = 20.0
 """Fastest camera that is accepted, in meters per second."""
+ARRAYS = ("world_from_camera", "intrinsics_px", "joints_m")
+"""Arrays of a file of an action."""
+MAX_JSON_BYTES = 256 << 20
+"""Largest .json file of an action in bytes."""
 _FINGERS = np.arange(1, 21).reshape(5, 4)
 ORDERS = {
     "MANO's (index, middle, little, ring, thumb, then the tips)": np.array(
@@ -151,3 +158,79 @@ def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -
         kind=kind,
         prompt=prompt,
     )
+
+
+def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> Action:
+    """Return the action of a user's .npz or .json file (`egosim episode make`).
+
+    `prompt` replaces the file's. The number of joints gives the kind of hands. Raises `InputError`
+    naming the file.
+    """
+    values: Mapping[str, Any]
+    if path.suffix == ".json":
+        values = _read_json(path)
+    elif path.suffix == ".npz":
+        values = read_arrays(path, {}, others=ARRAYS, packed=True)
+    else:
+        raise InputError(f"{path}: actions are read from .npz and .json files. (--actions)")
+    written = values.get("prompt")
+    if not isinstance(written, str | None):
+        raise InputError(f"{path}: prompt is {quote(written)}: it must be text.")
+    prompt = prompt or written
+    if not prompt:
+        raise InputError(f"{path} has no prompt: give one per clip. (--prompts)")
+    joints = np.asarray(values["joints_m"])
+    kinds: dict[int, Kind] = {count: kind for kind, count in JOINTS.items()}
+    try:
+        if joints.ndim != 4 or joints.shape[2] not in kinds:
+            raise InputError(
+                f"joints_m has shape {joints.shape}: it must be (frames, hands, joints, 3), with "
+                "21 joints of a human hand or 3 of a gripper."
+            )
+        return Action(
+            cameras=Cameras(
+                world_from_camera=np.asarray(values["world_from_camera"], float),
+                intrinsics_px=np.asarray(values["intrinsics_px"], float),
+                height=height,
+                width=width,
+            ),
+            joints_m=joints.astype(float),
+            kind=kinds[joints.shape[2]],
+            prompt=prompt,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return the arrays and the prompt of a .json file; a hand that is null has joints of NaN."""
+    written = read_json(path, limit=MAX_JSON_BYTES)
+    if not isinstance(written, dict) or not written.keys() <= {*ARRAYS, "prompt"}:
+        raise InputError(f"{path}: must be an object of {', '.join(ARRAYS)} and prompt.")
+    values: dict[str, Any] = {"prompt": written.get("prompt")}
+    for name in ARRAYS:
+        rows = written.get(name)
+        if name == "joints_m" and isinstance(rows, list):
+            rows = _fill_missing(rows)
+        try:
+            values[name] = np.array(rows, float)
+        except (ValueError, TypeError, OverflowError):
+            raise InputError(
+                f"{path}: {name} is {quote(rows)}, not an array of numbers: all rows must have "
+                "equal lengths."
+            ) from None
+    return values
+
+
+def _fill_missing(frames: list[Any]) -> list[Any]:
+    """Return frames of hands with null replaced by as many NaN joints as the others have.
+
+    Where all are null, they are human hands.
+    """
+    lists = [hands for hands in frames if isinstance(hands, list)]
+    given = [hand for hands in lists for hand in hands if isinstance(hand, list)]
+    nan = [[float("nan")] * 3] * (len(given[0]) if given else JOINTS["human"])
+    return [
+        [nan if hand is None else hand for hand in hands] if isinstance(hands, list) else hands
+        for hands in frames
+    ]

@@ -53,7 +53,7 @@ class Static:
 
     def run(self) -> int:
         """Read, render and write."""
-        from egosim_jax.cli.episode import read_action
+        from egosim_jax.actions import read_action
         from egosim_jax.conditions import repeated, static_of, static_triplet
         from egosim_jax.data.clips import write_clips
         from egosim_jax.io.video import read_video
