@@ -15,22 +15,22 @@ patch projection replaces that of its base.
 from __future__ import annotations
 
 import math
-import os
 import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from einops import EinopsError
 
+from egosim_jax.convert.lora_settings import Settings, finite, settings_of
 from egosim_jax.convert.rules import Rule, shape_only
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
-from egosim_jax.io.untrusted import listing, parse_json, quote, quote_path, quote_text, read_json
+from egosim_jax.io.untrusted import listing, quote_path, quote_text
 from egosim_jax.models.lora import (
     BASE,
     MOST_RANK,
@@ -64,8 +64,6 @@ FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
 IN_FULL = "non_lora_weights"
 """Stem of the file, next to a LoRA, of weights that replace those of the base."""
 SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
-ADAPTER, ADAPTER_ENTRY = "adapter_config.json", "lora_adapter_metadata"
-"""Settings of PEFT: file next to the weights, and diffusers' entry in a header."""
 
 
 @dataclass(frozen=True)
@@ -88,23 +86,6 @@ class Location:
         return self.path if self.layer is None else f"{self.path}, block {self.layer}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Settings of a LoRA that hold for all its layers."""
-
-    alpha: float | None = None
-    """Alpha of layers without one; None: the rank."""
-    rank_stabilized: bool = False
-    """True for a scale of alpha / sqrt(r), as in rsLoRA, instead of alpha / r."""
-
-    def scale(self, alpha: float | None, rank: int) -> float:
-        """Return the factor of a low-rank product."""
-        alpha = self.alpha if alpha is None else alpha
-        if alpha is None:
-            return 1.0
-        return alpha / (math.sqrt(rank) if self.rank_stabilized else rank)
-
-
 def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
     """Return the changes of a LoRA by path, in float32; files in our format have the same paths.
 
@@ -124,7 +105,7 @@ def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
         changes: dict[str, Change] = {**from_tensors(arrays)}
     else:
         with np.errstate(over="ignore", invalid="ignore"):  # `check` refuses values not finite
-            changes = _translated(source, config, want, _settings(path, metadata))
+            changes = _translated(source, config, want, settings_of(path, metadata))
     if in_full is not None:
         changes |= _values(in_full, config, want)
     if not changes:
@@ -183,53 +164,6 @@ def _values(
     if problems:
         raise InputError(f"{source.name} does not fit this network: {listing(problems)}.")
     return changes
-
-
-def _settings(path: Path, metadata: Mapping[str, str]) -> Settings:
-    """Read the settings from the adapter's config or from the header."""
-    adapter = (path if path.is_dir() else path.parent) / ADAPTER
-    if os.path.lexists(adapter):
-        return _peft(read_json(adapter), source=quote_path(adapter))
-    if ADAPTER_ENTRY in metadata:
-        source = f"{ADAPTER_ENTRY} of {quote_path(path)}"
-        adapted = parse_json(metadata[ADAPTER_ENTRY].encode(), source=source)
-        return _peft(
-            {name.removeprefix("transformer."): value for name, value in adapted.items()}
-            if isinstance(adapted, dict)
-            else adapted,
-            source=source,
-        )
-    alpha = metadata.get("alpha", metadata.get("ss_network_alpha", "None"))
-    if alpha in ("None", ""):
-        return Settings()
-    return Settings(alpha=_number(alpha, f"The alpha of {quote_path(path)}"))
-
-
-def _peft(adapter: Any, *, source: str) -> Settings:
-    match adapter:
-        case {"lora_alpha": alpha}:
-            pass
-        case _:
-            raise InputError(f"{source} has no lora_alpha, which PEFT writes. Add it.")
-    if adapter.get("alpha_pattern"):
-        raise InputError(
-            f"{source} has an alpha_pattern, which is not supported: set one lora_alpha."
-        )
-    return Settings(
-        alpha=_number(alpha, f"lora_alpha of {source}"),
-        rank_stabilized=adapter.get("use_rslora") is True,
-    )
-
-
-def _number(value: Any, what: str) -> float:
-    """Return a finite number. Raises `InputError` for everything else."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{what} is {quote(value)}, which is not a finite number.")
-    return number
 
 
 def _translated(
@@ -326,7 +260,7 @@ def _pair(
     if (scalar := found.get("alpha")) is not None:
         if math.prod(scalar.shape) != 1:
             raise RefusedError(f"has {math.prod(scalar.shape)} numbers as alpha; expected one")
-        alpha = _number(float(scalar.array().item()), f"The alpha of {location}")
+        alpha = finite(float(scalar.array().item()), f"The alpha of {location}")
     return Pair(down, up, settings.scale(alpha, rank))
 
 
