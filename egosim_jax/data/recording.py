@@ -16,6 +16,7 @@ Paths inside the folder are stored relative to it, all others absolute. Nothing 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -55,6 +56,8 @@ MAX_BYTES = 1 << 28
 """Largest description in bytes."""
 MAX_FPS = 1000
 """Highest frame rate that is accepted."""
+RATE = re.compile(r"[0-9]{1,40}(?:\.[0-9]{1,40}|/[1-9][0-9]{0,39})?")
+"""Frame rate in a description; a fraction with an exponent would be computed in full."""
 MAX_TEXT = 10_000
 """Longest caption, name or entry of the provenance, in characters."""
 _DTYPES = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64",
@@ -390,17 +393,15 @@ def _load(folder: Path) -> Recording:
     points = {n: arrays.pop(n) for n in list(_DTYPES)[3:] if n in arrays}
     if points and "points_m" not in points:
         raise InputError(f"{ARRAYS} has {', '.join(points)}, but no points_m.")
-    try:
-        fps = Fraction(written["fps"])
-    except (ValueError, ZeroDivisionError) as error:
-        raise InputError(f"{DESCRIPTION}: fps is {quote(written['fps'])}.") from error
+    if not RATE.fullmatch(written["fps"]):
+        raise InputError(f"{DESCRIPTION}: fps is {quote(written['fps'])}, not a rate.")
     names = ("recording_id", "start", "frames", "height", "width", "metric", "kind", "caption",
              "provenance")  # fmt: skip
     return Recording(
         **{name: written.get(name) for name in names},
         **arrays,
         video=_found_path(written.get("video"), folder),
-        fps=fps,
+        fps=Fraction(written["fps"]),
         names=tuple(written["names"]),
         depth=_found_depth(written.get("depth"), folder),
         points=ScenePoints(**points) if points else None,

@@ -186,6 +186,7 @@ def test_a_changed_or_hostile_description_is_refused(tmp_path):
         ('"video": "video.mp4"', '"video": "../../etc/video.mp4"', r"'\.\.'"),
         ('"frames": 6', '"frames": 1e9', "expected int"),
         ('"fps": "30000/1001"', '"fps": "1/0"', "fps"),
+        ('"fps": "30000/1001"', '"fps": "1e999999999"', "fps"),
         ('"unit_m": 0.001', '"unit_m": null', "depth"),
     ):
         recording.save(tmp_path)
