@@ -14,7 +14,8 @@ from itertools import islice
 from pathlib import Path
 
 from egosim_jax.data.readers import Entry, Reader
-from egosim_jax.data.recording import DESCRIPTION, Recording
+from egosim_jax.data.recorded_files import DESCRIPTION
+from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.types import InputError, check_counts
 

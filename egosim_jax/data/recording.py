@@ -27,6 +27,13 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from egosim_jax.data.metadata import SAFE_IDS, is_safe_id
+from egosim_jax.data.recorded_files import (
+    DESCRIPTION,
+    DepthFiles,
+    found_depth,
+    found_path,
+    stored_path,
+)
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.depth_images import read_depth_image
@@ -34,7 +41,7 @@ from egosim_jax.io.digest import sha256
 from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.run import write_json
 from egosim_jax.io.segments import read_segment
-from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_json
+from egosim_jax.io.untrusted import quote, quote_path, read_json
 from egosim_jax.io.video import Video
 from egosim_jax.types import (
     HAND_SIZE_M,
@@ -49,7 +56,7 @@ from egosim_jax.types import (
 )
 
 FORMAT, VERSION = "egosim_jax.recording", 1
-DESCRIPTION, ARRAYS = "recording.json", "arrays.npz"
+ARRAYS = "arrays.npz"
 MAX_FRAMES = 1 << 20
 """Longest recording in frames: about ten hours."""
 MAX_BYTES = 1 << 28
@@ -63,16 +70,6 @@ MAX_TEXT = 10_000
 _DTYPES = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64",
            "points_m": "float32", "colors": "uint8", "error_px": "float32",
            "frames": "int32", "indices": "int32", "pixels_px": "float32"}  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthFiles:
-    """Measured depth: one file per frame, of the picture's aspect but maybe another size."""
-
-    paths: tuple[Path | None, ...]
-    """PNG of 16 bits or npy of each frame; None where a frame has none."""
-    unit_m: float
-    """Length of one unit of the files in meters: 0.001 for millimeters."""
 
 
 @no_type_check
@@ -238,13 +235,13 @@ class Recording:
             np.savez(temporary, **arrays)
         depth = self.depth and {
             "unit_m": self.depth.unit_m,
-            "paths": [path and _stored_path(path, folder) for path in self.depth.paths],
+            "paths": [path and stored_path(path, folder) for path in self.depth.paths],
         }
         description = {
             "format": FORMAT,
             "version": VERSION,
             "recording_id": self.recording_id,
-            "video": _stored_path(self.video, folder),
+            "video": stored_path(self.video, folder),
             "start": int(self.start),
             "frames": int(self.frames),
             "fps": str(self.fps),
@@ -351,24 +348,6 @@ def _array(recording: Recording, name: str) -> np.ndarray | None:
     return None if owner is None else getattr(owner, name)
 
 
-def _stored_path(path: Path, folder: Path) -> str:
-    path = path.resolve()
-    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
-
-
-def _found_path(text: Any, folder: Path) -> Path:
-    """Return the path of a file that a description names."""
-    if not isinstance(text, str) or not text or "\0" in text:
-        raise InputError(f"{DESCRIPTION}: {quote(text)} is not a path.")
-    path = Path(text)
-    if ".." in path.parts:
-        raise InputError(
-            f"{DESCRIPTION}: the path {quote(text)} contains '..': paths are relative to the "
-            "folder and inside it, or absolute."
-        )
-    return folder / path
-
-
 def _load(folder: Path) -> Recording:
     written = read_json(folder / DESCRIPTION, limit=MAX_BYTES)
     if not isinstance(written, dict) or written.get("format") != FORMAT:
@@ -400,20 +379,9 @@ def _load(folder: Path) -> Recording:
     return Recording(
         **{name: written.get(name) for name in names},
         **arrays,
-        video=_found_path(written.get("video"), folder),
+        video=found_path(written.get("video"), folder),
         fps=Fraction(written["fps"]),
         names=tuple(written["names"]),
-        depth=_found_depth(written.get("depth"), folder),
+        depth=found_depth(written.get("depth"), folder),
         points=ScenePoints(**points) if points else None,
     )
-
-
-def _found_depth(written: Any, folder: Path) -> DepthFiles | None:
-    if written is None:
-        return None
-    paths = written.get("paths") if isinstance(written, dict) else None
-    unit = written.get("unit_m") if isinstance(written, dict) else None
-    if not isinstance(paths, list) or not isinstance(unit, float):
-        raise InputError(f"{DESCRIPTION}: depth is {quote_text(str(written))}.")
-    found = tuple(None if path is None else _found_path(path, folder) for path in paths)
-    return DepthFiles(paths=found, unit_m=unit)

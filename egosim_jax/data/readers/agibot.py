@@ -40,7 +40,8 @@ from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.data.readers.rotations import from_quaternions
-from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.data.recorded_files import DepthFiles
+from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.io.isolated import read_hdf5
 from egosim_jax.io.segments import probe_long_video, read_segment

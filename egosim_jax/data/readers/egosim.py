@@ -26,7 +26,8 @@ from egosim_jax.data.readers import Entry, make_id, natural_order
 from egosim_jax.data.readers.egovid import read_matrices
 from egosim_jax.data.readers.hamer import read_hamer
 from egosim_jax.data.readers.hands import clean_joints
-from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.data.recorded_files import DepthFiles
+from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert
 from egosim_jax.io.segments import probe_long_video
 from egosim_jax.io.untrusted import quote_path, read_bytes

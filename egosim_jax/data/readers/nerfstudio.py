@@ -23,7 +23,8 @@ from egosim_jax.data.readers.colmap import make_rate
 from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.readers.pictures import MAX_PICTURES, PictureVideo, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL
-from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.data.recorded_files import DepthFiles
+from egosim_jax.data.recording import Recording
 from egosim_jax.io.images import read_image
 from egosim_jax.io.untrusted import quote, quote_path, read_json
 from egosim_jax.types import InputError

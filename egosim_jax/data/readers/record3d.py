@@ -36,7 +36,8 @@ from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.readers.lzfse import unpack
 from egosim_jax.data.readers.pictures import MAX_PICTURES, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
-from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.data.recorded_files import DepthFiles
+from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.npz import DAMAGE

@@ -8,7 +8,8 @@ import pytest
 
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.frames import Sampling
-from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.data.recorded_files import DepthFiles
+from egosim_jax.data.recording import Recording
 from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.untrusted import read_json
 from egosim_jax.state import snapshot

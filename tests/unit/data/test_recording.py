@@ -6,7 +6,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from egosim_jax.data.recording import DepthFiles, Recording
+from egosim_jax.data.recorded_files import DepthFiles
+from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.depth_images import read_depth_image
