@@ -25,7 +25,7 @@ from jax.experimental import multihost_utils
 
 from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.conditioning.video import to_uint8
-from egosim_jax.data.mixing import Mixture
+from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.generator import denoise
@@ -263,7 +263,7 @@ class Samples:
 
     @cached_property
     def _records(self) -> list[Record]:
-        reader = ShardReader(self.latents)
+        reader = open_shards(self.latents)
         return [reader[i] for i in range(min(self.count, len(reader)))]
 
     @cached_property

@@ -81,7 +81,7 @@ class RefineVAE(Recipe):
     def train(self) -> int:
         """Train, and write the weights. An encoder that changed gives standardized latents."""
         out, frames, start = self.require("out", "frames", "weights")
-        from egosim_jax.data.shards import ShardReader
+        from egosim_jax.data.mixing import open_shards
         from egosim_jax.io import weights
         from egosim_jax.io.run import open_folder
         from egosim_jax.train.loop import train
@@ -100,7 +100,7 @@ class RefineVAE(Recipe):
             run_folder=out,
         ).vae
         if self.part == "all":
-            videos = (record.arrays["target"] for record in ShardReader(frames / "train"))
+            videos = (record.arrays["target"] for record in open_shards(frames / "train"))
             vae.standardize(*latent_statistics(vae, videos))
         folder = out / "weights"
         weights.save(folder / "vae.safetensors", vae, dtype=self.weights_dtype)

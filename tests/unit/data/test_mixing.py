@@ -6,9 +6,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from egosim_jax import configs
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.mixing import Mixture, open_shards, write_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.train.monitor import Samples
 from egosim_jax.types import InputError
 
 
@@ -103,3 +105,8 @@ def test_parts_that_differ_and_bad_weights_are_refused(folder, tmp_path):
     (tmp_path / "c" / "mixture.json").write_text('{"parts": [{"shards": "a"}]}', "utf-8")
     with pytest.raises(InputError, match="weight, a number"):
         open_shards(tmp_path / "c")
+
+
+def test_sample_clips_of_a_training_are_taken_from_a_mixture(folder):
+    samples = Samples(model=configs.get("debug"), latents=folder, vae=folder, count=13)
+    assert [record.metadata["video_id"] for record in samples._records][-2:] == ["clip11", "clip12"]
