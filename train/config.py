@@ -25,6 +25,9 @@ from egosim_jax.types import InputError, check_counts, check_seed
 if TYPE_CHECKING:
     from egosim_jax.train.update import Stage
 
+WeightsDtype = Literal["float32", "bfloat16", "float16"]
+"""Dtypes of the weights that a training writes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:

@@ -21,10 +21,10 @@ from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import Products
 from egosim_jax.progress import track
-from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
+from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.update import Stage
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.data.metadata import ClipFiles
@@ -70,7 +70,7 @@ class FromScratch(Recipe):
     """Additional loss weight of the denoiser where the clip differs from its prior.
 
     It differs at hands, at what they move and in unobserved regions."""
-    weights_dtype: str = "float32"
+    weights_dtype: WeightsDtype = "float32"
     """Dtype of the weights that are written."""
     products: Products | None = None
     """Dtype to which the denoiser's training rounds the factors of products; None: the model's."""
@@ -122,6 +122,7 @@ class FromScratch(Recipe):
         if self.bundle is not None and (given := self._for_bundle(self.bundle)) != self:
             return given.train()
         (out,) = self.require("out")
+        check_counts({"--stride": self.stride})
         from egosim_jax.io.run import open_folder
         from egosim_jax.networks import Networks
         from egosim_jax.train.loop import train

@@ -34,6 +34,7 @@ from egosim_jax.preflight.targets import peak
 from egosim_jax.sharding import batch_sharding, parts
 from egosim_jax.train.tasks.denoising import condition_of
 from egosim_jax.train.update import MAX_CONSECUTIVE_SKIPS
+from egosim_jax.types import check_counts
 
 Phase = Literal["start", "compile", "data", "step", "validate", "sample", "save"]
 PHASES: dict[Phase, str] = {
@@ -221,7 +222,11 @@ class Samples:
     vae: Path
     """Weights folder with the autoencoder of the latents."""
     count: int = 2
-    """Number of clips in the training set."""
+    """Number of clips that are generated."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` unless there is at least one clip."""
+        check_counts({"--samples": self.count})
 
     def write(self, networks: nnx.Module, out: Path, step: int) -> None:
         """Write OUT/step_N.mp4 and .png: each generated clip next to its ground truth.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax import configs
 from egosim_jax.command import ExitCode, HelpGroups
-from egosim_jax.train.config import Recipe, TrainConfig, resume_mutable
+from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.update import Stage
 
@@ -54,7 +54,7 @@ class RefineVAE(Recipe):
     """Additional weight of the squared error where something moves."""
     stream_probs: tuple[float, float, float] = (0.6, 0.25, 0.15)
     """Probabilities that a crop is of the target, the prior and the hands."""
-    weights_dtype: str = "float16"
+    weights_dtype: WeightsDtype = "float16"
     """Dtype of the weights that are written."""
 
     @property

@@ -1,5 +1,6 @@
 """Refining a VAE: its loss, what it trains, and its command."""
 
+import sys
 from dataclasses import replace
 
 import jax
@@ -9,9 +10,11 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
+from egosim_jax.command import ExitCode
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.networks import Networks
+from egosim_jax.train.__main__ import main
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.refining import RefineVAE
 from egosim_jax.train.tasks.autoencoding import Autoencoding
@@ -104,6 +107,22 @@ def frames(folder, model):
             arrays["first_frame"] = arrays["prior"][0]
             writer.add(arrays, {"video_id": split, "prompt": ""})
     return folder
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["tabletop_vae", "--weights-dtype", "fp16"], "float16"),
+        (["tabletop", "--weights-dtype", "fp16"], "float16"),
+        (["tabletop", "--stride", "0"], "--stride must be at least 1, not 0"),
+    ],
+)
+def test_what_would_fail_after_the_training_is_refused_before(command, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        sys.exit(main([*command, "--out", str(tmp_path / "out")]))
+    assert ended.value.code == ExitCode.USAGE
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

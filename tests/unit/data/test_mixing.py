@@ -107,6 +107,11 @@ def test_parts_that_differ_and_bad_weights_are_refused(folder, tmp_path):
         open_shards(tmp_path / "c")
 
 
+def test_a_training_without_sample_clips_is_refused_before_it_starts(folder):
+    with pytest.raises(InputError, match="--samples must be at least 1, not 0"):
+        Samples(model=configs.get("debug"), latents=folder, vae=folder, count=0)
+
+
 def test_sample_clips_of_a_training_are_taken_from_a_mixture(folder):
     samples = Samples(model=configs.get("debug"), latents=folder, vae=folder, count=13)
     assert [record.metadata["video_id"] for record in samples._records][-2:] == ["clip11", "clip12"]
