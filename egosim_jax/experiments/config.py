@@ -13,6 +13,8 @@ class ModelExperiment:
 
     out: Path
     """Folder of the report and the pictures of the experiment."""
+    first_scene: int
+    """Seed of the first scene."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None

@@ -30,7 +30,7 @@ from egosim_jax.progress import track
 from egosim_jax.rollout import Rollout, load_clip
 from egosim_jax.simulator import Simulator
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Action, Clip, SceneState, VideoSpec, check_counts, check_seed
+from egosim_jax.types import Action, Clip, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import (
     Script,
     TabletopClip,
@@ -120,7 +120,6 @@ class Story:
 def run(settings: LookAway) -> None:
     """Simulate every story with each update of the state and compare what is seen at the end."""
     check_counts({"--scenes": settings.scenes})
-    check_seed(settings.first_scene, name="--first-scene")
     generator = open_experiment(settings)
     spec = generator.config.video
     seeds = list(islice(_seeds(settings, spec), settings.scenes))

@@ -26,16 +26,7 @@ from egosim_jax.metrics.report import Summary, print_table
 from egosim_jax.perception import Perception, registry
 from egosim_jax.progress import track
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import (
-    Action,
-    Cameras,
-    Clip,
-    SceneState,
-    Triplet,
-    VideoSpec,
-    check_counts,
-    check_seed,
-)
+from egosim_jax.types import Action, Cameras, Clip, SceneState, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Scene, Script, World, make_scripts
 from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, film_scenes, paints_of, place
 from egosim_jax.worlds.tabletop.policies import POLICIES, WITHIN_M, error_m, succeeded
@@ -150,7 +141,6 @@ def run(settings: Policies) -> None:
     Frames are judged first, and reported; then states, for which every clip is perceived.
     """
     check_counts({"--scenes": settings.scenes, "--batch-size": settings.batch_size})
-    check_seed(settings.first_scene, name="--first-scene")
     perceive = registry.parse(settings.perception).build()
     generator = open_experiment(settings)
     folder, found = settings.out / "scenes", {key: [] for key in MEASURES}

@@ -17,7 +17,7 @@ from egosim_jax.metrics.ranking import spearman
 from egosim_jax.metrics.report import paired_difference, print_table
 from egosim_jax.progress import track
 from egosim_jax.ranking import by_picture
-from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts, check_seed
+from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 from egosim_jax.worlds.tabletop.twins import with_conditions
 
@@ -43,7 +43,6 @@ def run(settings: Rank) -> None:
             f"A goal with {settings.candidates} candidate cannot be ranked: it needs at least 2. "
             "(--candidates)"
         )
-    check_seed(settings.first_scene, name="--first-scene")
     generator = open_experiment(settings)
     seeds = range(settings.first_scene, settings.first_scene + settings.goals)
     goals = [

@@ -27,7 +27,7 @@ from egosim_jax.generator import Generator
 from egosim_jax.io.run import write_json
 from egosim_jax.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.progress import track
-from egosim_jax.types import Kind, VideoSpec, check_counts, check_seed
+from egosim_jax.types import Kind, VideoSpec, check_counts
 
 Table = dict[str, dict[str, dict[str, float]]]
 Scores = list[dict[str, float]]
@@ -71,7 +71,6 @@ def run(settings: Tabletop) -> None:
             "--worst": settings.worst,
         }
     )
-    check_seed(settings.first_scene, name="--first-scene")
     generator = open_experiment(settings)
     kinds: tuple[Kind, ...] = ("human", "robot")
     found = {kind: _compare(settings, kind, generator) for kind in kinds}

@@ -19,7 +19,7 @@ from egosim_jax.perception import registry
 from egosim_jax.progress import track
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts, check_seed
+from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action, to_ground_truth
 
 LARGE = VideoSpec(frames=17, height=480, width=832, fps=8)
@@ -47,7 +47,6 @@ DEFINITIONS = {
 def run(settings: Update) -> None:
     """Update states after a carried object and compare them with the true ones."""
     check_counts({"--scenes": settings.scenes})
-    check_seed(settings.first_scene, name="--first-scene")
     generator = open_experiment(settings)
     spec = generator.config.video
     table: dict[str, list[dict[str, float]]] = {}
