@@ -320,11 +320,11 @@ def of_split(items: Sequence[ClipFiles], split: Literal["train", "test"]) -> lis
             "The metadata has one clip: another one is needed to validate on. Cut the video into "
             "shorter clips, or add one. (--metadata)"
         )
-    held_out = items[HELD_OUT - 1 :: HELD_OUT] or items[-1:]
+    count = len(items)
+    held_out = range(HELD_OUT - 1, count, HELD_OUT) or range(count - 1, count)
     if split == "test":
-        print(f"no clip has the split test: {len(held_out)} of {len(items)} are held out")
-        return list(held_out)
-    return [item for item in items if item not in held_out]
+        print(f"no clip has the split test: {len(held_out)} of {count} are held out")
+    return [item for n, item in enumerate(items) if (n in held_out) == (split == "test")]
 
 
 @dataclass(frozen=True, kw_only=True)
