@@ -8,6 +8,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from tempfile import gettempdir
 
 for library in ("OPENBLAS", "OMP"):  # a fork has none of its parent's threads
     os.environ[f"{library}_NUM_THREADS"] = "1"
@@ -45,7 +46,7 @@ def main() -> int:
     parser.add_argument("--commands", nargs="+", help="all, if none is named")
     parser.add_argument("--kills", type=int, default=100, help="of all commands together")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", type=Path, default=Path("/tmp/egosim_crash"))  # noqa: S108
+    parser.add_argument("--folder", type=Path, default=Path(gettempdir()) / "egosim_crash")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     return kills(given) if given.what == "kills" else points(given)
