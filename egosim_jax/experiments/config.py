@@ -229,6 +229,8 @@ class DWM:
     """Training of each model from its base."""
     rank: int | None = 48
     """Rank of the LoRA by which a base is adapted; None: all weights are trained."""
+    products: Literal["bfloat16"] | None = "bfloat16"
+    """Dtype to which the denoisers round the factors of products; None: the model's."""
     text_dropout: float = 0.1
     """Probability with which a prompt is dropped in training."""
     seeds: int = 2

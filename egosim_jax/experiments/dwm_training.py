@@ -70,7 +70,9 @@ class Training:
 
     def __init__(self, settings: DWM):
         self.settings, self.out = settings, settings.out
-        self.config = replace(configs.get(settings.config), steps=settings.steps)
+        model = configs.get(settings.config)
+        dit = replace(model.dit, products=settings.products)
+        self.config = replace(model, steps=settings.steps, dit=dit)
         counts: dict[Split, int] = {
             "held_out": settings.held_out,
             "moving": settings.moving_scenes,

@@ -10,6 +10,7 @@ from flax import nnx
 
 from egosim_jax.models import Flops
 from egosim_jax.models.attention import Kernel
+from egosim_jax.models.layers import Products
 from egosim_jax.models.remat import LEVELS, Level
 from egosim_jax.types import InputError, check_counts
 
@@ -26,7 +27,7 @@ class CogVideoXDiTConfig:
 
     table: ClassVar[str] = "egosim_jax.convert.tables.cogvideox_dit"
     """Module of the conversion table."""
-    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "attention", "remat")
+    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "products", "attention", "remat")
     """Fields that change only how values are computed, which a resumed training may change."""
     remat_levels: ClassVar[tuple[str, ...]] = LEVELS
     """Values of `remat`, by the memory that they take, ascending."""
@@ -59,6 +60,10 @@ class CogVideoXDiTConfig:
     """Epsilon of the norms of queries and keys."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products and the residual stream."""
+    products: Products | None = None
+    """Dtype of the factors of the blocks' matrix products, attention's included; None: `dtype`.
+
+    With bfloat16 sums and all else stay in `dtype`."""
     attention: Kernel = "auto"
     """Attention kernel of the transformer."""
     remat: Level = "none"

@@ -11,7 +11,8 @@ the time embedding, one triple for the tokens of the text and one for those of t
 with a layer norm of the queries and keys of each head, and rotary positions of the video's tokens.
 
 Norms, modulation, gates and rotations are float32; matrix products and the residual stream are in
-the config's `dtype`. (Yang et al. 2024, CogVideoX; section 4.1 of DWM for the input channels.)
+the config's `dtype`, or the factors of the blocks' products alone in bfloat16 (`products`). (Yang
+et al. 2024, CogVideoX; section 4.1 of DWM for the input channels.)
 """
 
 from __future__ import annotations
@@ -105,7 +106,9 @@ class Attention(nnx.Module):
         self.config = config
 
         def linear(axes: tuple[str, str]) -> Linear:
-            return Linear(*sizes, axes=axes, dtype=config.dtype, rngs=rngs)
+            return Linear(
+                *sizes, axes=axes, dtype=config.dtype, products=config.products, rngs=rngs
+            )
 
         self.q = linear(("embed", "heads"))
         self.k = linear(("embed", "heads"))
@@ -122,10 +125,12 @@ class Attention(nnx.Module):
             rearrange(name_projection(linear(x)), "b n (h k) -> b n h k", h=self.config.heads)
             for linear in (self.q, self.k, self.v)
         )
+        dtype = jnp.dtype(self.config.products or self.config.dtype)
         q, k = (
-            rope.rotate(norm(heads), rotation).astype(v.dtype)
+            rope.rotate(norm(heads), rotation).astype(dtype)
             for norm, heads in ((self.norm_q, q), (self.norm_k, k))
         )
+        v = v.astype(dtype)
         y = attention(q, k, v, kernel=self.config.attention, over="heads")
         return name_projection(self.o(rearrange(y, "b n h k -> b n (h k)")))
 
@@ -134,9 +139,10 @@ class MLP(nnx.Module):
     """Linear, GELU in its tanh form, linear."""
 
     def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
-        dim, hidden, dtype = config.dim, config.ffn_dim, config.dtype
-        self.up = Linear(dim, hidden, axes=("embed", "mlp"), dtype=dtype, rngs=rngs)
-        self.down = Linear(hidden, dim, axes=("mlp", "embed"), dtype=dtype, rngs=rngs)
+        numerics: Any = {"dtype": config.dtype, "products": config.products}
+        dim, hidden = config.dim, config.ffn_dim
+        self.up = Linear(dim, hidden, axes=("embed", "mlp"), **numerics, rngs=rngs)
+        self.down = Linear(hidden, dim, axes=("mlp", "embed"), **numerics, rngs=rngs)
 
     def __call__(self, x: Float[Array, "b n d"]) -> Float[Array, "b n d"]:
         """Map every token by itself."""
