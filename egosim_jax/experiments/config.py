@@ -220,11 +220,11 @@ class DWM:
     )
     """Training of the autoencoder, on crops."""
     base: Hyperparameters = Hyperparameters(
-        steps=1200, learning_rate=2e-3, warmup=100, batch_size=8
+        steps=1000, learning_rate=2e-3, warmup=100, batch_size=8
     )
     """Training of each base model, from random weights."""
     adaptation: Hyperparameters = Hyperparameters(
-        steps=600, learning_rate=2e-3, warmup=50, batch_size=8
+        steps=700, learning_rate=2e-3, warmup=50, batch_size=4
     )
     """Training of each model from its base."""
     rank: int | None = 48
