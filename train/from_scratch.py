@@ -103,10 +103,18 @@ class FromScratch(Recipe):
         return {name: stages[name] for name in stages if name == "denoiser" or not self.weights}
 
     def trained_model(self) -> ModelConfig:
-        """Return the model's config with the numerics of this training."""
+        """Return the model's config with the numerics of this training.
+
+        Raises `InputError` if its denoiser has no option `products`.
+        """
         model = configs.get(self.config)
         if self.products is None:
             return model
+        if "products" not in model.dit.numerics_only:
+            raise InputError(
+                f"The denoiser of {model.name} has no --products, which must be omitted, not "
+                f"{self.products}."
+            )
         return replace(model, dit=replace(model.dit, products=self.products))
 
     def train(self) -> int:

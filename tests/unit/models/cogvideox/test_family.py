@@ -98,3 +98,26 @@ def test_the_released_config_has_the_tokens_and_the_lora_of_the_paper():
     assert flops.attention == 42 * 4 * 17_776**2 * 3072
     rank, targets = 64, len(dit.lora_targets)
     assert dit.layers * targets * rank * 2 * dit.dim == 66_060_288
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_rounded_products_stay_near_those_of_float32(networks, dtype):
+    rng = np.random.default_rng(0)
+    latents = jnp.asarray(rng.normal(size=(2, *TINY.latent_shape, 49)), jnp.float32)
+    text = jnp.asarray(rng.normal(size=(2, 16, 16)), jnp.float32)
+    weights, times = nnx.state(networks.dit), jnp.array([100.0, 900.0])
+
+    def loss_and_gradient(**numerics):
+        graph = nnx.graphdef(replace(TINY.dit, **numerics).build(rngs=nnx.Rngs(0)))
+
+        def loss(state):
+            return (nnx.merge(graph, state)(latents, times, text) ** 2).sum()
+
+        value, slopes = jax.jit(jax.value_and_grad(loss))(weights)
+        return value, jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(slopes)])
+
+    want, slope = loss_and_gradient()
+    have, rounded = loss_and_gradient(dtype=dtype, products="bfloat16")
+    # bfloat16 keeps 8 bits: 4e-3 a rounding.
+    assert 0 < abs(have - want) < 3e-2 * want
+    assert 0 < jnp.linalg.norm(rounded - slope) < 3e-2 * jnp.linalg.norm(slope)
