@@ -25,9 +25,9 @@ from egosim_jax.io.untrusted import quote
 from egosim_jax.perception.estimates import (
     CameraEstimator,
     Captioner,
+    ChosenRung,
     DepthEstimator,
     HandEstimator,
-    Rung,
     Segmenter,
 )
 from egosim_jax.rendering import RendererName
@@ -116,7 +116,7 @@ class AnnotateConfig:
     """Camera estimator; the recording's cameras are used instead where it has some."""
     focal_px: float | None = None
     """Focal length in pixels of the video."""
-    rung: Rung | None = None
+    rung: ChosenRung | None = None
     """Rung of the ladder of camera estimation to use instead of trying them."""
     depth: str = "sweep"
     """Depth estimator; the recording's depth is used instead where it has some."""
@@ -146,8 +146,8 @@ class AnnotateConfig:
                 raise InputError(f"--{option} is {value:g}: it must be above {low} and finite.")
         if self.scale is not None and self.camera_height_m is not None:
             raise InputError("--scale and --camera-height both give the scale: choose one.")
-        if self.rung is not None and self.rung not in get_args(Rung):
-            raise InputError(f"--rung must be one of {', '.join(get_args(Rung))}.")
+        if self.rung is not None and self.rung not in get_args(ChosenRung):
+            raise InputError(f"--rung must be one of {', '.join(get_args(ChosenRung))}.")
         if _find(_CAMERAS, self.cameras, "--cameras")[1] and (self.rung or self.focal_px):
             raise InputError(
                 "--rung and --focal are options of --cameras ladder: a network that estimates "

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from egosim_jax.command import ExitCode, HelpGroups
-from egosim_jax.perception.estimates import Rung
+from egosim_jax.perception.estimates import ChosenRung
 from egosim_jax.progress import track
 from egosim_jax.rendering import RendererName
 from egosim_jax.types import check_counts
@@ -97,8 +97,8 @@ class Annotate:
     """Cameras: ladder, of methods without weights, or depth-anything-3=FOLDER."""
     focal: float | None = None
     """Focal length of the video in its pixels, instead of estimating it."""
-    rung: Rung | None = None
-    """Only method of cameras to try: static, incremental, focal, global or rotation."""
+    rung: ChosenRung | None = None
+    """Only method of cameras to try."""
     depth: str = "sweep"
     """Depth: sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER.
 

@@ -22,6 +22,8 @@ Rung = Literal[
     "given", "network", "static", "incremental", "focal", "global", "rotation", "refused"
 ]
 """Rung of the ladder of camera estimation, from the best known to none; or a network's cameras."""
+ChosenRung = Literal["static", "incremental", "focal", "global", "rotation"]
+"""Rung that can be asked for where cameras are not known."""
 
 
 @no_type_check
