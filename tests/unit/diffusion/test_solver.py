@@ -137,6 +137,7 @@ def test_an_order_below_one_is_refused():
         UniPC(order=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", STOCHASTIC)
 @pytest.mark.parametrize("process", [PROCESS, VariancePreserving(snr_shift=3.0)])
 def test_stochastic_solvers_end_with_the_deviation_of_the_data(process, solver):
