@@ -136,6 +136,11 @@ class CogVideoXDiTConfig:
         return self.dim // self.heads
 
     @property
+    def attention_dtype(self) -> str:
+        """Dtype of queries, keys and values."""
+        return self.products or self.dtype
+
+    @property
     def image_dim(self) -> int | None:
         """Width of the image encoder's tokens; None: the model has no image branch."""
         return None

@@ -125,12 +125,11 @@ class Attention(nnx.Module):
             rearrange(name_projection(linear(x)), "b n (h k) -> b n h k", h=self.config.heads)
             for linear in (self.q, self.k, self.v)
         )
-        dtype = jnp.dtype(self.config.products or self.config.dtype)
         q, k = (
-            rope.rotate(norm(heads), rotation).astype(dtype)
+            rope.rotate(norm(heads), rotation)
             for norm, heads in ((self.norm_q, q), (self.norm_k, k))
         )
-        v = v.astype(dtype)
+        q, k, v = (heads.astype(self.config.attention_dtype) for heads in (q, k, v))
         y = attention(q, k, v, kernel=self.config.attention, over="heads")
         return name_projection(self.o(rearrange(y, "b n h k -> b n (h k)")))
 
