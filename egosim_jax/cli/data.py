@@ -17,7 +17,7 @@ from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.command import ExitCode
 from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.progress import track
-from egosim_jax.types import VideoSpec, check_counts
+from egosim_jax.types import InputError, VideoSpec, check_counts
 
 
 def _grid(name: str | None) -> VideoGrid:
@@ -76,11 +76,12 @@ class Pack:
         from egosim_jax.io.digest import sha256
 
         check_counts({"--shard-megabytes": self.shard_megabytes})
+        spec = self._spec()
         items = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
         progress = pack(
             items,
             out=self.out,
-            spec=self._spec(),
+            spec=spec,
             provenance={"metadata": self.metadata.name, "sha256": sha256(self.metadata)},
             shard_bytes=self.shard_megabytes * 2**20,
             overwrite=self.overwrite,
@@ -95,12 +96,24 @@ class Pack:
         return ExitCode.PARTIAL if problems else ExitCode.DONE
 
     def _spec(self) -> VideoSpec | None:
+        if self.resampling != "rate":
+            self._refuse("fps", without="--resampling rate")
         if self.size is None:
+            self._refuse("num_frames", without="--size")
+            self._refuse("decoding", without="--size")
             return None
         rate = {"fps": self.fps} if self.resampling == "rate" else {}
         spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1], **rate)
         _grid(self.config).check(spec)
         return spec
+
+    def _refuse(self, name: str, *, without: str) -> None:
+        """Raise `InputError` if an option without effect is not at its default."""
+        if (value := getattr(self, name)) != getattr(Pack, name):
+            raise InputError(
+                f"--{name.replace('_', '-')} {value} has no effect without {without}: give it, or "
+                "leave this out."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

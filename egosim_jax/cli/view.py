@@ -44,9 +44,11 @@ class View:
         """Draw the state, open the viewer, or write the page."""
         recording = self.path / RECORDING if self.path.is_dir() else self.path
         if recording.suffix == ".rrd" and recording.exists():
+            self._refuse_out("a recording is opened")
             return _open(recording, self.host)
         if (self.path / "report.json").exists() and (page := self.path / PAGE).exists():
-            print(page)  # of an evaluation, or of annotated clips
+            self._refuse_out(f"{page} exists")  # of an evaluation, or of annotated clips
+            print(page)
             return ExitCode.DONE
         if (self.path / JOURNAL).exists():
             raise InputError(
@@ -66,6 +68,10 @@ class View:
         print(f"{len(state.points_m)} points, {size} m, {objects}")
         print(out)
         return ExitCode.DONE
+
+    def _refuse_out(self, why: str) -> None:
+        if self.out is not None:
+            raise InputError(f"--out {self.out} would not be written, as {why}: leave it out.")
 
     def _state(self) -> SceneState:
         from egosim_jax.state.snapshot import DESCRIPTION, load, read_ply

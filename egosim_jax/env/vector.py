@@ -89,7 +89,7 @@ class WorldVectorEnv(VectorEnv):
         seed: SupportsIndex | Sequence[SupportsIndex | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episodes: those of `reset_mask`, or all.
+        """Begin episodes: those of `reset_mask`, or all; none if one of them cannot begin.
 
         A single seed is that of the first episode, of which the others have the following ones.
         Other options are those of `WorldEnv.reset`; `starts` has them for each episode.
@@ -103,9 +103,12 @@ class WorldVectorEnv(VectorEnv):
                 f"reset_mask has shape {mask.shape}, starts {len(starts)} and seed {len(seeds)} "
                 f"entries: all must have one for each of {self.num_envs} episodes."
             )
-        for number in np.flatnonzero(mask).tolist():
-            chosen = seeds[number]
-            start = start_of(self.backend, self.actions, seed=chosen, options=starts[number])
+        chosen = np.flatnonzero(mask).tolist()
+        begun = [
+            start_of(self.backend, self.actions, seed=seeds[number], options=starts[number])
+            for number in chosen
+        ]
+        for number, start in zip(chosen, begun, strict=True):
             self._running[number] = Running(self.backend, self.actions, start)
         self._ended[mask] = False
         return self._observations(), self._infos([running.info() for running in self.running])

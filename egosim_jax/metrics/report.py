@@ -32,11 +32,11 @@ def score(
 
 
 def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
-    """Return mean and standard deviation (n - 1) of values, ignoring NaN.
+    """Return mean and standard deviation (n - 1) of values, ignoring those that are not finite.
 
     The mean of no values is NaN, the deviation of fewer than two values 0.
     """
-    known = [value for value in values if not np.isnan(value)]
+    known = [value for value in values if np.isfinite(value)]
     mean = float(np.mean(known)) if known else float("nan")
     return mean, float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
 
@@ -46,8 +46,8 @@ def summarize(
 ) -> dict[str, dict[str, float]]:
     """Return mean and spread of each measure over scores, without those that no score has.
 
-    Where some scores are NaN, `known` is the number of the others and `of` that of all: their mean
-    hides what failed.
+    Where some scores are not finite, `known` is the number of the others and `of` that of all:
+    their mean hides what failed.
     """
     summary = {}
     for name in measures:

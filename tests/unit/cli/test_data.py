@@ -176,6 +176,20 @@ def test_official_decoding_is_packed_and_recorded(clips, out):
     np.testing.assert_array_equal(reader[0].arrays["prior"], official.frames)
 
 
+@pytest.mark.parametrize(
+    ("options", "without"),
+    [
+        ({"num_frames": 9}, "--size"),
+        ({"decoding": "official"}, "--size"),
+        ({"size": (16, 32), "num_frames": 5, "fps": 30}, "--resampling rate"),
+    ],
+)
+def test_pack_refuses_options_without_effect(clips, out, options, without):
+    with pytest.raises(InputError, match=f"has no effect without {without}:"):
+        Pack(metadata=clips, out=out, **options).run()
+    assert not out.exists()
+
+
 def test_packing_over_other_files_is_refused(clips, out):
     out.mkdir()
     (out / "thesis.tex").write_text("years of work")

@@ -18,3 +18,12 @@ def test_the_reason_is_that_of_the_folder(tmp_path, file, message):
     (tmp_path / file).write_text("{}")
     with pytest.raises(InputError, match=message):
         View(path=tmp_path).run()
+
+
+def test_a_page_that_exists_is_printed_and_not_written_elsewhere(tmp_path, capsys):
+    for name in ("report.json", "index.html"):
+        (tmp_path / name).write_text("{}")
+    View(path=tmp_path).run()
+    assert capsys.readouterr().out.strip() == str(tmp_path / "index.html")
+    with pytest.raises(InputError, match="would not be written"):
+        View(path=tmp_path, out=tmp_path / "other.html").run()

@@ -171,6 +171,15 @@ def test_a_refused_action_of_one_episode_changes_none():
     assert [running.chunks for running in envs.running] == [0, 0]
 
 
+def test_a_refused_start_of_one_episode_begins_none():
+    envs = WorldVectorEnv(painted(), 2)
+    envs.reset(seed=3)
+    before = [running.start.seed for running in envs.running]
+    with pytest.raises(InputError, match="nonsense"):
+        envs.reset(seed=8, options={"starts": [{}, {"nonsense": 1}]})
+    assert [running.start.seed for running in envs.running] == before
+
+
 def test_a_seeded_vector_environment_repeats_its_later_resets():
     seeds = []
     for _ in range(2):

@@ -25,8 +25,8 @@ def test_a_single_clip_has_no_spread():
     assert summarize([{"psnr": 20.0}], ("psnr",))["psnr"]["spread"] == 0.0
 
 
-def test_nan_is_ignored():
-    assert mean_and_spread([1.0, np.nan, 3.0]) == (2.0, pytest.approx(2**0.5))
+def test_what_is_not_finite_is_ignored():
+    assert mean_and_spread([1.0, np.nan, 3.0, np.inf]) == (2.0, pytest.approx(2**0.5))
     assert np.isnan(mean_and_spread([np.nan])[0])
 
 
