@@ -70,8 +70,8 @@ def check_batch(size: int, mesh: Mesh | AbstractMesh, grad_accum_steps: int = 1)
         raise InputError(
             f"A batch of {size} cannot be shared by a mesh of data {mesh.shape['data']} x fsdp "
             f"{mesh.shape['fsdp']}{in_turn}: it must be a multiple of their product, {unit}. "
-            f"{fix} (--batch-size, in training --grad-accum-steps, or another mesh: devices along "
-            "context share one sample)"
+            f"{fix} (--batch-size, in training --training.batch-size or "
+            "--training.grad-accum-steps, or another mesh: devices along context share one sample)"
         )
 
 

@@ -163,7 +163,9 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
             "`--remat` and by clips on a device at a time; a peak that does not fit is shown with\n"
             "the capacity:",
             _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
-            "Every recipe as it is, GiB of a device (clips on a device at a time):",
+            "Every recipe, GiB of a device (clips on a device at a time). A batch that the\n"
+            "devices cannot share in the recipe's parts is taken in fewer\n"
+            "(`--training.grad-accum-steps`), or raised to one clip a device:",
             _rows(["recipe", *(f"`{target}`" for target in targets)], by_target),
             "Generation with `egosim_14b`, 50 steps, with the weights of all networks; the time\n"
             "is the roofline, the least that the devices' peak allows:",
