@@ -12,6 +12,7 @@ from typing import get_args
 
 import numpy as np
 
+from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.experiments.config import DWM
 from egosim_jax.experiments.dwm_training import Training, changed
@@ -66,6 +67,8 @@ def run(settings: DWM) -> None:
     """Make clips, train, generate, compare, draw."""
     chosen = _check(settings)
     training = Training(settings)
+    sdedit = replace(training.base_model("inpaint"), strength=settings.strength)
+    _ = sdedit.visited  # raises for an invalid strength before any work
     open_folder(settings.out, {"experiment": settings}, mutable=["experiment.only"])
     trained = {name: training.variant(name, VARIANTS[name]) for name in chosen}
     generators: dict[str, Callable[[], Generator]] = {
@@ -74,7 +77,6 @@ def run(settings: DWM) -> None:
         )
         for name, at in trained.items()
     }
-    sdedit = replace(training.base_model("inpaint"), strength=settings.strength)
     generators["sdedit"] = lambda: Generator.load(sdedit, training.base("inpaint"))
     titles = {**{name: VARIANTS[name].title for name in chosen}, **OTHERS}
     found = {camera: _compare(training, generators, camera) for camera in CAMERAS}
@@ -103,6 +105,7 @@ def _check(settings: DWM) -> tuple[str, ...]:
     check_seed(settings.first_scene, name="--first-scene")
     for stage in (settings.autoencoder, settings.base, settings.adaptation):
         train_config(stage)
+    ConditionDropout(text=settings.text_dropout)
     if unknown := sorted({*settings.only} - {*VARIANTS}):
         raise InputError(
             f"There is no model {', '.join(unknown)} to compare: it must be of "

@@ -113,7 +113,15 @@ def test_a_wider_model_starts_as_its_base(tmp_path):
         np.testing.assert_array_equal(leaf, start[name])
 
 
-def test_an_unknown_model_is_refused_before_any_work(tmp_path):
-    with pytest.raises(InputError, match=r"no model fulll to compare"):
-        run(DWM(out=tmp_path / "run", only=("fulll",)))
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"only": ("fulll",)}, "no model fulll to compare"),
+        ({"strength": 75.0}, r"strength 75\.0: that must be above 0 and at most 1"),
+        ({"text_dropout": 1.5}, r"must be in \[0, 1\], not 1\.5"),
+    ],
+)
+def test_bad_settings_are_refused_before_any_work(tmp_path, bad, message):
+    with pytest.raises(InputError, match=message):
+        run(DWM(out=tmp_path / "run", **bad))
     assert not (tmp_path / "run").exists()
