@@ -231,8 +231,14 @@ class Generator:
         """Return the conditions of one clip of a simulation.
 
         Raises `InputError` unless view, action and first frame have the length and size of the
-        model's clips.
+        model's clips, and for a model of static videos and hand meshes.
         """
+        if self.config.layout.mask_packing == "observed":
+            raise InputError(
+                f"{self.config.name} is conditioned on a video of the whole scene and on hand "
+                "meshes; the view of a state has holes, and its hands are skeletons. Generate from "
+                "triplets (egosim generate --metadata), or simulate with a model of EgoSim's."
+            )
         video = self.config.video
         shape = (video.frames, video.height, video.width)
         check_video("The view", view.frames, shape)

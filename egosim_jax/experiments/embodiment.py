@@ -23,6 +23,7 @@ from egosim_jax.experiments.scenes import (
     SHEET_SCENES,
     HeldOutClip,
     baselines,
+    conditions_of,
     evaluate,
     generate,
     reconstruct,
@@ -40,7 +41,7 @@ from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.train.fine_tuning import write_trained
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.types import Kind, check_counts, check_seed
+from egosim_jax.types import InputError, Kind, check_counts, check_seed
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 Videos = Mapping[str, Sequence[np.ndarray]]
@@ -82,6 +83,11 @@ def run(settings: Embodiment) -> None:
     for stage in (settings.human, settings.full, settings.lora, settings.scratch):
         train_config(stage)  # raises for invalid values before any work
     experiment = _Experiment(settings)
+    if conditions_of(experiment.model)[1] == "mesh":
+        raise InputError(
+            f"{settings.config} is conditioned on hand meshes, which robots do not have: take a "
+            "model of keypoints. (--config)"
+        )
     record = {"experiment": settings, "weights": hashes(experiment.origin)}
     open_folder(settings.out, record, mutable=["experiment.out", "experiment.weights"])
     trained = experiment.train_all()

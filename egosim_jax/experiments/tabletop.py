@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from egosim_jax.experiments.scenes import (
     DroppedCondition,
     HeldOutClip,
     baselines,
+    conditions_of,
     evaluate,
     generate,
     reconstruct,
@@ -26,8 +28,9 @@ from egosim_jax.experiments.scenes import (
 from egosim_jax.generator import Generator
 from egosim_jax.io.run import write_json
 from egosim_jax.metrics.report import paired_differences, print_table, summarize
+from egosim_jax.networks import ModelConfig
 from egosim_jax.progress import track
-from egosim_jax.types import Kind, VideoSpec, check_counts
+from egosim_jax.types import Kind, check_counts
 
 Table = dict[str, dict[str, dict[str, float]]]
 Scores = list[dict[str, float]]
@@ -72,7 +75,8 @@ def run(settings: Tabletop) -> None:
         }
     )
     generator = open_experiment(settings)
-    kinds: tuple[Kind, ...] = ("human", "robot")
+    hands = conditions_of(generator.config)[1]
+    kinds: tuple[Kind, ...] = ("human", "robot") if hands == "skeleton" else ("human",)
     found = {kind: _compare(settings, kind, generator) for kind in kinds}
     report = {
         "definitions": {**DEFINITIONS, **SPREAD, **DIFFERENCES},
@@ -88,18 +92,19 @@ def run(settings: Tabletop) -> None:
         print_table("", differences, MEASURES, title=title)
 
 
-def _make_scenes(settings: Tabletop, kind: Kind, spec: VideoSpec) -> list[HeldOutClip]:
+def _make_scenes(settings: Tabletop, kind: Kind, config: ModelConfig) -> list[HeldOutClip]:
     seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
+    prior, hands = conditions_of(config)
+    make = partial(HeldOutClip.make, black_cloths=settings.black_cloths, prior=prior, hands=hands)
     return [
-        HeldOutClip.make(seed, spec, kind, black_cloths=settings.black_cloths)
+        make(seed, config.video, kind)
         for seed in track(seeds, f"making {kind} scenes", total=settings.scenes)
     ]
 
 
 def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Found:
     """Score every method on the scenes of one kind of hands, and draw their contact sheets."""
-    spec, size = generator.config.video, settings.batch_size
-    scenes = _make_scenes(settings, kind, spec)
+    size, scenes = settings.batch_size, _make_scenes(settings, kind, generator.config)
     table: Table = {}
     by_scene: dict[str, Scores] = {}
     generated: list[np.ndarray] = []
