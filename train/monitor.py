@@ -292,7 +292,8 @@ def _generate(
     networks: Any = nnx.merge(graph, params)
     keys = jax.random.split(jax.random.key(0), len(batch["target"]))
     noise = jax.vmap(lambda key: jax.random.normal(key, batch["target"].shape[1:]))(keys)
-    return denoise(networks.dit, condition_of(networks, batch), noise, model, keys)
+    condition = condition_of(networks, batch, model.zero_image(len(batch["target"])))
+    return denoise(networks.dit, condition, noise, model, keys)
 
 
 @jax.jit(static_argnums=0)

@@ -185,7 +185,7 @@ def condition_of(networks: Networks, batch: Batch, zeros: np.ndarray | None = No
         null = "null_ids" in batch
         null_text = networks.text(batch["null_ids"], batch["null_mask"]) if null else None
     if networks.image is None:
-        image: Any = batch.get("image", zeros)
+        image: Any = batch.get("image", None if zeros is None else jnp.asarray(zeros))
     else:
         image = networks.image(batch["pixels"])
     return Condition(
