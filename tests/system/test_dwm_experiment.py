@@ -8,7 +8,9 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.experiments.scenes import HeldOutClip
 from egosim_jax.io import weights
+from egosim_jax.networks import Networks
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
 
 pytestmark = pytest.mark.slow
@@ -60,3 +62,23 @@ def test_it_trains_compares_and_repeats_no_work(run):
     assert again == report
     assert sheet.exists()
     assert {path: path.stat().st_mtime_ns for path in made} == kept
+
+
+def test_the_other_experiments_give_a_model_of_dwm_its_conditions_or_refuse_it(
+    monkeypatch, tmp_path, capsys
+):
+    monkeypatch.setattr(configs, "get", lambda name: replace(TINY, encoders="joint"))
+    Networks.random(configs.get("dwm_tabletop"), seed=0).save(tmp_path / "weights")
+    model = f"--config dwm_tabletop --weights {tmp_path / 'weights'} --out {tmp_path}"
+    assert main(f"experiment tabletop --scenes 1 --seeds 1 --steps 2 {model}/run".split()) == 0
+    tables = json.loads((tmp_path / "run/report.json").read_text())["tables"]
+    assert tables.keys() == {"human"}  # a gripper has no mesh
+    twin = HeldOutClip.make(100, TINY.video, "human", prior="static", hands="mesh")
+    copied = twin.evaluate(twin.triplet.prior)["psnr"]
+    assert tables["human"]["prior copied"]["psnr"]["mean"] == pytest.approx(copied)
+    for command, reason in (
+        ("simulate --clips 1", "a video of the whole scene"),
+        ("experiment embodiment", "robots do not have"),
+    ):
+        assert main(f"{command} {model}/refused".split()) == 2
+        assert reason in capsys.readouterr().err
