@@ -11,6 +11,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.conditioning.layout import ChannelLayout
+from egosim_jax.networks import Networks
 from egosim_jax.train.tasks.denoising import Denoising, drawn, loss_weights, without_hands
 from egosim_jax.types import InputError
 from tests.training.run_tiny import MODEL
@@ -72,6 +73,72 @@ def test_drawn_latents_differ_by_stream_and_by_sample():
     found = drawn(batch, jax.random.split(jax.random.key(0), 2))
     rows = np.stack([found[name] for name in names]).reshape(6, 16)
     assert len({tuple(row) for row in rows}) == 6
+
+
+class Seen:
+    """Denoiser that keeps what it was given, and predicts 0."""
+
+    def prepare(self, condition, text, image=None):
+        self.condition, self.image = condition, image
+
+    def denoise(self, noisy, t, context):
+        return jnp.zeros_like(noisy)
+
+    def part(self, name):
+        where = MODEL.layout.slice(name)
+        return self.condition[..., where.start - 16 : where.stop - 16]
+
+
+@pytest.fixture
+def batch():
+    """Latents of two samples, each in its own range, without deviations."""
+    rng = np.random.default_rng(0)
+    draw = lambda *shape: jnp.asarray(rng.normal(size=(2, *shape)), jnp.float32)  # noqa: E731
+    streams = {name: draw(*MODEL.latent_shape, 16) for name in ("target", "prior", "hands")}
+    mask = jnp.zeros((2, *MODEL.latent_shape, 4), jnp.uint8)
+    return {**streams, "mask": mask, "text": draw(3, 64), "image": draw(3, 32)}
+
+
+def seen(batch, model=MODEL, **settings):
+    """Return the loss of a batch with fixed keys, and the denoiser."""
+    task, dit = Denoising(model=model, **settings), Seen()
+    loss, _ = task.loss(Networks(dit=dit), batch, task.keys(jax.random.key(0), 2))
+    return float(loss), dit
+
+
+def test_the_loss_is_that_of_latents_drawn_from_their_posteriors(batch):
+    model = dataclasses.replace(MODEL, posterior="sampled")
+    names = ("target", "prior", "hands")
+    of = lambda std: {f"{n}_std": jnp.full_like(batch[n], std) for n in names}  # noqa: E731
+    means, _ = seen(batch)
+    assert seen(batch | of(2.0))[0] == means  # a model of means does not draw
+    assert seen(batch | of(0.0), model)[0] == pytest.approx(means)
+    loss, dit = seen(batch | of(2.0), model)
+    assert loss == pytest.approx(1 + 1 + 4, rel=0.15)  # of noise, means and draws
+    for name in ("prior", "hands"):
+        assert (dit.part(name) - batch[name]).std() == pytest.approx(2, rel=0.15)
+
+
+def test_the_loss_of_navigation_is_that_of_the_camera_alone(batch):
+    loss, dit = seen(batch, navigation=1.0)
+    np.testing.assert_array_equal(dit.part("hands"), 0)
+    np.testing.assert_array_equal(dit.part("prior"), batch["prior"])
+    plain, dit = seen(batch)
+    np.testing.assert_array_equal(dit.part("hands"), batch["hands"])
+    still, _ = seen(batch | {"target": batch["prior"]})
+    assert loss == pytest.approx(still)
+    assert abs(loss - plain) > 1e-3
+
+
+def test_a_model_of_zero_image_tokens_is_trained_and_validated_with_zeros(batch):
+    model = dataclasses.replace(MODEL, image=None, zero_image_tokens=3)
+    given = batch.pop("image")
+    loss, dit = seen(batch, model)
+    np.testing.assert_array_equal(dit.image, np.zeros((2, 3, 32), np.float32))
+    assert loss == seen(batch | {"image": jnp.zeros_like(given)}, model)[0]
+    Denoising(model=model).validate(Networks(dit=dit), batch)
+    np.testing.assert_array_equal(dit.image, np.zeros((2, 3, 32), np.float32))
+    np.testing.assert_array_equal(seen(batch | {"image": given}, model)[1].image, given)
 
 
 def test_a_lora_is_all_that_its_task_trains_and_the_rest_is_in_the_compute_dtype():

@@ -155,7 +155,8 @@ class Denoising:
 def drawn(batch: Batch, keys: Key[Array, " b"]) -> Batch:
     """Return a batch with latents drawn from the posteriors whose deviations it has."""
     latents = {}
-    for number, name in enumerate(("target", "prior", "hands"), start=1):
+    # From 2 on: `split(key)`, by which the objective draws its noise, is `fold_in` of 0 and 1.
+    for number, name in enumerate(("target", "prior", "hands"), start=2):
         if name in batch:
             own = jax.vmap(jax.random.fold_in, (0, None))(keys, number)
             latents[name] = draw(batch[name], batch[f"{name}{STD}"], own)
