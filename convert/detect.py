@@ -21,7 +21,9 @@ from egosim_jax.types import InputError
 if TYPE_CHECKING:
     from egosim_jax.networks import ModelConfig
 
-TOKENIZER = ("tokenizer.json", "spiece.model")
+T5 = "spiece.model"
+"""File of T5's tokenizers alone; Wan's releases also have that of CLIP's text encoder."""
+TOKENIZER = ("tokenizer.json", T5)
 """Files that mark the folder of a tokenizer."""
 DEEPEST = 2
 """Levels of subfolders that are searched."""
@@ -66,7 +68,7 @@ class Folder:
     unknown: tuple[Source, ...]
     """Checkpoints without a known network."""
     tokenizer: Path | None
-    """Folder of the tokenizer, if any."""
+    """Folder of the tokenizer, if any; of several T5's, else the nearest."""
 
     def network(self, name: str) -> DetectedNetwork:
         """Return the only checkpoint of a network. Raises `InputError` for none or several."""
@@ -86,10 +88,10 @@ def detect(path: Path, config: ModelConfig | None = None) -> Folder:
     The tables are those of all registered models, after those of `config`, which take precedence.
     """
     tables = known_tables(config)
-    found, unknown, tokenizer = [], [], None
+    found, unknown, tokenizers = [], [], []
     for folder in _folders(path):
         if folder.is_dir() and any((folder / name).is_file() for name in TOKENIZER):
-            tokenizer = tokenizer or folder
+            tokenizers.append(folder)
         for source in sources(folder):
             here = networks_of(source, tables)
             found += here
@@ -99,6 +101,7 @@ def detect(path: Path, config: ModelConfig | None = None) -> Folder:
             f"{quote_path(path)} holds no checkpoint: no .safetensors, .pth, .pt or .bin. "
             "(--source)"
         )
+    tokenizer = min(tokenizers, key=lambda folder: not (folder / T5).is_file(), default=None)
     return Folder(path=path, found=tuple(found), unknown=tuple(unknown), tokenizer=tokenizer)
 
 

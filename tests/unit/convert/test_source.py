@@ -126,6 +126,18 @@ def test_networks_are_detected_by_their_names_under_any_prefix(tmp_path):
     assert list(folder.network("dit").tensors) == ["blocks.0.self_attn.q.weight"]
 
 
+def test_of_two_tokenizers_that_of_t5_is_taken(tmp_path):
+    """Wan's releases also have that of CLIP's text encoder, one folder nearer."""
+    (t5 := tmp_path / "google" / "umt5-xxl").mkdir(parents=True)
+    (clip := tmp_path / "xlm-roberta-large").mkdir()
+    for folder in (t5, clip):
+        (folder / "tokenizer.json").touch()
+    save_file({"x": torch.rand(1)}, tmp_path / "x.safetensors")
+    assert detect(tmp_path).tokenizer == clip
+    (t5 / "spiece.model").touch()
+    assert detect(tmp_path).tokenizer == t5
+
+
 def test_what_is_not_there_or_not_one_is_said(tmp_path):
     with pytest.raises(InputError, match="holds no checkpoint"):
         detect(tmp_path)
