@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,8 +89,8 @@ class Inspect:
 class Weights:
     """Convert every network of a checkpoint folder to a weights folder of a config.
 
-    All names and shapes are checked before anything is written. Running the same command again
-    resumes an interrupted conversion.
+    Networks that the config lacks are skipped with a message. All names and shapes are checked
+    before anything is written. Running the same command again resumes an interrupted conversion.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -114,11 +115,14 @@ class Weights:
 
         config = configs.get(self.config)
         folder = detect(self.source, config)
-        names = self.only or tuple(dict.fromkeys(found.network for found in folder.found))
+        detected = dict.fromkeys(found.network for found in folder.found)
+        names = self.only or tuple(name for name in detected if name in config.networks)
+        needless = ", ".join(name for name in detected if name not in config.networks)
         if not names:
-            raise InputError(
-                f"{quote_path(self.source)} holds no known network. (egosim convert inspect)"
-            )
+            has = f"only {needless}, which {self.config} lacks" if needless else "no known network"
+            raise InputError(f"{quote_path(self.source)} holds {has}. (egosim convert inspect)")
+        if needless and not self.only:
+            print(f"skipped, as {self.config} lacks it: {needless}", file=sys.stderr)
         apart(self.out, self.source)
         planned = []
         for found in map(folder.network, names):

@@ -1,5 +1,6 @@
 """`egosim-convert`: checkpoints as they are released, to weights folders."""
 
+import dataclasses
 import json
 import math
 import re
@@ -22,6 +23,7 @@ from safetensors.numpy import load_file
 from safetensors.torch import save_file
 
 from egosim_jax import configs
+from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
 from egosim_jax.convert import commands, outputs
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
@@ -193,6 +195,42 @@ def test_a_network_or_tokenizer_that_is_asked_for_must_be_there(tmp_path, capsys
     save_file({"a": torch.rand(1)}, source / "vae.safetensors")
     assert convert(source, tmp_path / "out") == 2
     assert "no known network" in capsys.readouterr().err
+
+
+def test_the_base_of_dwm_is_converted_without_the_network_that_it_lacks(
+    tmp_path, monkeypatch, capsys
+):
+    """By the command of docs/dwm.md, of a folder as Wan2.1-Fun-V1.1-14B-InP is released."""
+    dwm, get = configs.get("dwm_wan_14b"), configs.get
+    fields = {f.name: getattr(CONFIG.dit, f.name) for f in dataclasses.fields(CONFIG.dit)}
+    tiny = replace(dwm, dit=DWMWanDiTConfig(**fields), vae=CONFIG.vae, text=CONFIG.text)
+    monkeypatch.setattr(configs, "get", lambda name: tiny if name == dwm.name else get(name))
+    (source := tmp_path / "theirs").mkdir()
+    egosim(source)
+    dit = foreign("dit", "wan")
+    dit["patch_embedding.weight"] = dit["patch_embedding.weight"][:, :36].clone()
+    save_file(dit, source / "diffusion_pytorch_model.safetensors")
+    for folder, files in {
+        "google/umt5-xxl": ("spiece.model", "tokenizer.json"),
+        "xlm-roberta-large": ("sentencepiece.bpe.model", "tokenizer.json"),
+    }.items():
+        (source / folder).mkdir(parents=True)
+        for name in files:
+            (source / folder / name).write_text(folder, encoding="utf-8")
+    command = ["weights", str(source), "--config", "dwm_wan_14b", "--widen", "polarity"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert "skipped, as dwm_wan_14b lacks it: image" in capsys.readouterr().err
+    files = {path.stem for path in (tmp_path / "out").glob("[!.]*.safetensors")}
+    assert files == {"dit", "vae", "text"}
+    assert load_file(tmp_path / "out" / "dit.safetensors")["patch.kernel"].shape[0] == 52
+    tokenizer = tmp_path / "out" / "google" / "umt5-xxl" / "tokenizer.json"
+    assert tokenizer.read_text("utf-8") == "google/umt5-xxl"
+    for only, message in (("image", "has no network image"), (None, "only image, which")):
+        alone = source if only else next(source.glob("models_clip*"))
+        options = ["--only", only] if only else []
+        command = ["weights", str(alone), "--config", "dwm_wan_14b", *options]
+        assert main([*command, "--out", str(tmp_path / "none")]) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_the_hash_in_the_header_distinguishes_weights(tmp_path):
