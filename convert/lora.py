@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import ml_dtypes
 import numpy as np
 from einops import EinopsError
 
@@ -63,6 +64,8 @@ FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
 """Weight that a full difference is added to by the suffix of its name."""
 IN_FULL = "non_lora_weights"
 """Stem of the file, next to a LoRA, of weights that replace those of the base."""
+HALF = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
+"""Dtypes that a LoRA is kept in; others are read as float32."""
 SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
 
 
@@ -87,10 +90,11 @@ class Location:
 
 
 def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
-    """Return the changes of a LoRA by path, in float32; files in our format have the same paths.
+    """Return the changes of a LoRA by path; files in our format have the same paths.
 
     `path` is a file, or a folder of one with PEFT's config or weights in full. Missing blocks are
-    0, and ranks lower than the highest of a stack are padded with 0. Layers of a text encoder are
+    0, and ranks lower than the highest of a stack are padded with 0. Tensors of half precision keep
+    their dtype where nothing is computed; all others are float32. Layers of a text encoder are
     skipped with a message. Raises `InputError` listing every tensor that is not of the network or
     does not fit, and every value that is not finite.
     """
@@ -156,7 +160,7 @@ def _values(
             problems.append(f"{key}: not a weight of this network outside its blocks")
             continue
         try:
-            array = location.rule.to_jax(tensor.array()).astype(np.float32)
+            array = location.rule.to_jax(tensor.array()).astype(_dtype([tensor]))
         except (EinopsError, ValueError):
             problems.append(f"{key}: has shape {tensor.shape}; expected {want[location.target]}")
             continue
@@ -222,8 +226,9 @@ def _translated(
         shape = want[f"{path}.kernel"]
         changes[path] = _stacked({p.layer: v for p, v in pairs.items() if p.path == path}, shape)
     for target in dict.fromkeys(location.target for location in full):
-        values = np.zeros(want[target], np.float32)
-        for location in (location for location in full if location.target == target):
+        here = [location for location in full if location.target == target]
+        values = np.zeros(want[target], _dtype([full[location] for location in here]))
+        for location in here:
             layer = ... if location.layer is None else location.layer
             values[layer] = location.rule.to_jax(full[location].array())
         changes[target] = values
@@ -266,15 +271,25 @@ def _pair(
 
 def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delta:
     """Stack the low-rank tensors of all layers, the scale multiplied into the second."""
-    rank = max(pair.down.shape[0] for pair in layers.values())
+    pairs = layers.values()
+    rank = max(pair.down.shape[0] for pair in pairs)
     *stacked, wide, out = kernel
-    down = np.zeros((*stacked, wide, rank), np.float32)
-    up = np.zeros((*stacked, rank, out), np.float32)
+    down = np.zeros((*stacked, wide, rank), _dtype([pair.down for pair in pairs]))
+    same = all(pair.scale == 1 for pair in pairs)
+    up_dtype = _dtype([pair.up for pair in pairs]) if same else np.float32
+    up = np.zeros((*stacked, rank, out), up_dtype)
     for number, pair in layers.items():
         here, at = pair.down.shape[0], ... if number is None else number
         down[at][:, :here] = pair.down.array().T
         up[at][:here] = pair.scale * pair.up.array().astype(np.float32).T
     return Delta(down=down, up=up)
+
+
+def _dtype(tensors: Sequence[Tensor]) -> np.dtype:
+    """Return the dtype of half precision that tensors share, else float32."""
+    dtypes = {tensor.dtype for tensor in tensors}
+    shared = dtypes.pop() if len(dtypes) == 1 else None
+    return shared if shared in HALF else np.dtype(np.float32)
 
 
 def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, np.ndarray]:

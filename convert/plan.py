@@ -115,13 +115,14 @@ def merged(
         low_rank, full = changes.get(path.removesuffix(".kernel")), changes.get(path)
         added = []
         if path.endswith(".kernel") and isinstance(low_rank, lora.Delta):
-            added.append(low_rank.down[at] @ low_rank.up[at])
+            down, up = (array[at].astype(np.float32) for array in (low_rank.down, low_rank.up))
+            added.append(down @ up)
         if isinstance(full, np.ndarray):
-            added.append(full[at])
+            added.append(full[at].astype(np.float32))
         elif isinstance(full, lora.Value):
             if scale == 1:
                 return full.array[at]
-            added.append(full.array[at] - weight.astype(np.float32))
+            added.append(full.array[at].astype(np.float32) - weight.astype(np.float32))
         return weight.astype(np.float32) + scale * sum(added) if added else weight
 
     table = table_of(config)

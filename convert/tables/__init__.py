@@ -126,9 +126,12 @@ class CheckpointNaming:
             f"{name}.{self.down}": np.ascontiguousarray(down.T),
             f"{name}.{self.up}": np.ascontiguousarray(up.T),
         }
-        return found | (
-            {f"{name}.alpha": np.array(down.shape[-1], np.float32)} if self.alpha else {}
-        )
+        if not self.alpha:
+            return found
+        rank = down.shape[-1]
+        alpha = np.array(rank, down.dtype)  # as the trainer casts it with the others
+        exact = alpha if float(alpha) == rank else np.array(rank, np.float32)
+        return {**found, f"{name}.alpha": exact}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

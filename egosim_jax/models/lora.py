@@ -67,7 +67,7 @@ def linears(network: Any) -> Iterator[tuple[str, Linear]]:
 
 
 def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) -> None:
-    """Apply changes to a network in place; low-rank ones are kept apart from the weights.
+    """Apply changes to a network in place; low-rank ones are kept apart, in float32.
 
     Raises `InputError` as `check` does.
     """
@@ -81,13 +81,15 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
     for path, change in changes.items():
         if not isinstance(change, Delta):
             value = weights[path].get_value()
-            full = change.array - value if isinstance(change, Value) else jnp.asarray(change)
+            given = change.array if isinstance(change, Value) else change
+            full = jnp.asarray(given, jnp.float32)
+            full = full - value if isinstance(change, Value) else full
             weights[path].set_value((value + scale * full).astype(value.dtype))
     nnx.update(network, state)
     for path, change in changes.items():
         if isinstance(change, Delta):
-            up = jnp.asarray(scale * change.up)
-            layers[path].low_rank = LowRank(jnp.asarray(change.down), up)
+            down, up = (jnp.asarray(array, jnp.float32) for array in (change.down, change.up))
+            layers[path].low_rank = LowRank(down, scale * up)
 
 
 def deltas_of(network: Any) -> dict[str, Delta]:

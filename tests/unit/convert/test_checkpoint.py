@@ -3,17 +3,23 @@
 from dataclasses import replace
 from math import prod
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from safetensors.numpy import load_file, save_file
+from flax import nnx
+from safetensors.flax import save_file
 
 from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
+from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.checkpoint import checkpoint
 from egosim_jax.convert.lora import read_lora
-from egosim_jax.convert.tables import weight_shapes
+from egosim_jax.convert.plan import merged
+from egosim_jax.convert.tables import table_of, weight_shapes
+from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
-from egosim_jax.models.lora import Delta
+from egosim_jax.models.layers import Linear
+from egosim_jax.models.lora import Delta, Value, apply
 from egosim_jax.types import InputError
 
 RANK, LAYERS = 4, 2
@@ -40,10 +46,10 @@ def wan_layers(dim=48, ffn=96, text=64, image=32, freq=256, layers=LAYERS, out=6
     }  # fmt: skip
 
 
-def released(family, folder):
+def released(family, folder, dtype="float32"):
     """The two files as DWM's trainings write them; return their tensors by stem."""
     rng = np.random.default_rng(0)
-    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    draw = lambda *shape: rng.normal(size=shape).astype(jnp.dtype(dtype))  # noqa: E731
     low = {}
     if family == "cogvideox":
         for block in range(LAYERS):
@@ -62,7 +68,7 @@ def released(family, folder):
             layer = f"lora_unet__{name.replace('.', '_')}"
             low[f"{layer}.lora_down.weight"] = draw(RANK, wide)
             low[f"{layer}.lora_up.weight"] = draw(out, RANK)
-            low[f"{layer}.alpha"] = np.array(RANK, np.float32)
+            low[f"{layer}.alpha"] = np.array(RANK, jnp.dtype(dtype))
         files = {
             "lora_diffusion_pytorch_model": low,
             "non_lora_weights": {
@@ -71,38 +77,79 @@ def released(family, folder):
         }  # fmt: skip
     folder.mkdir()
     for stem, tensors in files.items():
-        save_file(tensors, folder / f"{stem}.safetensors")
+        arrays = {name: jnp.asarray(tensor) for name, tensor in tensors.items()}
+        save_file(arrays, folder / f"{stem}.safetensors")
     return files
 
 
-@pytest.mark.parametrize(("family", "config"), [("cogvideox", COGVIDEOX), ("wan", WAN)])
-def test_a_checkpoint_is_written_back_bit_for_bit(family, config, tmp_path):
-    want = released(family, tmp_path / "checkpoint")
-    have = checkpoint(read_lora(tmp_path / "checkpoint", config), config, None)
-    assert have.keys() == want.keys()
-    for stem, tensors in want.items():
-        assert have[stem].keys() == tensors.keys()
-        for name, tensor in tensors.items():
-            assert have[stem][name].dtype == tensor.dtype
-            np.testing.assert_array_equal(have[stem][name], tensor, err_msg=name)
-
-
-def test_the_command_writes_the_folder(tmp_path, monkeypatch):
-    from egosim_jax.convert.__main__ import main
-
-    want = released("cogvideox", tmp_path / "checkpoint")
+@pytest.fixture
+def tiny(monkeypatch):
+    """Config `dwm_cogvideox_5b` with a small transformer."""
     model = configs.get("dwm_cogvideox_5b")
     tiny = replace(
         model, dit=COGVIDEOX, text=replace(model.text, dim=16, ffn_dim=32, heads=2, head_dim=8)
     )
     monkeypatch.setattr(configs, "get", lambda name: tiny)
     monkeypatch.setattr(configs, "names", lambda: ["dwm_cogvideox_5b"])
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16", "bfloat16"])
+@pytest.mark.parametrize(("family", "config"), [("cogvideox", COGVIDEOX), ("wan", WAN)])
+def test_a_checkpoint_is_written_back_bit_for_bit(family, config, dtype, tmp_path):
+    want = released(family, tmp_path / "checkpoint", dtype)
+    have = checkpoint(read_lora(tmp_path / "checkpoint", config), config, None)
+    assert have.keys() == want.keys()
+    for stem, tensors in want.items():
+        assert have[stem].keys() == tensors.keys()
+        for name, tensor in tensors.items():
+            assert (have[stem][name].dtype, have[stem][name].shape) == (tensor.dtype, tensor.shape)
+            assert have[stem][name].tobytes() == tensor.tobytes(), name
+
+
+def test_an_alpha_that_half_precision_cannot_hold_is_written_exactly():
+    naming = table_of(WAN).checkpoint
+    for rank, dtype in ((256, "bfloat16"), (257, "float32")):
+        down, up = (np.zeros(shape, jnp.bfloat16) for shape in ((2, rank), (rank, 2)))
+        alpha = naming.tensors("head.head", down, up)["lora_unet__head_head.alpha"]
+        assert (alpha, alpha.dtype) == (rank, dtype)
+
+
+def test_half_precision_is_added_as_the_same_values_in_float32(tmp_path):
+    """Applications and merges alike."""
+    rng, shapes, half = np.random.default_rng(0), weight_shapes(WAN), jnp.bfloat16
+    wide, out = shapes["head.linear.kernel"]
+    down, up, bias = (rng.normal(size=s).astype(half) for s in ((wide, RANK), (RANK, out), out))
+    path = tmp_path / "dit.safetensors"
+    save_file({name: jnp.full(shape, 0.1) for name, shape in shapes.items()}, path)
+
+    def results(scale, dtype):
+        changes = {
+            "head.linear": Delta(down=down.astype(dtype), up=up.astype(dtype)),
+            "head.linear.bias": Value(array=bias.astype(dtype)),
+        }
+        linear = Linear(wide, out, axes=(None, None), rngs=nnx.Rngs(0))
+        apply(nnx.Dict(head=nnx.Dict(linear=linear)), changes, scale=scale)
+        yield linear(jnp.ones((1, wide)))
+        for weight in merged(read_safetensors(path), changes, WAN, scale=scale):
+            if weight.name.startswith("head.linear"):
+                yield weight.pieces[0]().astype(weight.dtype)
+
+    for scale in (1.0, 0.3):
+        for one, other in zip(results(scale, half), results(scale, np.float32), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_the_command_writes_the_folder(dtype, tiny, tmp_path):
+    want = released("cogvideox", tmp_path / "checkpoint", dtype)
     command = f"lora {tmp_path / 'checkpoint'} --config dwm_cogvideox_5b --layout dwm"
     assert main([*command.split(), "--out", str(tmp_path / "again")]) == 0
     for stem, tensors in want.items():
-        have = load_file(tmp_path / "again" / f"{stem}.safetensors")
+        have = read_safetensors(tmp_path / "again" / f"{stem}.safetensors")
         assert have.keys() == tensors.keys()
-        assert all(np.array_equal(have[name], tensors[name]) for name in tensors)
+        for name, tensor in tensors.items():
+            assert have[name].dtype == tensor.dtype
+            assert have[name].array().tobytes() == tensor.tobytes(), name
 
 
 @pytest.mark.parametrize(
