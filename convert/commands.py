@@ -129,6 +129,12 @@ class Weights:
             widening = _widening(found, config, self.widen)
             weights = to_jax(found, config, dtype=self.dtype, widening=widening)
             planned.append((found, weights))
+            if found.low_rank:
+                print(
+                    f"{found.source.name}: skipped {len(found.low_rank)} tensors of a LoRA on its "
+                    "layers. Merge it with `egosim convert lora --merge`.",
+                    file=sys.stderr,
+                )
             for file in found.source.files:
                 apart(self.out / f"{found.network}.safetensors", file)
         kept = {}

@@ -25,6 +25,8 @@ T5 = "spiece.model"
 """File of T5's tokenizers alone; Wan's releases also have that of CLIP's text encoder."""
 TOKENIZER = ("tokenizer.json", T5)
 """Files that mark the folder of a tokenizer."""
+BASE_LAYER, LORA = ".base_layer.", ".lora_"
+"""Parts of the names of an adapted layer's tensors by PEFT: of its weights, and of the LoRA."""
 DEEPEST = 2
 """Levels of subfolders that are searched."""
 MOST_NETWORKS = 16
@@ -48,13 +50,21 @@ class DetectedNetwork:
 
     @property
     def tensors(self) -> Mapping[str, Tensor]:
-        """Tensors of the network by name, without the prefix."""
+        """Tensors of the network by name, without the prefix and what PEFT adds to it."""
         cut = len(self.prefix)
+        skipped = set(self.low_rank)
         return {
-            name[cut:]: tensor
+            name[cut:].replace(BASE_LAYER, "."): tensor
             for name, tensor in self.source.tensors.items()
-            if name.startswith(self.prefix)
+            if name.startswith(self.prefix) and name not in skipped
         }
+
+    @property
+    def low_rank(self) -> list[str]:
+        """Names of the low-rank tensors of PEFT's adapted layers, which are not of the network."""
+        names = self.source.tensors.keys()
+        layers = {name.partition(BASE_LAYER)[0] for name in names if BASE_LAYER in name}
+        return [name for name in names if LORA in name and name.partition(LORA)[0] in layers]
 
 
 @dataclass(frozen=True, kw_only=True)

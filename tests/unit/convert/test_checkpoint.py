@@ -21,6 +21,7 @@ from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.lora import Delta, Value, apply
 from egosim_jax.types import InputError
+from tests.translation import translate_back
 
 RANK, LAYERS = 4, 2
 COGVIDEOX = CogVideoXDiTConfig(
@@ -150,6 +151,35 @@ def test_the_command_writes_the_folder(dtype, tiny, tmp_path):
         for name, tensor in tensors.items():
             assert have[name].dtype == tensor.dtype
             assert have[name].array().tobytes() == tensor.tobytes(), name
+
+
+def test_a_transformer_that_was_saved_with_its_lora_is_read_without_it(tiny, tmp_path, capsys):
+    """As in the folder that a training of DWM ends with: PEFT renames the adapted layers."""
+    rng = np.random.default_rng(0)
+    ours = {n: rng.normal(size=s).astype(np.float32) for n, s in weight_shapes(COGVIDEOX).items()}
+    theirs = translate_back(ours, table_of(COGVIDEOX).rules("diffusers", COGVIDEOX))
+    adapted = {}
+    for name, tensor in theirs.items():
+        layer, _, kind = name.rpartition(".")
+        if layer.endswith(("to_q", "to_k", "to_v", "to_out.0")):
+            name = f"{layer}.base_layer.{kind}"
+            adapted[f"{layer}.lora_A.default.weight"] = np.ones((RANK, 32), np.float32)
+            adapted[f"{layer}.lora_B.default.weight"] = np.ones((32, RANK), np.float32)
+        adapted[name] = np.ascontiguousarray(tensor)
+    folder = tmp_path / "final" / "transformer"
+    folder.mkdir(parents=True)
+    file = folder / "diffusion_pytorch_model.safetensors"
+    save_file({name: jnp.asarray(tensor) for name, tensor in adapted.items()}, file)
+    command = ["weights", str(tmp_path / "final"), "--config", "dwm_cogvideox_5b", "--out"]
+    assert main([*command, str(tmp_path / "out")]) == 0
+    assert "skipped 16 tensors of a LoRA" in capsys.readouterr().err
+    have = read_safetensors(tmp_path / "out" / "dit.safetensors")
+    assert have.keys() == ours.keys()
+    assert all(np.array_equal(have[name].array(), ours[name]) for name in ours)
+    adapted = {name: a for name, a in adapted.items() if "to_q.base_layer" not in name}
+    save_file({name: jnp.asarray(tensor) for name, tensor in adapted.items()}, file)
+    assert main([*command, str(tmp_path / "none")]) == 2
+    assert "to_q.weight: missing" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
