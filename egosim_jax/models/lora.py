@@ -165,7 +165,7 @@ def start(
 ) -> None:
     """Add trainable low-rank changes to the linear layers that match `targets`, in place.
 
-    A is drawn as the paper does, from a normal distribution of deviation 1 / sqrt(in), and B is 0,
+    A is drawn as PEFT does, uniformly from ±1 / sqrt(in) (Kaiming's with a = sqrt(5)), and B is 0,
     so that nothing changes before the first update. Raises `InputError` if no linear layer matches
     `targets`, or no weight a pattern of `also_train`.
     """
@@ -185,7 +185,10 @@ def start(
         )
     for layer in layers:
         *stacked, wide, out = layer.kernel.shape
-        down = jax.random.normal(rngs.params(), (*stacked, wide, rank)) / wide**0.5
+        bound = wide**-0.5
+        down = jax.random.uniform(
+            rngs.params(), (*stacked, wide, rank), minval=-bound, maxval=bound
+        )
         layer.low_rank = LowRank(down, jnp.zeros((*stacked, rank, out)))
 
 
