@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -113,6 +114,18 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]] | None:
     return results
 
 
+def conditions_sha256(files: ClipFiles) -> str:
+    """Return the SHA-256 of the files of a clip's conditions, of those that exist, by role."""
+    roles = {
+        "prior": files.prior,
+        "mask": files.mask,
+        "hands": files.hands,
+        "first_frame": files.first_frame,
+    }
+    found = {role: sha256(path) for role, path in roles.items() if path and path.exists()}
+    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
+
+
 def seed_of(seed: int, output_id: str) -> int:
     """Return the seed of a clip's noise, given the seed of the job."""
     return int.from_bytes(hashlib.sha256(f"{seed} {output_id}".encode()).digest()[:4], "big")
@@ -143,7 +156,7 @@ class BatchJob:
     decoding: Decoding = "accurate"
     """Color decoding of videos."""
     skip_existing: bool = False
-    """Skip windows whose video exists."""
+    """Skip windows whose video exists; one of other inputs is refused."""
     reconstruct: bool = False
     """Also write the ground truth through the autoencoder."""
     baseline: Baseline | None = None
@@ -215,16 +228,19 @@ class BatchJob:
     def _list(self, windows: Sequence[Window]) -> None:
         """Report existing clips whose results an interruption prevented.
 
-        Raises `InputError` if one is of another window or prompt, and would be taken for this one.
+        Raises `InputError` if one is of another window, prompt or other conditions, and would be
+        taken for this one. Lines of earlier versions do not say of which conditions.
         """
         results = read_results(self.out) or {}
         for window in windows:
             line = results.get(window.output_id, {})
+            digest = conditions_sha256(window.files)
             if line.get("status") != "done":
-                self._report(window, status="done", seed=seed_of(self.seed, window.output_id))
+                seed = seed_of(self.seed, window.output_id)
+                self._report(window, status="done", seed=seed, conditions_sha256=digest)
                 continue
             own = {"source_id": window.files.video_id, "start": window.start,
-                   "prompt": window.files.prompt}  # fmt: skip
+                   "prompt": window.files.prompt, "conditions_sha256": digest}  # fmt: skip
             if differing := [name for name in own if line.get(name, own[name]) != own[name]]:
                 raise InputError(
                     f"{self._video(window)} exists and cannot be skipped, because it has another "
@@ -301,11 +317,12 @@ class BatchJob:
 
     def _load(
         self, windows: Sequence[Window]
-    ) -> tuple[list[tuple[Window, Triplet]], list[Failure]]:
-        """Decode the inputs of a batch; return them, and the failures."""
+    ) -> tuple[list[tuple[Window, Triplet, str]], list[Failure]]:
+        """Decode the inputs of a batch; return them with their hashes, and the failures."""
         loaded, failed = [], []
         for window in windows:
             try:
+                digest = conditions_sha256(window.files)
                 triplet = load_triplet(
                     window.files,
                     self.model.video,
@@ -314,17 +331,17 @@ class BatchJob:
                     decoding=self.decoding,
                     grid=self.model.grid,
                 )
-                loaded.append((window, triplet))
+                loaded.append((window, triplet, digest))
             except InputError as error:
                 failed.append((window, str(error)))
                 self._report(window, status="failed", error=str(error))
         return loaded, failed
 
     def _generate_batch(
-        self, generator: Generator, loaded: Sequence[tuple[Window, Triplet]], size: int
+        self, generator: Generator, loaded: Sequence[tuple[Window, Triplet, str]], size: int
     ) -> list[Failure]:
         """Generate and write one batch, padded to `size` so that nothing is compiled again."""
-        windows, triplets = zip(*loaded, strict=True)
+        windows, triplets, digests = zip(*loaded, strict=True)
         fill = size - len(windows)
         triplets = [*triplets, *[triplets[-1]] * fill]
         seeds = [seed_of(self.seed, w.output_id) for w in (*windows, *[windows[-1]] * fill)]
@@ -337,11 +354,12 @@ class BatchJob:
             return [(window, str(error)) for window in windows]
         seconds = (time.monotonic() - then) / len(windows)
         reconstructions = generator.reconstruct(triplets) if self.reconstruct else [None] * size
-        for window, triplet, clip, reconstruction, seed in zip(
-            windows, triplets, clips, reconstructions, seeds, strict=False
+        for window, digest, triplet, clip, reconstruction, seed in zip(
+            windows, digests, triplets, clips, reconstructions, seeds, strict=False
         ):
             self._write(window, triplet, clip, reconstruction)
-            self._report(window, status="done", seed=seed, seconds=round(seconds, 3))
+            self._report(window, status="done", seed=seed, seconds=round(seconds, 3),
+                         conditions_sha256=digest)  # fmt: skip
             print(self._video(window))
         return []
 
@@ -379,7 +397,7 @@ class BatchJob:
             "prompt": window.files.prompt,
         }
         # A column of the metadata must not replace a field of the result.
-        reserved = {*own, "seed", "seconds", "error"}
+        reserved = {*own, "seed", "seconds", "conditions_sha256", "error"}
         extra = window.files.extra.items()
         line = own | {f"metadata_{k}" if k in reserved else k: text for k, text in extra}
         append_line(self.out / RESULTS, line)

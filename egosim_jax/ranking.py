@@ -85,7 +85,8 @@ def order(scores: Mapping[str, Sequence[float]]) -> list[Ranked]:
 def rank(jobs: Sequence[BatchJob], windows: Sequence[Window], score: Score) -> list[Ranked]:
     """Generate every candidate by each job, which differ in their seed, and rank them.
 
-    Finished clips are not generated again. Raises `InputError` if a candidate has no clip.
+    Finished clips are not generated again. Raises `InputError` if a candidate has no clip, or one
+    of other conditions.
     """
     scores: dict[str, list[float]] = {window.output_id: [] for window in windows}
     for job in jobs:
@@ -110,5 +111,6 @@ def report(ranked: Sequence[Ranked], out: Path, *, goal: str, measure: str) -> N
     table = {}
     for one in ranked:
         mean, spread = mean_and_spread(one.scores)
-        table[one.name] = {"score": {"mean": mean, "spread": spread}, "rank": {"mean": one.rank}}
+        place = {"mean": float(one.rank)}
+        table[one.name] = {"score": {"mean": mean, "spread": spread}, "rank": place}
     print_table("candidate", table, MEASURES, title=f"{measure}: {goal}")

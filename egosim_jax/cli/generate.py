@@ -97,7 +97,7 @@ class Generate:
 
     SDEdit begins with the noised prior, at the model's strength or 0.75."""
     skip_existing: bool = False
-    """Skip clips whose video exists."""
+    """Skip clips whose video exists; one that was made of other inputs is refused."""
     reconstruct: bool = False
     """Also write {id}_vae.mp4, the ground truth through the autoencoder: the upper bound."""
 

@@ -1,19 +1,107 @@
 """Ranking of candidate actions."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from egosim_jax import ranking
+from egosim_jax.batch import BatchJob, windows_of
 from egosim_jax.cli.__main__ import main
+from egosim_jax.data.clips import write_clips
+from egosim_jax.data.metadata import read_metadata
 from egosim_jax.perception.networks.xclip import prepare
+from egosim_jax.testing import random_triplet, tiny_model
 from egosim_jax.types import InputError
+from tests import shown
 
 
 def test_the_candidate_with_the_highest_mean_score_is_first():
     found = ranking.order({"a": (0.1, 0.3), "b": (0.5, 0.1), "c": (0.0, 0.0)})
     assert [(one.name, one.rank) for one in found] == [("b", 1), ("a", 2), ("c", 3)]
     assert found[0].score == pytest.approx(0.3)
+
+
+MODEL = tiny_model(image=None, dit=replace(tiny_model().dit, image_dim=None), steps=1)
+
+
+@pytest.fixture(autouse=True)
+def generated_clips_show_the_hands(monkeypatch):
+    """Replace the networks: a clip ends as bright as the hands of its candidate."""
+    shown.uncached(monkeypatch)
+    made = shown.networks(MODEL, "hands")
+    monkeypatch.setattr("egosim_jax.batch.Networks.random", lambda config, *, seed: made)
+
+
+def candidates(folder, **grays):
+    """Write a candidate for each gray of its hands; return their windows."""
+    clip = random_triplet(MODEL.video)
+    clips = [
+        replace(clip, video_id=name, hands=np.full_like(clip.hands, gray))
+        for name, gray in grays.items()
+    ]
+    return windows_of(read_metadata(write_clips(folder, clips, fps=8)), (0,))
+
+
+def jobs(out):
+    return [
+        BatchJob(model=MODEL, out=out / str(s), weights=None, seed=s, skip_existing=True)
+        for s in (0, 1)
+    ]
+
+
+def brightness(video):
+    return float(video[-1].mean())
+
+
+def test_candidates_are_generated_by_every_seed_ranked_and_reported(tmp_path, capsys):
+    windows = candidates(tmp_path / "clips", dark=40, bright=200, gray=120)
+    ranked = ranking.rank(jobs(tmp_path / "out"), windows, brightness)
+    assert [(one.name, one.rank) for one in ranked] == [("bright", 1), ("gray", 2), ("dark", 3)]
+    for one, gray in zip(ranked, (200, 120, 40), strict=True):
+        assert one.scores == pytest.approx((gray, gray), abs=4)  # a score of each seed
+    capsys.readouterr()
+    ranking.report(ranked, tmp_path, goal="light", measure="brightness")
+    found = json.loads((tmp_path / "ranking.json").read_text("utf-8"))
+    assert (found["goal"], found["measure"], found["best"]) == ("light", "brightness", "bright")
+    assert [row["name"] for row in found["candidates"]] == ["bright", "gray", "dark"]
+    assert [row["scores"] for row in found["candidates"]] == [list(one.scores) for one in ranked]
+    table = capsys.readouterr().out
+    assert table.index("bright") < table.index("gray") < table.index("dark")
+
+
+def test_a_candidate_without_a_clip_ends_the_ranking(tmp_path):
+    windows = candidates(tmp_path / "clips", a=40, b=200)
+    windows[1].files.hands.unlink()
+    with pytest.raises(InputError, match="The candidate b has no clip"):
+        ranking.rank(jobs(tmp_path / "out"), windows, brightness)
+
+
+def test_a_candidate_whose_hands_were_corrected_is_not_ranked_by_its_old_clip(tmp_path):
+    out, windows = tmp_path / "out", candidates(tmp_path / "clips", a=120, b=200)
+    first = ranking.rank(jobs(out), windows, brightness)
+    assert [one.name for one in first] == ["b", "a"]
+    assert ranking.rank(jobs(out), windows, brightness) == first
+    candidates(tmp_path / "clips", a=120, b=40)
+    with pytest.raises(InputError, match=r"b\.mp4 exists .* another conditions_sha256"):
+        ranking.rank(jobs(out), windows, brightness)
+    for seed in "01":
+        (out / seed / "b.mp4").unlink()
+    again = ranking.rank(jobs(out), windows, brightness)
+    assert [one.name for one in again] == ["a", "b"]
+    assert ranking.rank(jobs(out), windows, brightness) == again
+
+
+def test_results_of_a_version_that_recorded_no_conditions_are_taken(tmp_path):
+    out, windows = tmp_path / "out", candidates(tmp_path / "clips", a=40, b=200)
+    first = ranking.rank(jobs(out), windows, brightness)
+    for file in out.glob("*/results.jsonl"):
+        lines = [json.loads(line) for line in file.read_text("utf-8").splitlines()]
+        assert all(len(line.pop("conditions_sha256")) == 64 for line in lines)
+        file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
+    assert ranking.rank(jobs(out), windows, brightness) == first
 
 
 def test_a_video_that_ends_at_the_goal_scores_highest():
