@@ -115,9 +115,10 @@ def test_an_alpha_that_half_precision_cannot_hold_is_written_exactly():
         assert (alpha, alpha.dtype) == (rank, dtype)
 
 
-def test_half_precision_is_added_as_the_same_values_in_float32(tmp_path):
+@pytest.mark.parametrize("half", ["float16", "bfloat16"])
+def test_half_precision_is_added_as_the_same_values_in_float32(half, tmp_path):
     """Applications and merges alike."""
-    rng, shapes, half = np.random.default_rng(0), weight_shapes(WAN), jnp.bfloat16
+    rng, shapes, half = np.random.default_rng(0), weight_shapes(WAN), jnp.dtype(half)
     wide, out = shapes["head.linear.kernel"]
     down, up, bias = (rng.normal(size=s).astype(half) for s in ((wide, RANK), (RANK, out), out))
     path = tmp_path / "dit.safetensors"
