@@ -167,9 +167,11 @@ def mano_hands(
 ) -> MovingMesh:
     """Return the meshes of a left and a right hand, in this order, in the colors of their sides.
 
-    Without a model of the left hand its poses are those of a right one that is mirrored in x, as
-    HaMeR estimates them. `add_mean` is for poses relative to the mean pose. Raises `InputError` for
-    another number of hands.
+    Without a model of the left hand its poses are those of a right one, as HaMeR estimates them,
+    which is posed, mirrored in x, then moved by the translation. So the global orientation is in
+    mirrored axes of the world: where HaMeR's is G and R turns its camera to the world, it is
+    (M R M) G with M = diag(-1, 1, 1). `add_mean` is for poses relative to the mean pose. Raises
+    `InputError` for another number of hands.
     """
     if poses.global_orient.shape[1] != 2:
         raise InputError(
@@ -180,11 +182,10 @@ def mano_hands(
     models = (left or right, right)
     meshes = []
     for number, (side, model) in enumerate(zip(sides, models, strict=True)):
-        vertices = _pose(model, poses, number, add_mean)
         mirrored = side == "left" and left is None
         meshes.append(
             MovingMesh(
-                vertices_m=vertices * [-1, 1, 1] if mirrored else vertices,
+                vertices_m=_pose(model, poses, number, add_mean, mirrored),
                 triangles=model.triangles[:, ::-1] if mirrored else model.triangles,
                 colors=np.tile(HAND_COLORS[side], (len(model.v_template), 1)),
             )
@@ -192,7 +193,9 @@ def mano_hands(
     return join_meshes(meshes)
 
 
-def _pose(model: Mano, poses: ManoPoses, hand: int, add_mean: bool) -> Float[np.ndarray, "f v 3"]:
+def _pose(
+    model: Mano, poses: ManoPoses, hand: int, add_mean: bool, mirrored: bool
+) -> Float[np.ndarray, "f v 3"]:
     """Return the vertices of one hand, NaN where it is missing."""
     given = poses.given[:, hand]
     vertices = np.full((len(given), *model.v_template.shape), np.nan)
@@ -200,6 +203,7 @@ def _pose(model: Mano, poses: ManoPoses, hand: int, add_mean: bool) -> Float[np.
         pose = poses.hand_pose[given, hand] + (model.hands_mean if add_mean else 0.0)
         turns = np.concatenate([poses.global_orient[given, hand], pose], axis=-1)
         posed = skin(model, poses.betas[hand], turns.reshape(-1, JOINTS, 3))
+        posed = posed * [-1, 1, 1] if mirrored else posed
         vertices[given] = posed + poses.translation_m[given, hand, None]
     return vertices
 

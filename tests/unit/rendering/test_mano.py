@@ -3,13 +3,15 @@
 import pickle
 import sys
 import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from egosim_jax.io.pickled_models import read_model
-from egosim_jax.rendering.mano import ManoPoses, mano_hands, read_mano, read_poses
+from egosim_jax.rendering.mano import ManoPoses, mano_hands, read_mano, read_poses, rotations_of
 from egosim_jax.types import InputError
 from tests.mano import PARENTS, Called, Global, Made, dump, model_pickle, random_model
 
@@ -84,7 +86,20 @@ def test_without_a_left_model_the_left_hand_is_mirrored(model):
     poses = make_poses()
     mirrored = mano_hands(model, poses).vertices_m[:, :30]
     own = mano_hands(model, poses, left=model).vertices_m[:, :30]
-    np.testing.assert_array_equal(mirrored, own * [-1, 1, 1])
+    place = poses.translation_m[:, 0, None]
+    np.testing.assert_allclose(mirrored, (own - place) * [-1, 1, 1] + place, atol=1e-12)
+
+
+def test_a_mirrored_hand_is_turned_from_the_camera_to_the_world_in_mirrored_axes(model):
+    seen, mirror = make_poses(), np.diag([-1, 1, 1])
+    turn = rotations_of(np.array([0.4, -0.9, 0.2]))
+    turned = mirror @ turn @ mirror @ rotations_of(seen.global_orient[:, 0])
+    orient = seen.global_orient.copy()
+    orient[:, 0] = Rotation.from_matrix(turned).as_rotvec()
+    placed = replace(seen, global_orient=orient, translation_m=np.ones((3, 2, 3)))
+    hand, world = (mano_hands(model, poses).vertices_m[:, :30] for poses in (seen, placed))
+    expected = (hand - hand[:, :1]) @ turn.T
+    np.testing.assert_allclose(world - world[:, :1], expected, atol=1e-12)
 
 
 def test_a_hand_may_be_missing_but_not_half(model):
