@@ -43,6 +43,8 @@ from egosim_jax.types import InputError, Triplet, VideoSpec
 logger = logging.getLogger(__name__)
 
 Policy = Literal["strict", "lenient"]
+SAME_RATE = 1.01
+"""Largest ratio of the frame rates of a clip's videos that are taken as equal, as 24 and 23.976."""
 DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
@@ -141,8 +143,10 @@ def check_clip(
         sizes["first_frame"] = _read_first_frame(files.first_frame).shape[:2]
     except InputError as error:
         problems.append(str(error))
+    if resampling == "rate":
+        problems += _rate_problems(probed)
     if policy == "strict":
-        taken = {name: _taken(info, spec, resampling) for name, info in probed.items()}
+        taken = _taken(probed, spec, resampling)
         problems += _length_problems(probed, taken, start + (spec.frames if spec else 1), grid)
         problems += _size_problems(sizes, grid.spatial_stride * grid.patch)
     return [f"{files.row} ({files.video_id}): {problem}" for problem in problems]
@@ -160,7 +164,8 @@ def load_triplet(
 ) -> Triplet:
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
-    Another `resampling` takes them from all frames, and has no `start`. The CLIP image is that of
+    Another `resampling` takes them from all frames, the same ones of every video, and has no
+    `start`. The CLIP image is that of
     the clip for every window. Raises `InputError` with the problems of `check_clip`, or naming a
     damaged video.
     """
@@ -175,7 +180,12 @@ def load_triplet(
     arrays: dict[str, np.ndarray] = {
         "mask": np.zeros((spec.frames, spec.height, spec.width), np.uint8)
     }
-    for name, path in _videos(files, policy).items():
+    videos = _videos(files, policy)
+    step = 1
+    if resampling == "rate":
+        probed = {name: probe_video(path, damage=DAMAGE[policy]) for name, path in videos.items()}
+        step = _step(probed, spec)
+    for name, path in videos.items():
         fit = _fit_mask if name == "mask" else resize_image
         try:
             video = read_video(
@@ -186,7 +196,6 @@ def load_triplet(
                 damage=DAMAGE[policy],
                 each=partial(fit, height=spec.height, width=spec.width),
             )
-            step = int(video.fps / spec.fps)
             frames = video.frames[resample(len(video.frames), spec.frames, resampling, step=step)]
         except InputError as error:
             raise InputError(f"{files.row} ({files.video_id}): {error}") from error
@@ -228,12 +237,34 @@ def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
     return videos
 
 
-def _taken(info: VideoInfo, spec: VideoSpec | None, resampling: Resampling) -> int:
-    """Return the number of frames of a video that can be taken."""
+def _taken(
+    probed: dict[str, VideoInfo], spec: VideoSpec | None, resampling: Resampling
+) -> dict[str, int]:
+    """Return the number of frames of each video that can be taken."""
     if spec is None or resampling == "first":
-        return info.frames
-    step = int(info.fps / spec.fps)
-    return len(resample(info.frames, spec.frames, resampling, step=step))
+        return {name: info.frames for name, info in probed.items()}
+    step = _step(probed, spec)
+    return {
+        name: len(resample(info.frames, spec.frames, resampling, step=step))
+        for name, info in probed.items()
+    }
+
+
+def _step(probed: dict[str, VideoInfo], spec: VideoSpec) -> int:
+    """Return the step of the rule `rate` for all videos: of the recorded one or else the prior."""
+    timed = probed.get("target") or probed.get("prior")
+    return int(timed.fps / spec.fps) if timed else 1
+
+
+def _rate_problems(probed: dict[str, VideoInfo]) -> list[str]:
+    rates = {name: info.fps for name, info in probed.items()}
+    if not rates or max(rates.values()) <= SAME_RATE * min(rates.values()):
+        return []
+    return [
+        f"the frame rates disagree: {_table({n: f'{float(r):g}' for n, r in rates.items()})}. "
+        "Frames taken by rate need one rate: write the videos at it, or take them by another rule. "
+        "(--resampling)"
+    ]
 
 
 def _length_problems(

@@ -1,5 +1,7 @@
 """DWM's folders and lists: what is written is read, and what is wrong is named."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -40,8 +42,8 @@ def root(tmp_path):
     return tmp_path
 
 
-def near(video, other):
-    return np.abs(video.astype(int) - other).mean() < 8
+def near(video, other, most=8):
+    return np.abs(video.astype(int) - other).mean() < most
 
 
 def test_a_written_list_is_read(root):
@@ -146,6 +148,29 @@ def test_frames_are_taken_at_intervals(root):
         load_triplet(clip, VideoSpec(frames=17, height=32, width=48), resampling="stride")
     with pytest.raises(InputError, match="need a size"):
         list(pack([clip], out=root / "x", spec=None, provenance={}, resampling="rate"))
+
+
+def packed_by_rate(root, rates):
+    """Record of a clip of 14 frames, each three times, whose videos have these frame rates."""
+    clip = read_metadata(clips_list(root))[0]
+    paths = {"target": clip.target, "prior": clip.prior, "hands": clip.hands}
+    for name, path in paths.items():
+        frames = getattr(make_triplet("a"), name).repeat(3, axis=0)[:14]
+        write_video(path, frames, rates.get(name, 24))
+    spec = VideoSpec(frames=5, height=32, width=48, fps=8)
+    return load_triplet(clip, spec, resampling="rate")
+
+
+def test_frames_taken_by_rate_are_the_same_in_every_video(root):
+    taken, whole = packed_by_rate(root, {"prior": Fraction(24000, 1001)}), make_triplet("a")
+    for name in ("prior", "hands", "target"):
+        for frame in range(5):
+            assert near(getattr(taken, name)[frame], getattr(whole, name)[frame], most=2)
+
+
+def test_videos_of_other_rates_are_not_taken_by_rate(root):
+    with pytest.raises(InputError, match=r"rates disagree: prior 24, hands 8, target 24\..*rule"):
+        packed_by_rate(root, {"hands": 8})
 
 
 def test_triplets_without_a_recorded_video_are_refused(tmp_path):
