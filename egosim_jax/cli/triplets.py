@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
+from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.rendering.mesh import MovingMesh
@@ -48,8 +51,8 @@ class Static:
     """MANO_LEFT.pkl; without it, left hands are mirrored right ones."""
     add_mean: bool = False
     """Take the poses of MANO as relative to its mean pose."""
-    fps: int = 8
-    """Frame rate of the videos in frames per second."""
+    fps: int | None = None
+    """Frame rate in frames per second; None: that of the recorded video, or 8 without one."""
 
     def run(self) -> int:
         """Read, render and write."""
@@ -57,11 +60,14 @@ class Static:
         from egosim_jax.conditions import repeated, static_of, static_triplet
         from egosim_jax.data.clips import write_clips
         from egosim_jax.io.video import read_video
-        from egosim_jax.types import InputError, check_counts
 
         check_counts({"--fps": self.fps})
         action = read_action(self.action, height=self.height, width=self.width, prompt=self.prompt)
-        target = None if self.video is None else read_video(self.video).frames
+        if self.video is None:
+            target, fps = None, Fraction(self.fps or 8)
+        else:
+            video = read_video(self.video)
+            target, fps = video.frames, _one_rate({video.fps}, self.fps, of="--video")
         if self.scene is not None:
             static = static_of(self.scene, action.cameras)
         elif target is not None:
@@ -74,12 +80,11 @@ class Static:
         triplet = static_triplet(
             action, static, video_id=self.video_id, meshes=self._meshes(), target=target
         )
-        print(write_clips(self.out, [triplet], fps=self.fps, append=True))
+        print(write_clips(self.out, [triplet], fps=fps, append=True))
         return ExitCode.DONE
 
     def _meshes(self) -> MovingMesh | None:
         from egosim_jax.rendering.mano import mano_hands, read_mano, read_poses
-        from egosim_jax.types import InputError
 
         given = (self.mano_poses, self.mano_right, self.mano_left)
         if given == (None, None, None) and not self.add_mean:
@@ -125,7 +130,6 @@ class Align:
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.io.run import write_json
         from egosim_jax.metrics.alignment import align_clip
-        from egosim_jax.types import InputError
 
         clips = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
         table = Table(
@@ -171,8 +175,10 @@ class ToDwm:
     """Root of the folders."""
     name: str
     """Name of the dataset, which is that of its folder and of its list."""
-    fps: int = 8
-    """Frame rate of the videos in frames per second."""
+    fps: int | None = None
+    """Frame rate in frames per second; None: that of the shards.
+
+    Frames that `data pack` took by another rule than rate do not say theirs."""
     limit: int | None = None
     """Maximum number of clips."""
 
@@ -181,16 +187,41 @@ class ToDwm:
         from itertools import islice
 
         from egosim_jax.data.dwm import write_folders
-        from egosim_jax.data.pack import read_triplets
+        from egosim_jax.data.pack import frame_rates, read_triplets
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.types import check_counts
 
         check_counts({"--fps": self.fps, "--limit": self.limit})
         reader = ShardReader(self.shards)
         count = min(len(reader), self.limit or len(reader))
+        fps = _one_rate(frame_rates(reader, count), self.fps, of="--shards")
         triplets = track(islice(read_triplets(reader), count), "writing", total=count)
-        print(write_folders(self.out, triplets, name=self.name, fps=self.fps))
+        print(write_folders(self.out, triplets, name=self.name, fps=fps))
         return ExitCode.DONE
+
+
+def _one_rate(known: Collection[Fraction], given: int | None, *, of: str) -> Fraction:
+    """Return the frame rate that is known or given. Raises `InputError` for none, or for several.
+
+    `of` is the option that it is known of.
+    """
+    rates = {*known} if given is None else {*known, Fraction(given)}
+    if not rates:
+        raise InputError(f"The clips do not say their frame rate: give it. (--fps, {of})")
+    if len(known) > 1:
+        raise InputError(
+            f"The videos have {_listed(rates)} frames per second: all must have one rate. Pack "
+            f"those of each rate into other shards. ({of})"
+        )
+    if len(rates) > 1:
+        raise InputError(
+            f"The videos have {_listed(known)} frames per second, not {given}: their frames must "
+            f"keep this rate. Leave it out. (--fps, {of})"
+        )
+    return rates.pop()
+
+
+def _listed(rates: Collection[Fraction]) -> str:
+    return ", ".join(f"{float(rate):g}" for rate in sorted(rates))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +243,6 @@ class Mix:
         """Check the folders and write the mixture."""
         from egosim_jax.data.mixing import write_mixture
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.types import InputError
 
         weights = self.weights or tuple(float(len(ShardReader(part))) for part in self.shards)
         if len(weights) != len(self.shards) or len({*self.shards}) < len(self.shards):

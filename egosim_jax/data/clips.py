@@ -50,7 +50,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
 def write_clips(
-    folder: Path, triplets: Iterable[Triplet], *, fps: int, append: bool = False
+    folder: Path, triplets: Iterable[Triplet], *, fps: int | Fraction, append: bool = False
 ) -> Path:
     """Write triplets as files in EgoSim's layout; return the path of their metadata.csv.
 

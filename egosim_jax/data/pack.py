@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.untrusted import listing, read_bytes
+from egosim_jax.io.video import probe_encoded
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
 MAX_FILE = 1 << 28
@@ -132,12 +134,7 @@ def read_triplets(source: ShardReader) -> Iterator[Triplet]:
 
     Raises `InputError` for shards of latents or without targets.
     """
-    manifest = source.manifest
-    if manifest.kind == "latents" or "target" not in manifest.arrays:
-        raise InputError(
-            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}: it must be "
-            "videos or frames with their target. (--shards)"
-        )
+    _check_targets(source)
     for number, record in enumerate(source):
         try:
             frames, height, width = video_shape(record.arrays)
@@ -147,3 +144,33 @@ def read_triplets(source: ShardReader) -> Iterator[Triplet]:
             raise InputError(f"{source.name(number)}: {error}") from error
         names = {name: str(record.metadata.get(name, "")) for name in ("video_id", "prompt")}
         yield Triplet(**names, **arrays, extra=record.metadata.get("extra", {}))
+
+
+def frame_rates(source: ShardReader, count: int) -> set[Fraction]:
+    """Return the frame rates of the first `count` clips of shards; none if they do not say it.
+
+    Frames of files do if they were taken by the rule `rate`. Raises `InputError` as `read_triplets`
+    does.
+    """
+    _check_targets(source)
+    manifest = source.manifest
+    if manifest.spec is None:
+        return {
+            probe_encoded(
+                source[number].arrays["target"].tobytes(), name=f"{source.name(number)}: target"
+            ).fps
+            for number in range(count)
+        }
+    if "decoding" in manifest.provenance and manifest.provenance.get("resampling") != "rate":
+        return set()
+    return {Fraction(manifest.spec.fps)}
+
+
+def _check_targets(source: ShardReader) -> None:
+    """Raise `InputError` for shards of latents or without targets."""
+    manifest = source.manifest
+    if manifest.kind == "latents" or "target" not in manifest.arrays:
+        raise InputError(
+            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}: it must be "
+            "videos or frames with their target. (--shards)"
+        )

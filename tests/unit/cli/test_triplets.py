@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from egosim_jax.data.dwm import write_folders
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.mixing import open_shards
 from egosim_jax.data.pack import pack
-from egosim_jax.io.video import write_video
+from egosim_jax.io.video import probe_video, read_video, write_video
 from egosim_jax.state.snapshot import save, write_ply
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
@@ -133,6 +134,58 @@ def test_a_fixed_camera_repeats_the_first_frame(clip, action, tmp_path):
         Static(video=tmp_path / "short.mp4", **files).run()
 
 
+def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, action, tmp_path):
+    rate = Fraction(30000, 1001)
+    write_video(tmp_path / "clip.mp4", clip.frames, rate)
+    command = Static(action=action, out=tmp_path / "out", video=tmp_path / "clip.mp4", **FILES)
+    assert command.run() == 0
+    (files,) = read_metadata(tmp_path / "out" / "metadata.csv")
+    assert probe_video(files.target).fps == probe_video(files.prior).fps == rate
+    with pytest.raises(InputError, match=r"29\.97 frames per second, not 8: .*Leave it out"):
+        replace(command, fps=8).run()
+
+
+def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
+    twin = with_conditions(clip, to_triplet(clip), "static", "mesh")
+    twins = [replace(twin, video_id=name) for name in ("a", "b")]
+    items = read_metadata(write_folders(tmp_path / "root", twins, name="s", fps=24))
+    packed = {"videos": (None, "first"), "frames": (SPEC, "first"), "rate": (SPEC, "rate")}
+    again = items[0].target, items[0].prior, items[0].hands
+    for name, (spec, rule) in packed.items():
+        if name == "rate":  # whose shorter clips have every third frame
+            for path in again:
+                write_video(path, read_video(path).frames.repeat(3, axis=0)[:13], 24)
+            items = items[:1]
+        shards = tmp_path / name
+        list(pack(items, out=shards, spec=spec, provenance={}, resampling=rule))
+
+    def rate(name, **options):
+        out = tmp_path / "out"
+        assert ToDwm(shards=tmp_path / name, out=out, name=name, **options).run() == 0
+        return probe_video(read_metadata(out / "dataset_files" / f"{name}.txt")[0].target).fps
+
+    assert rate("videos") == 24
+    assert rate("rate") == 8
+    assert rate("frames", fps=12) == 12
+    with pytest.raises(InputError, match="do not say their frame rate: give it"):
+        rate("frames")
+    for name, have in (("videos", 24), ("rate", 8)):
+        with pytest.raises(InputError, match=f"have {have} frames per second, not 30"):
+            rate(name, fps=30)
+
+
+def test_videos_of_several_rates_are_not_one_set_of_dwm(clip, tmp_path):
+    twin = with_conditions(clip, to_triplet(clip), "static", "mesh")
+    items = []
+    for name, fps in (("a", 8), ("b", 12)):
+        path = write_folders(tmp_path / name, [replace(twin, video_id=name)], name=name, fps=fps)
+        items += read_metadata(path)
+    list(pack(items, out=tmp_path / "shards", spec=None, provenance={}))
+    with pytest.raises(InputError, match="have 8, 12 frames per second: all must have one"):
+        ToDwm(shards=tmp_path / "shards", out=tmp_path / "out", name="b").run()
+    assert not (tmp_path / "out").exists()
+
+
 def test_hands_of_mano_replace_those_of_keypoints(clip, action, tmp_path):
     (tmp_path / "MANO_RIGHT.pkl").write_bytes(model_pickle(random_model()))
     write_video(tmp_path / "clip.mp4", clip.frames, 8)
@@ -166,7 +219,7 @@ def test_shards_become_folders_of_dwm_are_mixed_and_aligned(clip, tmp_path, caps
     path = write_folders(tmp_path / "root", [replace(twin, video_id="a/0")], name="a", fps=8)
     for name in ("one", "two"):
         list(pack(read_metadata(path), out=tmp_path / name, spec=SPEC, provenance={}))
-    assert ToDwm(shards=tmp_path / "one", out=tmp_path / "again", name="b").run() == 0
+    assert ToDwm(shards=tmp_path / "one", out=tmp_path / "again", name="b", fps=8).run() == 0
     written = tmp_path / "again" / "dataset_files" / "b.txt"
     assert near(load_triplet(read_metadata(written)[0], SPEC).prior, static_video(clip))
     parts = tmp_path / "one", tmp_path / "two"
