@@ -165,8 +165,8 @@ class Align:
 class ToDwm:
     """Write shards of frames or videos as DWM's folders, with a list. Prints the list.
 
-    The folders are videos, videos_static, videos_hands, prompts and prompts_rewrite; `--metadata
-    LIST` of every command reads them.
+    The folders are videos, videos_static, videos_hands, prompts and prompts_rewrite below OUT/NAME;
+    `--metadata LIST` of every command reads them.
     """
 
     shards: Path

@@ -124,9 +124,15 @@ def write_folders(
 ) -> Path:
     """Write triplets in DWM's folders below a root, and their list; return its path.
 
-    The id A/B/NAME gives A/B/videos/NAME.mp4. `name` is that of the list, without its suffix.
-    Raises `InputError` for an id that is not a valid file name, and without a target video.
+    The id A/B/CLIP gives NAME/A/B/videos/CLIP.mp4; `name` is also that of the list, without its
+    suffix. Raises `InputError` for a name or id that is not a valid file name, and without a target
+    video.
     """
+    if "/" in name or not is_safe_id(f"{name}/0"):
+        raise InputError(
+            f"The name {quote(name)} of a dataset must be that of a folder: use letters, digits, "
+            "'_' and '-'. (--name)"
+        )
     lines = []
     for triplet in triplets:
         if not is_safe_id(triplet.video_id):
@@ -138,7 +144,7 @@ def write_folders(
                 f"{triplet.video_id} has no recorded video, which DWM's lists name: it must have "
                 "a target."
             )
-        place = Path(triplet.video_id)
+        place = Path(name) / triplet.video_id
         videos = {VIDEOS: triplet.target, STATIC: triplet.prior, HANDS: triplet.hands}
         for kind, frames in videos.items():
             write_video(root / place.parent / kind / f"{place.name}.mp4", frames, fps)

@@ -29,7 +29,7 @@ def make_triplet(number):
     prior, hands, target = rng.integers(0, 256, (3, 9, 32, 48, 3)).astype(np.uint8)
     mask = np.zeros((9, 32, 48), np.uint8)
     return Triplet(
-        video_id=f"home/{number}",
+        video_id=f"{number}",
         prompt=f"take cup {number}",
         prior=prior,
         mask=mask,

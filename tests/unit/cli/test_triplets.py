@@ -216,7 +216,7 @@ def test_hands_of_mano_replace_those_of_keypoints(clip, action, tmp_path):
 
 def test_shards_become_folders_of_dwm_are_mixed_and_aligned(clip, tmp_path, capsys):
     twin = with_conditions(clip, to_triplet(clip), "static", "mesh")
-    path = write_folders(tmp_path / "root", [replace(twin, video_id="a/0")], name="a", fps=8)
+    path = write_folders(tmp_path / "root", [replace(twin, video_id="0")], name="a", fps=8)
     for name in ("one", "two"):
         list(pack(read_metadata(path), out=tmp_path / name, spec=SPEC, provenance={}))
     assert ToDwm(shards=tmp_path / "one", out=tmp_path / "again", name="b", fps=8).run() == 0

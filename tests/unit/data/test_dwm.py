@@ -37,7 +37,7 @@ def make_triplet(name, seed=0):
 
 @pytest.fixture
 def root(tmp_path):
-    triplets = [make_triplet("home/open/00000"), make_triplet("home/carry/00000", 1)]
+    triplets = [make_triplet("open/00000"), make_triplet("carry/00000", 1)]
     write_folders(tmp_path, triplets, name="train", fps=8)
     return tmp_path
 
@@ -49,21 +49,34 @@ def near(video, other, most=8):
 def test_a_written_list_is_read(root):
     path = root / "dataset_files" / "train.txt"
     assert path.read_text("utf-8").splitlines() == [
-        "home/open/videos/00000.mp4",
-        "home/carry/videos/00000.mp4",
+        "train/open/videos/00000.mp4",
+        "train/carry/videos/00000.mp4",
     ]
     clips = read_metadata(path)
     assert [clip.video_id for clip in clips] == [
-        "home_open_videos_00000",
-        "home_carry_videos_00000",
+        "train_open_videos_00000",
+        "train_carry_videos_00000",
     ]
     assert not check_clip(clips[1], SPEC)
-    triplet, given = load_triplet(clips[1], SPEC), make_triplet("home/carry/00000", 1)
+    triplet, given = load_triplet(clips[1], SPEC), make_triplet("carry/00000", 1)
     assert triplet.prompt == given.prompt
     assert not triplet.mask.any()
     for name in ("prior", "hands", "target", "first_frame"):
         assert near(getattr(triplet, name), getattr(given, name))
     assert not near(triplet.prior, given.target)
+
+
+def test_datasets_of_one_root_keep_their_clips_and_names(root):
+    own = [make_triplet("open/00000", 2)]
+    path = write_folders(root, own, name="own", fps=8)
+    (clip,), others = read_metadata(path), read_metadata(root / "dataset_files" / "train.txt")
+    assert clip.extra == {"dataset": "own"}
+    assert others[0].extra == {"dataset": "train"}
+    assert near(load_triplet(clip, SPEC).target, own[0].target)
+    assert near(load_triplet(others[0], SPEC).target, make_triplet("open/00000").target)
+    for name in ("a/b", "..", "a.b", ""):
+        with pytest.raises(InputError, match="must be that of a folder: use letters"):
+            write_folders(root, own, name=name, fps=8)
 
 
 def test_a_list_may_be_in_the_root(root):
@@ -73,7 +86,7 @@ def test_a_list_may_be_in_the_root(root):
 
 
 def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
-    folder = root / "home" / "open"
+    folder = root / "train" / "open"
     (folder / "prompts_rewrite" / "00000.txt").unlink()
     (folder / "prompts" / "00000.txt").write_text("I open\nthe drawer. \n", "utf-8")
     assert read_metadata(root / "dataset_files" / "train.txt")[0].prompt == "I open the drawer."
@@ -82,11 +95,11 @@ def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ("home/open/videos/00000.mp4\n../x/videos/1.mp4", "without '..'"),
-        ("home/open/videos/00000.mp4\nhome/open/videos/00000.mp4", "another line"),
-        ("home/open/videos/00000.mp4\nhome/open/00000.mp4", "in a folder videos"),
-        ("home/open/videos/00000.mp4\nhome/open/videos/7.mp4", "prompts_rewrite/7.txt"),
-        ("home/else/videos/00000.mp4", "--metadata"),
+        ("train/open/videos/00000.mp4\n../x/videos/1.mp4", "without '..'"),
+        ("train/open/videos/00000.mp4\ntrain/open/videos/00000.mp4", "another line"),
+        ("train/open/videos/00000.mp4\ntrain/open/00000.mp4", "in a folder videos"),
+        ("train/open/videos/00000.mp4\ntrain/open/videos/7.mp4", "prompts_rewrite/7.txt"),
+        ("train/else/videos/00000.mp4", "--metadata"),
         ("\n\n", "lists 0 clips"),
     ],
 )
