@@ -47,6 +47,11 @@ class Pack:
     """Take rows whose column has this value, for instance split=test."""
     limit: int | None = None
     """Maximum number of clips."""
+    prompts: Literal["prompts_rewrite", "prompts"] = "prompts_rewrite"
+    """Captions of a list of DWM.
+
+    prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
+    has none; prompts: the original ones, of the paper's evaluation."""
     size: tuple[int, int] | None = None
     """Height and width of decoded frames to store instead of the files.
 
@@ -77,7 +82,8 @@ class Pack:
 
         check_counts({"--shard-megabytes": self.shard_megabytes})
         spec = self._spec()
-        items = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
+        clips = read_metadata(self.metadata, prompts=self.prompts)
+        items = select(clips, where=self.where, limit=self.limit)
         progress = pack(
             items,
             out=self.out,

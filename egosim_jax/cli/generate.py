@@ -30,7 +30,7 @@ class Generate:
     """
 
     help_groups: ClassVar[HelpGroups] = {
-        "clips": ("robot", "limit", "where", "video_id", "start", "lenient", "decoding"),
+        "clips": ("robot", "limit", "where", "video_id", "start", "prompts", "lenient", "decoding"),
         "sampling": ("steps", "sampling", "strength", "solver", "lora", "lora_scale", "baseline"),
         "run": ("batch_size", "skip_existing", "reconstruct"),
     }
@@ -61,6 +61,11 @@ class Generate:
     """Maximum number of clips; without metadata, number of scenes, of consecutive seeds."""
     start: Annotated[tuple[int, ...], tyro.conf.arg(metavar="FRAME [FRAME ...]")] = (0,)
     """First frame of the window that is generated; several make several clips, {id}_{frame}."""
+    prompts: Literal["prompts_rewrite", "prompts"] = "prompts_rewrite"
+    """Captions of a list of DWM.
+
+    prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
+    has none; prompts: the original ones, of the paper's evaluation."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     sampling: str | None = None
@@ -157,6 +162,11 @@ class Generate:
                 "--robot is of the tabletop world: the clips of --metadata have their own hands. "
                 "Omit one of them. (--robot, --metadata)"
             )
+        if self.prompts != "prompts_rewrite" and self.metadata is None:
+            raise InputError(
+                f"--prompts {self.prompts} is of a list of DWM: scenes of the tabletop world have "
+                "one caption. Give a list, or leave this out. (--prompts, --metadata)"
+            )
         if self.lora is not None and self._weights is None:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
 
@@ -165,7 +175,10 @@ class Generate:
         from egosim_jax.data.metadata import read_metadata, select
 
         clips = select(
-            read_metadata(metadata), where=self.where, video_ids=self.video_id, limit=self.limit
+            read_metadata(metadata, prompts=self.prompts),
+            where=self.where,
+            video_ids=self.video_id,
+            limit=self.limit,
         )
         return windows_of(clips, self.start)
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from egosim_jax.command import ExitCode
 from egosim_jax.progress import track
@@ -271,6 +271,11 @@ class FromCaches:
     """List of DWM, .txt."""
     out: Path
     """Folder of the latents shards."""
+    prompts: Literal["prompts_rewrite", "prompts"] = "prompts_rewrite"
+    """Captions of the list, which the caches must be of.
+
+    prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
+    has none; prompts: the original ones, of the paper's evaluation."""
     limit: int | None = None
     """Maximum number of clips."""
 
@@ -280,7 +285,7 @@ class FromCaches:
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.train.cached import shard_caches
 
-        clips = select(read_metadata(self.metadata), limit=self.limit)
+        clips = select(read_metadata(self.metadata, prompts=self.prompts), limit=self.limit)
         model = configs.get(self.config).at(self.weights)
         for _ in track(
             shard_caches(model, self.weights, clips, out=self.out), "reading", total=len(clips)

@@ -3,14 +3,17 @@
     DATASET/SCENE/ACTION/videos/NAME.mp4            recorded video (ground truth)
                          videos_static/NAME.mp4     static scene along the same cameras
                          videos_hands/NAME.mp4      hand meshes on black
-                         prompts_rewrite/NAME.txt   caption, or in prompts/ if it is not there
+                         prompts_rewrite/NAME.txt   rewritten caption, of the released models
+                         prompts/NAME.txt           original caption, of the paper's evaluation
 
 A list is a text file with the path of a recorded video in each line, relative to a root folder: the
 folder of the list or the one above it, whichever has the first video. DWM's lists are in
 `dataset_files` of the root. The number of folders above `videos` is free.
 
 A static video has no mask, since it shows the scene everywhere; its first frame is the image for
-CLIP. The caption is all text of the file: DWM generates from it, but trained on its first line.
+CLIP. The caption is all text of the file: DWM generates from it, but trained on its first line. A
+clip without a rewritten caption has the original one; the original ones may also be chosen, and are
+then required.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
-from egosim_jax.data.metadata import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, is_safe_id
+from egosim_jax.data.metadata import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, Prompts, is_safe_id
 from egosim_jax.data.readers import inside, make_id
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes
@@ -28,17 +31,21 @@ from egosim_jax.types import InputError, Triplet
 
 VIDEOS, STATIC, HANDS = "videos", "videos_static", "videos_hands"
 """Folders of recorded videos, static scenes and hand meshes."""
-PROMPTS = ("prompts_rewrite", "prompts")
-"""Folders of captions, the preferred one first."""
+PROMPTS: dict[Prompts, tuple[Prompts, ...]] = {
+    "prompts_rewrite": ("prompts_rewrite", "prompts"),
+    "prompts": ("prompts",),
+}
+"""Folders in which captions are searched, the preferred one first, by the one chosen."""
 LISTS = "dataset_files"
 """Folder of lists in a root."""
 MAX_LIST_BYTES, MAX_PROMPT_BYTES = 1 << 26, 1 << 16
 """Largest list and caption in bytes."""
 
 
-def read_list(path: Path) -> list[ClipFiles]:
+def read_list(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
     """Return the clips of a list, whose ids are their paths with underscores.
 
+    `prompts` are the captions to take.
     Raises one `InputError` that lists the problems: no root, paths outside of it or not in a folder
     `videos`, absent and empty captions, duplicates.
     """
@@ -51,7 +58,7 @@ def read_list(path: Path) -> list[ClipFiles]:
     problems = Problems()
     for line, entry in entries:
         try:
-            files = _files(root, entry, f"{path.name} line {line}")
+            files = _files(root, entry, f"{path.name} line {line}", prompts)
             if files.video_id in clips:
                 raise InputError(f"its id {files.video_id} is also that of another line")
             clips[files.video_id] = files
@@ -91,7 +98,7 @@ def _root_of(path: Path, entry: str) -> Path:
     )
 
 
-def _files(root: Path, entry: str, row: str) -> ClipFiles:
+def _files(root: Path, entry: str, row: str, prompts: Prompts) -> ClipFiles:
     video = inside(root, entry, what="the path")
     if video.parent.name != VIDEOS or video.suffix != ".mp4":
         raise InputError(
@@ -99,7 +106,7 @@ def _files(root: Path, entry: str, row: str) -> ClipFiles:
             f"scene is searched in {STATIC} next to it"
         )
     folder = video.parent.parent
-    texts = [folder / name / f"{video.stem}.txt" for name in PROMPTS]
+    texts = [folder / name / f"{video.stem}.txt" for name in PROMPTS[prompts]]
     found = next((text for text in texts if text.is_file()), texts[0])
     prompt = " ".join(_text(found, MAX_PROMPT_BYTES).split())
     if not prompt:

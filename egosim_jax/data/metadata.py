@@ -23,7 +23,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes, read_lines
 from egosim_jax.types import InputError, check_counts
@@ -34,6 +34,9 @@ TARGET = "video"
 """Column of the recorded video."""
 MASK_NAME, HANDS_NAME, IMAGE_NAME = "pc_mask_video.mp4", "hand_kp_video.mp4", "hand_inpaint.png"
 """Default file names, in the folder of the prior."""
+Prompts = Literal["prompts_rewrite", "prompts"]
+"""Captions of a list of DWM: rewritten ones, or the original ones where there are none; or these.
+"""
 MAX_BYTES = 1 << 28
 """Maximum size of a metadata file in bytes."""
 MAX_CLIPS = 400_000
@@ -77,17 +80,22 @@ class ClipFiles:
     """File and line of the row, for messages."""
 
 
-def read_metadata(path: Path) -> list[ClipFiles]:
+def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
     """Read every row of a metadata file (`.csv`, or `.jsonl` with one object per line).
 
-    A `.txt` is a list of DWM (`data/dwm.py`). Raises one `InputError` that lists the problems:
-    missing columns, empty cells (which the official loader reads as the text "nan"), cells beyond
-    the header, unsafe and duplicate ids.
+    A `.txt` is a list of DWM (`data/dwm.py`), of which `prompts` chooses the captions. Raises one
+    `InputError` that lists the problems: missing columns, empty cells (which the official loader
+    reads as the text "nan"), cells beyond the header, unsafe and duplicate ids.
     """
     if path.suffix == ".txt":
         from egosim_jax.data.dwm import read_list
 
-        return read_list(path)
+        return read_list(path, prompts=prompts)
+    if prompts != "prompts_rewrite":
+        raise InputError(
+            f"{quote_path(path)} has its captions in the column prompt: those of {prompts} can be "
+            "chosen for a list of DWM, .txt. Give one, or leave this out. (--prompts, --metadata)"
+        )
     clips: list[ClipFiles] = []
     problems = Problems()
     first_seen: dict[str, int] = {}

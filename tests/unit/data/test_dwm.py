@@ -5,6 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from egosim_jax.cli.data import Pack
+from egosim_jax.cli.generate import Generate
 from egosim_jax.data.clips import check_clip, load_triplet
 from egosim_jax.data.dwm import write_folders
 from egosim_jax.data.metadata import read_metadata
@@ -90,6 +92,40 @@ def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
     (folder / "prompts_rewrite" / "00000.txt").unlink()
     (folder / "prompts" / "00000.txt").write_text("I open\nthe drawer. \n", "utf-8")
     assert read_metadata(root / "dataset_files" / "train.txt")[0].prompt == "I open the drawer."
+
+
+def original_captions(root):
+    """Write original captions other than the rewritten ones; return the list."""
+    for number, folder in enumerate(("open", "carry")):
+        path = root / "train" / folder / "prompts" / "00000.txt"
+        path.write_text(f"original {number}", "utf-8")
+    return clips_list(root)
+
+
+def test_original_captions_can_be_chosen_and_are_then_required(root):
+    path = original_captions(root)
+    assert [c.prompt for c in read_metadata(path)] == 2 * ["The hand opens the drawer."]
+    chosen = read_metadata(path, prompts="prompts")
+    assert [c.prompt for c in chosen] == ["original 0", "original 1"]
+    (root / "train" / "open" / "prompts" / "00000.txt").unlink()
+    with pytest.raises(InputError, match=r"open/prompts/00000\.txt"):
+        read_metadata(path, prompts="prompts")
+
+
+def test_commands_take_the_chosen_captions(root, tmp_path):
+    path, shards = original_captions(root), tmp_path / "shards"
+    Pack(metadata=path, out=shards, prompts="prompts").run()
+    packed = [record.metadata["prompt"] for record in ShardReader(shards)]
+    assert packed == ["original 0", "original 1"]
+    windows = Generate(config="debug", prompts="prompts")._windows(path)
+    assert [window.files.prompt for window in windows] == packed
+
+
+def test_captions_of_a_column_cannot_be_chosen(clips, tmp_path):
+    with pytest.raises(InputError, match="captions in the column prompt: those of prompts"):
+        Pack(metadata=clips, out=tmp_path / "shards", prompts="prompts").run()
+    with pytest.raises(InputError, match="scenes of the tabletop world have one caption"):
+        Generate(config="debug", prompts="prompts").run()
 
 
 @pytest.mark.parametrize(
