@@ -46,7 +46,7 @@ def check_action(action: Action, *, state: SceneState, fps: int, continued: bool
     is the first of the next action.
     """
     _check_speed(action.cameras, fps)
-    _check_order(action)
+    check_order(action)
     _check_scene(state, action.cameras, 0)
     if continued:
         _check_scene(state, action.cameras, -1)
@@ -63,7 +63,7 @@ def _check_speed(cameras: Cameras, fps: int) -> None:
         )
 
 
-def _check_order(action: Action) -> None:
+def check_order(action: Action) -> None:
     """Raise `InputError` if the joints of the hands are plausible only in another order."""
     hands = action.joints_m[np.isfinite(action.joints_m).all(axis=(2, 3))]
     if not len(hands):

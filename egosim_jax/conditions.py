@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from egosim_jax.actions import check_order
 from egosim_jax.data.clips import write_clips
 from egosim_jax.rendering import Renderer, jitted
 from egosim_jax.rendering.hand_mesh import pose_hands
@@ -81,14 +82,15 @@ def static_triplet(
     """Return a triplet of DWM: a static scene, hand meshes along the action, and the ground truth.
 
     The meshes are those of the action's keypoints, which have a left hand before a right one,
-    unless others are given. Raises `InputError` if lengths or sizes disagree.
+    unless others are given. Raises `InputError` if lengths or sizes disagree, or for keypoints in
+    another order.
     """
     cameras = action.cameras
     shape = len(cameras.world_from_camera), cameras.height, cameras.width
     check_video("The static video", static[0], shape)
     if target is not None:
         check_video("The recorded video", target, shape)
-    mesh = pose_hands(action.joints_m) if meshes is None else meshes
+    mesh = _posed(action) if meshes is None else meshes
     if len(mesh.vertices_m) != shape[0]:
         raise InputError(
             f"The hands have {len(mesh.vertices_m)} frames, the cameras {shape[0]}: both must have "
@@ -103,3 +105,12 @@ def static_triplet(
         first_frame=static[0][0],
         target=target,
     )
+
+
+def _posed(action: Action) -> MovingMesh:
+    """Return the meshes of the keypoints. Raises `InputError` if they are in another order."""
+    try:
+        check_order(action)
+    except InputError as error:
+        raise InputError(f"In the action, {error} (--action)") from error
+    return pose_hands(action.joints_m)

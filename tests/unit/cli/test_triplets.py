@@ -134,6 +134,19 @@ def test_a_fixed_camera_repeats_the_first_frame(clip, action, tmp_path):
         Static(video=tmp_path / "short.mp4", **files).run()
 
 
+def test_keypoints_in_another_order_are_refused(clip, action, tmp_path):
+    values = json.loads(action.read_text("utf-8"))
+    for hands in values["joints_m"]:
+        for number, joints in enumerate(hands):
+            hands[number] = [*joints[1:], joints[0]]
+    action.write_text(json.dumps(values), "utf-8")
+    write_video(tmp_path / "clip.mp4", clip.frames, 8)
+    files = {"action": action, "out": tmp_path / "out", **FILES}
+    with pytest.raises(InputError, match=r"order with the wrist last: .*\(--action\)"):
+        Static(video=tmp_path / "clip.mp4", **files).run()
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, action, tmp_path):
     rate = Fraction(30000, 1001)
     write_video(tmp_path / "clip.mp4", clip.frames, rate)
