@@ -87,9 +87,9 @@ def static_triplet(
     """
     cameras = action.cameras
     shape = len(cameras.world_from_camera), cameras.height, cameras.width
-    check_video("The static video", static[0], shape)
     if target is not None:
-        check_video("The recorded video", target, shape)
+        _check_recorded(target, shape)
+    check_video("The static video", static[0], shape)
     mesh = _posed(action) if meshes is None else meshes
     if len(mesh.vertices_m) != shape[0]:
         raise InputError(
@@ -114,3 +114,13 @@ def _posed(action: Action) -> MovingMesh:
     except InputError as error:
         raise InputError(f"In the action, {error} (--action)") from error
     return pose_hands(action.joints_m)
+
+
+def _check_recorded(target: np.ndarray, shape: tuple[int, int, int]) -> None:
+    """Raise `InputError` unless the recorded video has the length and size of the action."""
+    try:
+        check_video("The recorded video", target, shape)
+    except InputError as error:
+        raise InputError(
+            f"{error} Cut or resize it, or give the action of this video. (--video, --action)"
+        ) from error

@@ -130,7 +130,10 @@ def test_a_fixed_camera_repeats_the_first_frame(clip, action, tmp_path):
     with pytest.raises(InputError, match="--fps must be at least 1, not 0"):
         Static(video=tmp_path / "clip.mp4", fps=0, **files).run()
     write_video(tmp_path / "short.mp4", clip.frames[:4], 8)
-    with pytest.raises(InputError, match=r"must be uint8 \(5, 48, 80, 3\)"):
+    message = (
+        r"recorded video .* must be uint8 \(5, 48, 80, 3\)\. Cut or resize .*\(--video, --action"
+    )
+    with pytest.raises(InputError, match=message):
         Static(video=tmp_path / "short.mp4", **files).run()
 
 
