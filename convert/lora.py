@@ -288,8 +288,8 @@ def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delt
 def _dtype(tensors: Sequence[Tensor]) -> np.dtype:
     """Return the dtype of half precision that tensors share, else float32."""
     dtypes = {tensor.dtype for tensor in tensors}
-    shared = dtypes.pop() if len(dtypes) == 1 else None
-    return shared if shared in HALF else np.dtype(np.float32)
+    shared = next(iter(dtypes))
+    return shared if len(dtypes) == 1 and shared in HALF else np.dtype(np.float32)
 
 
 def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, np.ndarray]:
