@@ -38,11 +38,16 @@ class GroupNorm(nnx.Module):
     def __call__(self, x: Float[Array, "b f h w c"]) -> Float[Array, "b f h w c"]:
         """Normalize; the result is float32."""
         y = rearrange(x.astype(jnp.float32), "b f h w (g c) -> b f h w g c", g=self.groups)
-        axes = (1, 2, 3, 5)
-        y = y - y.mean(axes, keepdims=True)
-        y = y * jax.lax.rsqrt(jnp.square(y).mean(axes, keepdims=True) + self.eps)
+        y = y - _group_mean(y)
+        y = y * jax.lax.rsqrt(_group_mean(jnp.square(y)) + self.eps)
         y = rearrange(y, "b f h w g c -> b f h w (g c)")
         return y * self.scale[...].astype(jnp.float32) + self.bias[...].astype(jnp.float32)
+
+
+def _group_mean(y: Float[Array, "b f h w g c"]) -> Float[Array, "b 1 1 1 g 1"]:
+    """Return the means of groups, of rows first: one long sum in float32 loses digits on CPUs."""
+    rows = jax.lax.optimization_barrier(y.mean((3, 5), keepdims=True))  # else XLA joins the sums
+    return rows.mean((1, 2), keepdims=True)
 
 
 def fit(z: Float[Array, "b f h w c"], shape: tuple[int, ...]) -> Float[Array, "b f2 h2 w2 c"]:
