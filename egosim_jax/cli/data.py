@@ -15,6 +15,7 @@ from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
 from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.command import ExitCode
+from egosim_jax.data.metadata import Prompts
 from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.progress import track
 from egosim_jax.types import InputError, VideoSpec, check_counts
@@ -47,7 +48,7 @@ class Pack:
     """Take rows whose column has this value, for instance split=test."""
     limit: int | None = None
     """Maximum number of clips."""
-    prompts: Literal["prompts_rewrite", "prompts"] = "prompts_rewrite"
+    prompts: Prompts = "prompts_rewrite"
     """Captions of a list of DWM.
 
     prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from egosim_jax.command import ExitCode, HelpGroups
+from egosim_jax.data.metadata import Prompts
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Generate:
     """Maximum number of clips; without metadata, number of scenes, of consecutive seeds."""
     start: Annotated[tuple[int, ...], tyro.conf.arg(metavar="FRAME [FRAME ...]")] = (0,)
     """First frame of the window that is generated; several make several clips, {id}_{frame}."""
-    prompts: Literal["prompts_rewrite", "prompts"] = "prompts_rewrite"
+    prompts: Prompts = "prompts_rewrite"
     """Captions of a list of DWM.
 
     prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that

@@ -6,9 +6,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from egosim_jax.command import ExitCode
+from egosim_jax.data.metadata import Prompts
 from egosim_jax.progress import track
 from egosim_jax.types import InputError, check_counts
 
@@ -271,7 +272,7 @@ class FromCaches:
     """List of DWM, .txt."""
     out: Path
     """Folder of the latents shards."""
-    prompts: Literal["prompts_rewrite", "prompts"] = "prompts_rewrite"
+    prompts: Prompts = "prompts_rewrite"
     """Captions of the list, which the caches must be of.
 
     prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that

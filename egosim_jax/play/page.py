@@ -102,7 +102,7 @@ class Page:
         blank = np.zeros((self.played.world.video.height, self.played.world.video.width, 3))
         self._pictures = [
             gui.add_image(_large(blank.astype(np.uint8)), label=label, jpeg_quality=90)
-            for label in ("Generated", "Truth")
+            for label in ("Generated", "Ground truth")
         ]
         self._status = gui.add_markdown(HELP)
         with gui.add_folder("Act"):
