@@ -34,6 +34,10 @@ WATCH = """(() => {
 """Script that notes when pictures and the status change in the page."""
 WIDTH = 880
 """Columns of the recording."""
+EMPTY = 0.2
+"""Share of the page, on the left, that the scene leaves empty and the recording lacks."""
+DISMISS = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+"""Script that closes notifications, as that of a browser without a GPU."""
 
 
 def make_clip(page, button):
@@ -50,14 +54,18 @@ def make_clip(page, button):
 
 def record(page, runs, path):
     """Record the page while a clip is made: shots before and after, and its pictures as played."""
+    page.run(DISMISS)
+    time.sleep(1)
     before = page.screenshot()
     page.click("put it on the ring")
     page.wait_for_text("remembered after")
+    time.sleep(1)
+    after = page.screenshot()
     page.click("save")
     page.wait_for_text("episode.zip")
     (video,) = runs.glob("*/episode.mp4")
     boxes = page.boxes()
-    write_gif(path, before, page.screenshot(), boxes, read_video(video).frames)
+    write_gif(path, before, after, boxes, read_video(video).frames)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
@@ -74,8 +82,12 @@ def write_gif(path, before, after, boxes, frames):
             large = Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
             shot.paste(large, (round(x), round(y)))
         shots.append(shot)
-    size = WIDTH, round(WIDTH * before.shape[0] / before.shape[1])
-    small = [shot.resize(size, Image.Resampling.LANCZOS) for shot in shots]
+    height, width = before.shape[:2]
+    left = round(EMPTY * width)
+    size = WIDTH, round(WIDTH * height / (width - left))
+    small = [
+        shot.crop((left, 0, width, height)).resize(size, Image.Resampling.LANCZOS) for shot in shots
+    ]
     palette = small[len(small) // 2].quantize(160)
     pictures = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in small]
     durations = [800, *[125] * (len(pictures) - 2), 2500]
