@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,22 +23,21 @@ from jax.sharding import Mesh
 from egosim_jax.conditioning.baselines import DROPPED, Baseline, with_hand_mask
 from egosim_jax.convert.lora import check_base
 from egosim_jax.data.clips import Policy, check_clip, load_triplet
-from egosim_jax.data.metadata import ClipFiles, check_presence, is_safe_id
+from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
 from egosim_jax.generator import Generator, batches
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted import listing, quote, quote_path, read_lines
+from egosim_jax.io.untrusted import listing, quote
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, parts
 from egosim_jax.types import Clip, InputError, Triplet
 
-RESULTS = "results.jsonl"
-"""File of the results in a folder of generated clips."""
 SHEET_CLIPS = 6
 """Maximum number of clips on the contact sheet."""
 SHEET_COLUMNS = 6
@@ -48,23 +46,6 @@ SHEET_ROWS = ("prior", "hands", "generated", "ground truth")
 """Rows of each clip on the contact sheet; the last one where it is known."""
 SHEET_WIDTH = 240
 """Width of a frame on the contact sheet in pixels."""
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """A window of a clip, and the id of the generated clip."""
-
-    files: ClipFiles
-    """Files of the clip."""
-    start: int
-    """First frame of the window in the clip."""
-    output_id: str
-    """Stem of the output files."""
-
-    @property
-    def split(self) -> str:
-        """Split of the metadata, or "all"."""
-        return self.files.extra.get("split", "all")
 
 
 Failure = tuple[Window, str]
@@ -82,48 +63,6 @@ class Outcome(NamedTuple):
     """Windows whose inputs are invalid."""
     failed: int
     """Windows whose generation failed."""
-
-
-def windows_of(clips: Iterable[ClipFiles], starts: Sequence[int]) -> list[Window]:
-    """Return the windows of clips that start at some frames.
-
-    With several starts the ids are {video_id}_{start}.
-    """
-    several = len(starts) > 1
-    return [
-        Window(files, start, f"{files.video_id}_{start}" if several else files.video_id)
-        for files, start in itertools.product(clips, starts)
-    ]
-
-
-def read_results(folder: Path) -> dict[str, dict[str, Any]] | None:
-    """Read the last result of each id in a folder of generated clips; None if it has no results."""
-    path = folder / RESULTS
-    if not path.is_file():
-        return None
-    results = {}
-    for number, line in read_lines(path):
-        output_id = line.get("video_id") if isinstance(line, dict) else None
-        start = line.get("start", 0) if isinstance(line, dict) else None
-        if not (isinstance(output_id, str) and is_safe_id(output_id)) or type(start) is not int:
-            raise InputError(
-                f"{quote_path(path)}, line {number} is not a result: it needs a valid video_id and "
-                "an integer start."
-            )
-        results[output_id] = line
-    return results
-
-
-def conditions_sha256(files: ClipFiles) -> str:
-    """Return the SHA-256 of the files of a clip's conditions, of those that exist, by role."""
-    roles = {
-        "prior": files.prior,
-        "mask": files.mask,
-        "hands": files.hands,
-        "first_frame": files.first_frame,
-    }
-    found = {role: sha256(path) for role, path in roles.items() if path and path.exists()}
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
 
 
 def seed_of(seed: int, output_id: str) -> int:

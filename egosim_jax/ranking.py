@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.batch import BatchJob, Window
+from egosim_jax.batch import BatchJob
 from egosim_jax.data.transforms import resize_image
+from egosim_jax.data.windows import Window
 from egosim_jax.io.run import write_json
 from egosim_jax.io.video import read_video
 from egosim_jax.metrics.lpips import Lpips, frame_distances

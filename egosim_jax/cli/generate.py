@@ -14,7 +14,7 @@ from egosim_jax.data.metadata import Prompts
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
-    from egosim_jax.batch import Window
+    from egosim_jax.data.windows import Window
     from egosim_jax.networks import ModelConfig
 
 
@@ -172,8 +172,8 @@ class Generate:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
 
     def _windows(self, metadata: Path) -> Sequence[Window]:
-        from egosim_jax.batch import windows_of
         from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.data.windows import windows_of
 
         clips = select(
             read_metadata(metadata, prompts=self.prompts),

@@ -48,8 +48,9 @@ class Rank:
     def run(self) -> int:
         """Check the goal, generate every candidate, rank."""
         from egosim_jax import configs, ranking
-        from egosim_jax.batch import BatchJob, windows_of
+        from egosim_jax.batch import BatchJob
         from egosim_jax.data.metadata import read_metadata
+        from egosim_jax.data.windows import windows_of
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.io.images import read_image
 

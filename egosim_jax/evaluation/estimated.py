@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from egosim_jax.batch import Window
+from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
 from egosim_jax.evaluation.methods import Shape, read_at
 from egosim_jax.io.digest import sha256

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.batch import Window
+from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
 from egosim_jax.metrics.frechet import frechet_distance
 from egosim_jax.perception.networks.video_mae import VideoMae

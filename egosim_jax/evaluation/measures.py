@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.batch import Window
+from egosim_jax.data.windows import Window
 from egosim_jax.metrics import lpips
 from egosim_jax.metrics.dreamsim import DEFINITION, DreamSim
 from egosim_jax.metrics.image import clip_psnr, color_drift, psnr, ssim

@@ -15,9 +15,9 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.batch import Window
 from egosim_jax.data.metadata import is_safe_id
 from egosim_jax.data.transforms import resize_image
+from egosim_jax.data.windows import Window
 from egosim_jax.io.untrusted import quote_path, quote_text
 from egosim_jax.io.video import read_video
 from egosim_jax.metrics.image import fit_colors

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.batch import Window
 from egosim_jax.data.transforms import resize_video
+from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.files import ARROWS
 from egosim_jax.evaluation.methods import Method, Shape, read_at
 from egosim_jax.evaluation.result import Evaluation

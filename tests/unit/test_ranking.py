@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 
 from egosim_jax import ranking
-from egosim_jax.batch import BatchJob, windows_of
+from egosim_jax.batch import BatchJob
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.windows import windows_of
 from egosim_jax.perception.networks.xclip import prepare
 from egosim_jax.testing import random_triplet, tiny_model
 from egosim_jax.types import InputError

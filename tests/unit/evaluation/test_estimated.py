@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from egosim_jax.batch import Window
 from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.estimated import (
     OBJECT_MASK,
     CameraError,

@@ -1,0 +1,81 @@
+"""Windows of clips for which a clip is generated, and the file of their results.
+
+Of the lines of results.jsonl the last one of an id counts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.data.metadata import ClipFiles, is_safe_id
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.untrusted import quote_path, read_lines
+from egosim_jax.types import InputError
+
+RESULTS = "results.jsonl"
+"""File of the results in a folder of generated clips."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A window of a clip, and the id of the generated clip."""
+
+    files: ClipFiles
+    """Files of the clip."""
+    start: int
+    """First frame of the window in the clip."""
+    output_id: str
+    """Stem of the output files."""
+
+    @property
+    def split(self) -> str:
+        """Split of the metadata, or "all"."""
+        return self.files.extra.get("split", "all")
+
+
+def windows_of(clips: Iterable[ClipFiles], starts: Sequence[int]) -> list[Window]:
+    """Return the windows of clips that start at some frames.
+
+    With several starts the ids are {video_id}_{start}.
+    """
+    several = len(starts) > 1
+    return [
+        Window(files, start, f"{files.video_id}_{start}" if several else files.video_id)
+        for files, start in itertools.product(clips, starts)
+    ]
+
+
+def read_results(folder: Path) -> dict[str, dict[str, Any]] | None:
+    """Read the last result of each id in a folder of generated clips; None if it has no results."""
+    path = folder / RESULTS
+    if not path.is_file():
+        return None
+    results = {}
+    for number, line in read_lines(path):
+        output_id = line.get("video_id") if isinstance(line, dict) else None
+        start = line.get("start", 0) if isinstance(line, dict) else None
+        if not (isinstance(output_id, str) and is_safe_id(output_id)) or type(start) is not int:
+            raise InputError(
+                f"{quote_path(path)}, line {number} is not a result: it needs a valid video_id and "
+                "an integer start."
+            )
+        results[output_id] = line
+    return results
+
+
+def conditions_sha256(files: ClipFiles) -> str:
+    """Return the SHA-256 of the files of a clip's conditions, of those that exist, by role."""
+    roles = {
+        "prior": files.prior,
+        "mask": files.mask,
+        "hands": files.hands,
+        "first_frame": files.first_frame,
+    }
+    found = {role: sha256(path) for role, path in roles.items() if path and path.exists()}
+    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
