@@ -235,7 +235,7 @@ class DWM:
     """Probability with which a prompt is dropped in training."""
     seeds: int = 2
     """Repetitions of each clip with different noise."""
-    steps: int = 10
+    steps: int = 4
     """Denoising steps of the generated clips."""
     strength: float = 0.75
     """Strength of SDEdit: share of the steps that it takes, from the noised static video."""
