@@ -12,7 +12,7 @@ import hashlib
 import itertools
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from egosim_jax.data.clips import Policy, check_clip, load_triplet
 from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
-from egosim_jax.generator import Generator, batches
+from egosim_jax.generator import Generator, NonFiniteError, batches
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.digest import sha256
@@ -95,7 +95,7 @@ class BatchJob:
     decoding: Decoding = "accurate"
     """Color decoding of videos."""
     skip_existing: bool = False
-    """Skip windows whose video exists; one of other inputs is refused."""
+    """Skip windows whose video is done; one of other inputs is refused."""
     reconstruct: bool = False
     """Also write the ground truth through the autoencoder."""
     baseline: Baseline | None = None
@@ -122,24 +122,27 @@ class BatchJob:
         for name, digest in (digests or {}).items():
             print(f"{self.model.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
 
-    def generate(self, windows: Sequence[Window]) -> Outcome:
-        """Check all inputs, compile, generate and draw; print the path of each new clip."""
+    def generate(
+        self, windows: Sequence[Window], *, load: Callable[[Mesh], Generator] | None = None
+    ) -> Outcome:
+        """Check all inputs, compile, generate and draw; print the path of each new clip.
+
+        `load` replaces `self.load`, for jobs that share a generator.
+        """
         self._check_names(windows)
-        existing = [w for w in windows if self.skip_existing and self._video(w).exists()]
-        if existing:
-            print(f"{len(existing)} existing clips are skipped", file=sys.stderr)
-            self._list(existing)
-        skipped = {window.output_id for window in existing}
+        skipped = self._finished(windows) if self.skip_existing else set()
+        if skipped:
+            print(f"{len(skipped)} existing clips are skipped", file=sys.stderr)
         todo = [window for window in windows if window.output_id not in skipped]
-        valid, rejected = self._check(todo)
+        valid, rejected = self.check(todo)
         for window, problem in rejected:
             self._report(window, status="failed", error=problem)
         failed: list[Failure] = []
         if valid:
             self._warn_of_long_prompts(valid)
-            failed = self._generate(valid)
+            failed = self._generate(valid, load or self.load)
             self._draw(windows)
-        outcome = Outcome(len(existing), len(valid) - len(failed), len(rejected), len(failed))
+        outcome = Outcome(len(skipped), len(valid) - len(failed), len(rejected), len(failed))
         bad = outcome.rejected + outcome.failed
         print(f"{outcome.done} done, {bad} failed: {self.out}", file=sys.stderr)
         return outcome
@@ -164,30 +167,33 @@ class BatchJob:
                         "one of them. (column video_id)"
                     )
 
-    def _list(self, windows: Sequence[Window]) -> None:
-        """Report existing clips whose results an interruption prevented.
+    def _finished(self, windows: Sequence[Window]) -> set[str]:
+        """Return the ids of the windows whose clips are there, and listed as done.
 
         Raises `InputError` if one is of another window, prompt or other conditions, and would be
         taken for this one. Lines of earlier versions do not say of which conditions.
         """
-        results = read_results(self.out) or {}
+        results, finished = read_results(self.out) or {}, set()
         for window in windows:
             line = results.get(window.output_id, {})
-            digest = conditions_sha256(window.files)
-            if line.get("status") != "done":
-                seed = seed_of(self.seed, window.output_id)
-                self._report(window, status="done", seed=seed, conditions_sha256=digest)
+            files = [self._video(window)]
+            if self.reconstruct:
+                files.append(self._reconstruction(window))
+            if line.get("status") != "done" or not all(path.exists() for path in files):
                 continue
             own = {"source_id": window.files.video_id, "start": window.start,
-                   "prompt": window.files.prompt, "conditions_sha256": digest}  # fmt: skip
+                   "prompt": window.files.prompt,
+                   "conditions_sha256": conditions_sha256(window.files)}  # fmt: skip
             if differing := [name for name in own if line.get(name, own[name]) != own[name]]:
                 raise InputError(
                     f"{self._video(window)} exists and cannot be skipped, because it has another "
                     f"{differing[0]}: {quote(line[differing[0]])}, not {quote(own[differing[0]])}. "
-                    "Choose another --out, or remove the clip. (--skip-existing)"
+                    "Choose another folder, or remove the clip. (--out)"
                 )
+            finished.add(window.output_id)
+        return finished
 
-    def _check(self, windows: Sequence[Window]) -> tuple[list[Window], list[Failure]]:
+    def check(self, windows: Sequence[Window]) -> tuple[list[Window], list[Failure]]:
         """Return the windows whose inputs are valid, and the others with their problems."""
         if windows:
             check_presence([window.files for window in windows])
@@ -217,13 +223,15 @@ class BatchJob:
                 file=sys.stderr,
             )
 
-    def _generate(self, windows: Sequence[Window]) -> list[Failure]:
+    def _generate(
+        self, windows: Sequence[Window], load: Callable[[Mesh], Generator]
+    ) -> list[Failure]:
         """Generate batch after batch; return the failures."""
         mesh, size = self._place()
         unit = parts("batch", mesh)
         size = min(size, -(-len(windows) // unit) * unit)  # a multiple of the mesh that suffices
         then = time.monotonic()
-        generator = self._load_generator(mesh)
+        generator = load(mesh)
         loaded = time.monotonic()
         generator.compile(size)
         print(
@@ -246,7 +254,8 @@ class BatchJob:
             )
         return failed
 
-    def _load_generator(self, mesh: Mesh) -> Generator:
+    def load(self, mesh: Mesh) -> Generator:
+        """Return the generator of the job's weights; random ones are those of its seed."""
         if self.weights is None:
             print(f"{self.model.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(self.model, Networks.random(self.model, seed=self.seed), mesh)
@@ -287,10 +296,14 @@ class BatchJob:
         then = time.monotonic()
         try:
             clips = self._clips(generator, triplets, seeds)
-        except FloatingPointError as error:
-            for window in windows:
-                self._report(window, status="failed", error=str(error))
-            return [(window, str(error)) for window in windows]
+        except NonFiniteError as error:
+            bad = {n for n in error.places if n < len(loaded)}
+            problem = "The latents of the clip are not finite (NaN or infinity)."
+            failed = [(windows[n], problem) for n in sorted(bad)]
+            for window, _ in failed:
+                self._report(window, status="failed", error=problem)
+            good = [item for n, item in enumerate(loaded) if n not in bad]
+            return failed + (self._generate_batch(generator, good, size) if good else [])
         seconds = (time.monotonic() - then) / len(windows)
         reconstructions = generator.reconstruct(triplets) if self.reconstruct else [None] * size
         for window, digest, triplet, clip, reconstruction, seed in zip(
@@ -318,8 +331,7 @@ class BatchJob:
         comparison = np.concatenate(shown, axis=2)
         write_video(self.out / f"{window.output_id}_cmp.mp4", comparison, clip.fps)
         if reconstruction is not None:
-            path = self.out / f"{window.output_id}_vae.mp4"
-            write_video(path, reconstruction.frames, clip.fps)
+            write_video(self._reconstruction(window), reconstruction.frames, clip.fps)
         write_video(self._video(window), clip.frames, clip.fps)
 
     def _report(self, window: Window, *, status: str, **values: Any) -> None:
@@ -343,6 +355,9 @@ class BatchJob:
 
     def _video(self, window: Window) -> Path:
         return self.out / f"{window.output_id}.mp4"
+
+    def _reconstruction(self, window: Window) -> Path:
+        return self.out / f"{window.output_id}_vae.mp4"
 
     def _draw(self, windows: Sequence[Window]) -> None:
         """Draw the contact sheet of the first existing clips."""

@@ -50,6 +50,16 @@ from egosim_jax.types import (
 T = TypeVar("T")
 
 
+class NonFiniteError(FloatingPointError):
+    """Latents of some clips of a batch are NaN or infinite; the others are in order."""
+
+    def __init__(self, names: Sequence[str], places: Sequence[int]):
+        """Name the clips at `places` of the batch whose ids are `names`."""
+        bad = [names[n] for n in places]
+        super().__init__(f"The latents of {bad} are not finite (NaN or infinity).")
+        self.places = tuple(places)
+
+
 def denoise(
     dit: Denoiser,
     condition: Condition,
@@ -189,7 +199,7 @@ class Generator:
         """Generate one clip for each triplet, from the noise of its seed.
 
         `without` hides one condition, as training does (`conditioning/dropout.py`). Raises
-        `InputError` if a mesh does not divide the batch, and `FloatingPointError` naming the clips
+        `InputError` if a mesh does not divide the batch, and `NonFiniteError` naming the clips
         whose latents are not finite.
         """
         return self._clips(self.latents(triplets, seeds, without=without))
@@ -206,13 +216,9 @@ class Generator:
         if without is not None:
             condition = condition.drop(without)
         latents = self._denoise(condition, self.noise(seeds), *self._stepping(last_32_bits(seeds)))
-        bad = [
-            triplet.video_id
-            for triplet, latent in zip(triplets, np.asarray(latents), strict=True)
-            if not np.isfinite(latent).all()
-        ]
+        bad = [n for n, latent in enumerate(np.asarray(latents)) if not np.isfinite(latent).all()]
         if bad:
-            raise FloatingPointError(f"The latents of {bad} are not finite (NaN or infinity).")
+            raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
         return latents
 
     def __call__(

@@ -7,6 +7,7 @@ best candidate has the highest score. (Kim et al. 2026, Dexterous World Models, 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from egosim_jax.batch import BatchJob
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
 from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted import listing
 from egosim_jax.io.video import read_video
 from egosim_jax.metrics.lpips import Lpips, frame_distances
 from egosim_jax.metrics.report import mean_and_spread, print_table
@@ -26,6 +28,8 @@ from egosim_jax.types import InputError
 
 Score = Callable[[UInt8[np.ndarray, "f h w 3"]], float]
 """Function that scores a video; higher is better."""
+STRETCH = 0.02
+"""Most by which the ratio of width to height of a picture may differ from that of the clips."""
 MEASURES = {"score": ("score", "{:.4f}"), "rank": ("rank", "{:.0f}")}
 
 
@@ -46,16 +50,22 @@ class Ranked:
         return float(np.mean(self.scores))
 
 
-def by_picture(goal: UInt8[np.ndarray, "h w 3"]) -> Score:
+def by_picture(goal: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Score:
     """Return the score of a video whose last frame shall look like a picture (LPIPS of AlexNet).
 
-    The picture is resized to the video. Raises `InputError` if LPIPS is not installed.
+    The picture is resized to `size`, rows and columns of the videos. Raises `InputError` if it has
+    another shape than they, so that resizing would stretch it, or LPIPS is not installed.
     """
-    network = Lpips.load("alex")
+    (rows, columns), (height, width) = goal.shape[:2], size
+    if abs(columns * height / (rows * width) - 1) > STRETCH:
+        raise InputError(
+            f"The picture of the goal has {columns}x{rows} pixels and would be stretched to the "
+            f"{width}x{height} of the clips: crop it to their shape. (--goal-image)"
+        )
+    network, picture = Lpips.load("alex"), resize_image(goal, height, width)[None]
 
     def score(video: UInt8[np.ndarray, "f h w 3"]) -> float:
-        picture = resize_image(goal, *video.shape[1:3])
-        return -float(frame_distances(network, video[-1:], picture[None])[0])
+        return -float(frame_distances(network, video[-1:], picture)[0])
 
     return score
 
@@ -86,13 +96,18 @@ def order(scores: Mapping[str, Sequence[float]]) -> list[Ranked]:
 def rank(jobs: Sequence[BatchJob], windows: Sequence[Window], score: Score) -> list[Ranked]:
     """Generate every candidate by each job, which differ in their seed, and rank them.
 
-    Finished clips are not generated again. Raises `InputError` if a candidate has no clip, or one
-    of other conditions.
+    Finished clips are not generated again, and the weights of the first job are loaded once. Raises
+    `InputError` if a candidate is invalid, has no clip, or one of other conditions.
     """
+    _, rejected = jobs[0].check(windows)
+    if rejected:
+        reasons = listing([f"{window.output_id}: {problem}" for window, problem in rejected])
+        raise InputError(f"All candidates must be valid to be ranked. {reasons} (--actions)")
+    load = functools.cache(jobs[0].load)
     scores: dict[str, list[float]] = {window.output_id: [] for window in windows}
     for job in jobs:
         job.open()
-        job.generate(windows)
+        job.generate(windows, load=load)
         for name, found in scores.items():
             path = job.out / f"{name}.mp4"
             if not path.exists():

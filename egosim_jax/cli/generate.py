@@ -52,7 +52,7 @@ class Generate:
     The model `debug` has random ones."""
     lora: Path | None = None
     """LoRA of the video transformer, in PEFT's, diffusers', kohya's or ComfyUI's names."""
-    lora_scale: float = 1.0
+    lora_scale: float | None = None
     """Strength of the LoRA."""
     video_id: tuple[str, ...] = ()
     """Take only these clips."""
@@ -120,7 +120,7 @@ class Generate:
             out=self.out or Path("runs") / f"{self.config}_{self.seed}",
             weights=self._weights,
             lora=self.lora,
-            lora_scale=self.lora_scale,
+            lora_scale=1.0 if self.lora_scale is None else self.lora_scale,
             seed=self.seed,
             batch_size=self.batch_size,
             mesh=self.mesh,
@@ -167,6 +167,10 @@ class Generate:
             raise InputError(
                 f"--prompts {self.prompts} is of a list of DWM: scenes of the tabletop world have "
                 "one caption. Give a list, or leave this out. (--prompts, --metadata)"
+            )
+        if self.lora is None and self.lora_scale is not None:
+            raise InputError(
+                "--lora-scale is the strength of a LoRA: name its file as well. (--lora)"
             )
         if self.lora is not None and self._weights is None:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")

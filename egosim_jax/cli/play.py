@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -62,6 +62,7 @@ class Play:
         check_counts({"--steps": self.steps})
         check_seed(self.seed, name="--seed")
         self._check_port()
+        from egosim_jax import configs
         from egosim_jax.env.actions import ActionSpec
         from egosim_jax.env.backends import GeneratedWorld
         from egosim_jax.env.streaming import Streamer
@@ -72,7 +73,9 @@ class Play:
         from egosim_jax.play.played import Played
 
         share_with_jax()
-        generator = Generator.load(self.config, self.weights)
+        config = configs.get(self.config)
+        config = replace(config, steps=self.steps or config.steps)
+        generator = Generator.load(config, configs.weights_of(self.config, self.weights))
         streamer = Streamer(generator)
         world = GeneratedWorld(
             generator=streamer, video=generator.config.video, perception=self.perception

@@ -25,7 +25,7 @@ class Rank:
     out: Path
     """Folder to write to; the same command resumes."""
     goal_image: Path | None = None
-    """Picture of the goal."""
+    """Picture of the goal, of the shape of the model's clips."""
     goal_text: str | None = None
     """Text that describes the goal."""
     xclip: Path | None = None
@@ -69,9 +69,11 @@ class Rank:
                 "A picture is compared by LPIPS, not by X-CLIP: omit the network, or give a text "
                 "of the goal. (--xclip, --goal-image)"
             )
+        config = configs.get(self.config)
         if self.goal_image is not None:
             goal, measure = str(self.goal_image), "-LPIPS of the last frame to the goal"
-            score = ranking.by_picture(read_image(self.goal_image))
+            video = config.video
+            score = ranking.by_picture(read_image(self.goal_image), (video.height, video.width))
         else:
             goal, measure = str(self.goal_text), "similarity of the video to the goal"
             score = ranking.by_text(goal, self.xclip)
@@ -82,7 +84,6 @@ class Rank:
                 "(--actions)"
             )
         share_with_jax()
-        config = configs.get(self.config)
         config = config if self.sampling is None else configs.sampled(config, self.sampling)
         weights = configs.weights_of(self.config, self.weights)
         config = replace(config.at(weights), steps=self.steps or config.steps)

@@ -66,7 +66,8 @@ def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
     clips = candidates(seed, generator.config.video, settings.candidates)
     best = seed % len(clips)
     triplets = [_triplet(clip, generator) for clip in clips]
-    score = by_picture(clips[best].frames[-1])
+    goal = clips[best].frames[-1]
+    score = by_picture(goal, goal.shape[:2])
     generated = [
         [score(clip.frames) for clip in generator.generate(triplets, [n + repeat for n in noise])]
         for noise, repeat in (

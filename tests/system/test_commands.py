@@ -135,7 +135,7 @@ def test_columns_of_the_metadata_do_not_replace_those_of_the_result(clips, tmp_p
     assert line["metadata_error"] == "yes"
 
 
-def test_a_clip_whose_line_a_kill_prevented_is_listed(generated, clips, tmp_path):
+def test_a_clip_whose_line_a_kill_prevented_is_made_again(generated, clips, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(generated, out)
     (out / "results.jsonl").unlink()

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from egosim_jax import configs
 from egosim_jax.cli.play import Play
 from egosim_jax.episode import Episode
 from egosim_jax.geometry import invert, project, transform
@@ -24,6 +25,18 @@ def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.setattr("egosim_jax.cli.play.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'egosim-jax\[play\]'"):
         Play().run()
+
+
+def test_the_denoising_steps_are_those_that_are_given(monkeypatch):
+    monkeypatch.setattr("egosim_jax.cli.play.find_spec", lambda name: True)
+
+    def load(config, weights):
+        raise InputError(f"{config.steps} steps")
+
+    monkeypatch.setattr("egosim_jax.generator.Generator.load", load)
+    for steps, loaded in ((2, 2), (None, configs.get("tabletop").steps)):
+        with pytest.raises(InputError, match=f"^{loaded} steps"):
+            Play(steps=steps, port=0).run()
 
 
 def pixels_of_places():

@@ -13,7 +13,7 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
 from egosim_jax.encoding import Inputs, encode_condition
-from egosim_jax.generator import Generator, denoise
+from egosim_jax.generator import Generator, NonFiniteError, denoise
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import CompiledFn
 from egosim_jax.types import InputError, Triplet, VideoSpec
@@ -137,8 +137,9 @@ def test_latents_that_are_not_finite_name_their_clips(networks, triplets):
     graph, state = nnx.split(networks)
     broken = nnx.merge(graph, jax.tree.map(jnp.copy, state))
     broken.dit.head.linear.bias[...] = jnp.full_like(broken.dit.head.linear.bias[...], jnp.nan)
-    with pytest.raises(FloatingPointError, match="tabletop_human_0_0"):
+    with pytest.raises(NonFiniteError, match="tabletop_human_0_0") as found:
         Generator(CONFIG, broken).generate(triplets[:2], [0, 0])
+    assert found.value.places == (0, 1)
 
 
 def test_a_weights_folder_comes_back_bit_for_bit(networks, tmp_path: Path):

@@ -73,11 +73,12 @@ def test_candidates_are_generated_by_every_seed_ranked_and_reported(tmp_path, ca
     assert table.index("bright") < table.index("gray") < table.index("dark")
 
 
-def test_a_candidate_without_a_clip_ends_the_ranking(tmp_path):
+def test_an_invalid_candidate_ends_the_ranking_before_any_is_generated(tmp_path):
     windows = candidates(tmp_path / "clips", a=40, b=200)
     windows[1].files.hands.unlink()
-    with pytest.raises(InputError, match="The candidate b has no clip"):
+    with pytest.raises(InputError, match=r"must be valid to be ranked. b: .*--actions"):
         ranking.rank(jobs(tmp_path / "out"), windows, brightness)
+    assert not list((tmp_path / "out").rglob("*.mp4"))
 
 
 def test_a_candidate_whose_hands_were_corrected_is_not_ranked_by_its_old_clip(tmp_path):
@@ -108,10 +109,17 @@ def test_results_of_a_version_that_recorded_no_conditions_are_taken(tmp_path):
 def test_a_video_that_ends_at_the_goal_scores_highest():
     rng = np.random.default_rng(0)
     goal, other = rng.integers(0, 256, (2, 64, 64, 3), np.uint8)
-    score = ranking.by_picture(goal)
+    score = ranking.by_picture(goal, (64, 64))
     assert score(np.stack([other, goal])) == pytest.approx(0, abs=1e-6)
     assert score(np.stack([goal, other])) < -0.1
-    assert score(np.stack([other, goal])[:, ::2, ::2]) < 0  # of the goal at the video's size
+    half = ranking.by_picture(goal, (32, 32))
+    assert half(np.stack([other, goal])[:, ::2, ::2]) < 0  # of the goal at the video's size
+
+
+def test_a_picture_of_another_shape_than_the_clips_is_not_stretched():
+    with pytest.raises(InputError, match=r"has 640x480 pixels .* to the 832x480 of the clips"):
+        ranking.by_picture(np.zeros((480, 640, 3), np.uint8), (480, 832))
+    ranking.by_picture(np.zeros((960, 1664, 3), np.uint8), (480, 832))
 
 
 def test_a_text_without_a_network_is_refused_with_the_way_out():

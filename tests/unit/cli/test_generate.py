@@ -29,6 +29,12 @@ def test_a_lora_of_other_weights_is_refused(tmp_path, capsys):
     assert "was trained on other weights" in capsys.readouterr().err
 
 
+def test_the_strength_of_no_lora_is_refused(tmp_path, capsys):
+    options = ["--config", "debug", "--out", str(tmp_path / "out"), "--lora-scale", "0.5"]
+    assert main(["generate", *options]) == ExitCode.USAGE
+    assert "--lora-scale is the strength of a LoRA" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.fixture(scope="module")
 def clip():
     return to_triplet(next(make_sequence(0, spec=VideoSpec(frames=9, height=64, width=96))))

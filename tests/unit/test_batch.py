@@ -1,0 +1,85 @@
+"""Batch generation, by networks without layers that show the hands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.batch import BatchJob
+from egosim_jax.data.clips import write_clips
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.windows import read_results, windows_of
+from egosim_jax.generator import Generator, NonFiniteError
+from egosim_jax.io.video import read_video
+from egosim_jax.testing import random_triplet, tiny_model
+from tests import shown
+
+MODEL = tiny_model(image=None, dit=replace(tiny_model().dit, image_dim=None), steps=1)
+
+
+@pytest.fixture(autouse=True)
+def generated_clips_show_the_hands(monkeypatch):
+    shown.uncached(monkeypatch)
+    made = shown.networks(MODEL, "hands")
+    monkeypatch.setattr("egosim_jax.batch.Networks.random", lambda config, *, seed: made)
+
+
+def windows(folder, **grays):
+    """Write a clip for each gray of its hands; return their windows."""
+    clip = random_triplet(MODEL.video)
+    clips = [
+        replace(clip, video_id=name, hands=np.full_like(clip.hands, gray), target=clip.prior)
+        for name, gray in grays.items()
+    ]
+    return windows_of(read_metadata(write_clips(folder, clips, fps=8)), (0,))
+
+
+def job(out, **changes):
+    return BatchJob(model=MODEL, out=out, weights=None, **changes)
+
+
+def brightness(path):
+    return float(read_video(path).frames[-1].mean())
+
+
+def run(given, found):
+    given.open()
+    outcome = given.generate(found)
+    return outcome, {k: line["status"] for k, line in (read_results(given.out) or {}).items()}
+
+
+def test_an_old_clip_whose_inputs_broke_and_were_repaired_differently_is_made_again(tmp_path):
+    out, found = tmp_path / "out", windows(tmp_path / "clips", a=40, b=120)
+    assert run(job(out), found)[1] == {"a": "done", "b": "done"}
+    found[0].files.hands.unlink()
+    assert run(job(out), found)[1] == {"a": "failed", "b": "done"}
+    found = windows(tmp_path / "clips", a=200, b=120)
+    outcome, statuses = run(job(out, skip_existing=True), found)
+    assert (outcome.existing, outcome.done, statuses["a"]) == (1, 1, "done")
+    assert brightness(out / "a.mp4") == pytest.approx(200, abs=4)
+
+
+def test_a_clip_without_the_wanted_reconstruction_is_not_finished(tmp_path):
+    out, found = tmp_path / "out", windows(tmp_path / "clips", a=40)
+    run(job(out), found)
+    again = job(out, skip_existing=True, reconstruct=True)
+    assert run(again, found)[0].done == 1
+    assert (out / "a_vae.mp4").exists()
+    assert run(again, found)[0].existing == 1
+
+
+def test_one_clip_that_is_not_finite_does_not_cost_the_others_of_its_batch(tmp_path, monkeypatch):
+    made = Generator.generate
+
+    def generate(self, triplets, seeds, **options):
+        if bad := [n for n, triplet in enumerate(triplets) if triplet.video_id == "b"]:
+            raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
+        return made(self, triplets, seeds, **options)
+
+    monkeypatch.setattr(Generator, "generate", generate)
+    out, found = tmp_path / "out", windows(tmp_path / "clips", a=40, b=120, c=200)
+    outcome, statuses = run(job(out, batch_size=3), found)
+    assert (outcome.done, outcome.failed) == (2, 1)
+    assert statuses == {"a": "done", "b": "failed", "c": "done"}
+    assert "not finite" in read_results(out)["b"]["error"]
+    assert brightness(out / "c.mp4") == pytest.approx(200, abs=4)
