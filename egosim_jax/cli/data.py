@@ -213,6 +213,8 @@ class Make:
     attempts: float | None = None
     """Share of the scenes in which a policy may fail and the head turns, not a script; None: none.
     """
+    fixed_camera: bool = False
+    """Leave the camera where it is in the first frame."""
     prior: Literal["state", "static"] = "state"
     """Rendering of the scene along the camera path.
 
@@ -241,6 +243,7 @@ class Make:
             attempts=self.attempts,
             prior=self.prior,
             hands=self.hands,
+            fixed_camera=self.fixed_camera or None,
         )
         progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))
         for _ in track(progress, "making", total=self.scenes):

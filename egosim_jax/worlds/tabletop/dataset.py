@@ -91,7 +91,7 @@ class DatasetConfig:
         if self.attempts and self.fixed_camera:
             raise InputError(
                 "In attempts the head turns, which a fixed camera excludes: omit one of them. "
-                "(--attempts)"
+                "(--attempts, --fixed-camera)"
             )
         if self.hands != "skeleton" and self.kind != "human":
             raise InputError(

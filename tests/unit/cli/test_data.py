@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from egosim_jax import configs
-from egosim_jax.cli.data import Check, Look, Pack, Stats
+from egosim_jax.cli.data import Check, Look, Make, Pack, Stats
 from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.grid import VideoGrid
@@ -33,6 +33,16 @@ def test_pack_stores_each_clip_and_prints_the_folder(clips, out, capsys):
     assert [record.metadata["video_id"] for record in reader] == ["clip0", "clip1"]
     assert reader[1].metadata["extra"] == {"split": "test"}
     assert reader[1].metadata["prompt"] == "hands move, clip 1"
+
+
+def test_static_twins_of_a_fixed_camera_are_one_frame(out):
+    size = {"frames": 5, "height": 32, "width": 48}
+    Make(world="tabletop", out=out, scenes=1, workers=1, prior="static", hands="mesh",
+         fixed_camera=True, **size).run()  # fmt: skip
+    (record,) = ShardReader(out)
+    prior = record.arrays["prior"]
+    assert np.array_equal(prior, np.broadcast_to(prior[:1], prior.shape))
+    assert not np.array_equal(record.arrays["target"][-1], record.arrays["target"][0])
 
 
 def test_pack_with_a_size_stores_decoded_frames(clips, out):
