@@ -230,10 +230,10 @@ class Lora:
         """Read the LoRA, check it, write."""
         from egosim_jax import configs
         from egosim_jax.convert.lora import (
+            base_of,
             check_base,
             exported,
             exported_metadata,
-            metadata_of,
             read_lora,
         )
         from egosim_jax.convert.plan import merged
@@ -252,12 +252,12 @@ class Lora:
         origin = [self.source]
         if self.source.is_dir():
             origin = sorted(file for file in self.source.iterdir() if file.is_file())
+        known = next(iter(base), None) or base_of(self.source)
+        trained_on = {} if known is None else {BASE: known}
         if self.layout == "dwm":
-            return self._write_checkpoint(changes, config, origin)
+            return self._write_checkpoint(changes, config, origin, trained_on)
         if self.merge is None:
-            metadata = exported_metadata(changes)
-            for known in (*base, *filter(None, [metadata_of(self.source).get(BASE)])):
-                metadata[BASE] = known
+            metadata = exported_metadata(changes) | trained_on
             weights = in_memory(exported(changes, config))
             with lock_folder(self.out.parent):
                 write_file(self.out, weights, origin=origin, metadata=metadata)
@@ -271,7 +271,11 @@ class Lora:
         return command.ExitCode.DONE
 
     def _write_checkpoint(
-        self, changes: Mapping[str, Change], config: NetworkConfig, origin: Sequence[Path]
+        self,
+        changes: Mapping[str, Change],
+        config: NetworkConfig,
+        origin: Sequence[Path],
+        trained_on: Mapping[str, str],
     ) -> int:
         """Write the folder of a checkpoint of DWM."""
         from egosim_jax.convert.checkpoint import checkpoint
@@ -287,7 +291,8 @@ class Lora:
             for stem, tensors in checkpoint(changes, config, base).items():
                 target = self.out / f"{stem}.safetensors"
                 weights = in_memory(tensors)
-                write_file(target, weights, origin=origin, metadata={"format": "pt"})
+                metadata = {"format": "pt", **trained_on}
+                write_file(target, weights, origin=origin, metadata=metadata)
         return command.ExitCode.DONE
 
 

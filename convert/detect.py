@@ -87,7 +87,7 @@ class Folder:
             names = ", ".join(found.source.name for found in here) or "none"
             raise InputError(
                 f"{quote_path(self.path)} holds {len(here)} checkpoints of the network {name} "
-                f"({names}); expected one. Give the path of the file itself. (--source)"
+                f"({names}); expected one. Give the path of the file itself."
             )
         return here[0]
 
@@ -108,8 +108,7 @@ def detect(path: Path, config: ModelConfig | None = None) -> Folder:
             unknown += [] if here else [source]
     if not found and not unknown:
         raise InputError(
-            f"{quote_path(path)} holds no checkpoint: no .safetensors, .pth, .pt or .bin. "
-            "(--source)"
+            f"{quote_path(path)} holds no checkpoint: no .safetensors, .pth, .pt or .bin."
         )
     tokenizer = min(tokenizers, key=lambda folder: not (folder / T5).is_file(), default=None)
     return Folder(path=path, found=tuple(found), unknown=tuple(unknown), tokenizer=tokenizer)

@@ -28,7 +28,7 @@ from einops import EinopsError
 
 from egosim_jax.convert.lora_settings import Settings, finite, settings_of
 from egosim_jax.convert.rules import Rule, shape_only
-from egosim_jax.convert.source import Source, sources
+from egosim_jax.convert.source import PTH, Source, sources
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
 from egosim_jax.io.untrusted import listing, quote_path, quote_text
@@ -64,6 +64,8 @@ FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
 """Weight that a full difference is added to by the suffix of its name."""
 IN_FULL = "non_lora_weights"
 """Stem of the file, next to a LoRA, of weights that replace those of the base."""
+ENDS = (".safetensors", *PTH)
+"""Suffixes of files of weights."""
 HALF = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
 """Dtypes that a LoRA is kept in; others are read as float32."""
 SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
@@ -113,7 +115,7 @@ def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
     if in_full is not None:
         changes |= _values(in_full, config, want)
     if not changes:
-        raise InputError(f"{quote_path(path)} has no layers of this network. (--lora)")
+        raise InputError(f"{quote_path(path)} has no layers of this network.")
     check(want, changes)
     return changes
 
@@ -125,24 +127,40 @@ def metadata_of(file: Path) -> dict[str, str]:
 
 def check_base(path: Path, known: Collection[str]) -> None:
     """Raise `InputError` if a LoRA's header names base weights of another hash."""
-    base = metadata_of(_found(path)[0].files[0]).get(BASE)
+    base = base_of(path)
     if base is not None and base not in known:
         raise InputError(
             f"{quote_path(path)} was trained on other weights: their {BASE} is "
             f"{quote_text(base[:12])}…, not {', '.join(f'{name[:12]}…' for name in known)}. Use "
-            "the weights that it was trained on; to merge it into others, also give those. (--base)"
+            "the weights that it was trained on, or merge it into others with `egosim convert lora "
+            "--merge OTHERS --base ITS_WEIGHTS`."
         )
 
 
+def base_of(path: Path) -> str | None:
+    """Return the hash of the base weights in the header of a LoRA's file or folder, if any."""
+    return metadata_of(_found(path)[0].files[0]).get(BASE)
+
+
 def _found(path: Path) -> tuple[Source, Source | None]:
-    """Return the LoRA of a file or folder, and the weights in full next to it, if any."""
+    """Return the LoRA of a file or folder, and the weights in full next to it, if any.
+
+    Raises `InputError` for a file which is only a part of such a folder.
+    """
+    parts = [] if path.is_dir() else [path.with_name(f"{IN_FULL}{end}") for end in ENDS]
+    if part := next(filter(Path.exists, parts), None):
+        raise InputError(
+            f"{quote_path(path)} is only a part of a LoRA: it must be read together with the "
+            f"weights in full next to it, {part.name}. Give the folder that holds these two files, "
+            f"{quote_path(path.parent)}."
+        )
     found = list(sources(path))
     in_full = [source for source in found if source.files[0].stem == IN_FULL]
     low_rank = [source for source in found if source not in in_full]
     if len(low_rank) != 1 or len(in_full) > 1:
         raise InputError(
             f"{quote_path(path)} holds {len(found)} weight files; expected one, and at most one "
-            f"{IN_FULL}. (--lora)"
+            f"{IN_FULL}."
         )
     return low_rank[0], in_full[0] if in_full else None
 

@@ -29,7 +29,7 @@ from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_res
 from egosim_jax.generator import Generator, NonFiniteError, batches
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.decoding import Decoding
-from egosim_jax.io.digest import sha256
+from egosim_jax.io.digest import sha256_within
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted import listing, quote
 from egosim_jax.io.video import read_video, write_video
@@ -81,7 +81,7 @@ class BatchJob:
     weights: Path | None
     """Folder of weights; None for random weights of `seed`."""
     lora: Path | None = None
-    """LoRA of the denoiser."""
+    """LoRA of the denoiser: a file, or a folder with weights in full (DWM's)."""
     lora_scale: float = 1.0
     """Strength of the LoRA."""
     seed: int = 0
@@ -110,7 +110,7 @@ class BatchJob:
         settings = {
             "model": self.model,
             "weights": digests,
-            "lora": None if self.lora is None else [sha256(self.lora), self.lora_scale],
+            "lora": None if self.lora is None else [sha256_within(self.lora), self.lora_scale],
             "seed": self.seed,
             "policy": self.policy,
         }

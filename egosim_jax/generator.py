@@ -157,8 +157,9 @@ class Generator:
         """Load a model, by name or config, from a weights folder.
 
         Without a folder, these are the weights that come with the package or were fetched. `lora`
-        is a file in any naming that `egosim convert` reads. Raises `InputError` if config, weights
-        or LoRA are missing or do not fit each other, or if the LoRA names another base.
+        is a file or folder in any naming that `egosim convert` reads. Raises `InputError` if
+        config, weights or LoRA are missing or do not fit each other, or if the LoRA names another
+        base.
         """
         from egosim_jax import configs
 

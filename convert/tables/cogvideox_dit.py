@@ -68,7 +68,7 @@ def check(tensors: Mapping[str, Tensor]) -> None:
             "This transformer is of CogVideoX 1.5, which cannot be converted: a token must have "
             f"one latent frame, and its {name} of shape {tensors[name].shape} reads two (so that "
             "the 13 latents of 49 frames, an odd number, would not fit either). Take version 1.1, "
-            "as DWM's release does: CogVideoX-Fun-V1.1-5b-InP. (--source)"
+            "as DWM's release does: CogVideoX-Fun-V1.1-5b-InP."
         )
 
 

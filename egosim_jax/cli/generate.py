@@ -51,7 +51,9 @@ class Generate:
 
     The model `debug` has random ones."""
     lora: Path | None = None
-    """LoRA of the video transformer, in PEFT's, diffusers', kohya's or ComfyUI's names."""
+    """LoRA of the video transformer, in PEFT's, diffusers', kohya's or ComfyUI's names.
+
+    A file, or DWM's folder of one with weights in full."""
     lora_scale: float | None = None
     """Strength of the LoRA."""
     video_id: tuple[str, ...] = ()

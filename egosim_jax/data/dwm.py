@@ -94,7 +94,7 @@ def _root_of(path: Path, entry: str) -> Path:
     raise InputError(
         f"{quote_path(path)}: its first clip {quote(entry)} must be a file below the folder of the "
         "list or the one above, and is in neither. Put the list into the root of the data, or into "
-        f"{LISTS} there. (--metadata)"
+        f"{LISTS} there."
     )
 
 

@@ -119,8 +119,7 @@ def check_presence(items: Sequence[ClipFiles]) -> None:
         shown = ", ".join(quote_path(item.prior) for item in items[:3])
         raise InputError(
             f"None of the {len(items):,} clips has its prior video: {shown}"
-            f"{', …' if len(items) > 3 else ''}. Paths are relative to the folder of the metadata. "
-            "(--metadata)"
+            f"{', …' if len(items) > 3 else ''}. Paths are relative to the folder of the metadata."
         )
 
 

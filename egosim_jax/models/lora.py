@@ -210,7 +210,7 @@ def matches(path: str, patterns: Sequence[str]) -> bool:
 def check_scale(scale: float) -> None:
     """Raise `InputError` unless a LoRA's scale is finite."""
     if not math.isfinite(scale):
-        raise InputError(f"A LoRA's scale must be a finite number, not {scale}. (--scale)")
+        raise InputError(f"A LoRA's scale must be a finite number, not {scale}.")
 
 
 def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) -> None:

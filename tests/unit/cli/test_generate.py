@@ -35,6 +35,23 @@ def test_the_strength_of_no_lora_is_refused(tmp_path, capsys):
     assert "--lora-scale is the strength of a LoRA" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_job_is_of_all_files_of_its_lora(tmp_path):
+    write_weights(tmp_path / "weights", configs.get("debug"))
+    (tmp_path / "lora").mkdir()
+    files = [tmp_path / "lora" / f"{stem}.safetensors" for stem in ("lora", "non_lora_weights")]
+    for file in files:
+        save_file({"a": np.zeros(3, np.float32)}, file)
+    job = BatchJob(
+        model=configs.get("debug"), out=tmp_path / "out", weights=tmp_path / "weights",
+        lora=tmp_path / "lora",
+    )  # fmt: skip
+    job.open()
+    job.open()
+    save_file({"a": np.ones(3, np.float32)}, files[1])
+    with pytest.raises(InputError, match="lora"):
+        job.open()
+
+
 @pytest.fixture(scope="module")
 def clip():
     return to_triplet(next(make_sequence(0, spec=VideoSpec(frames=9, height=64, width=96))))

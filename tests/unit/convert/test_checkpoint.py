@@ -13,10 +13,11 @@ from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.checkpoint import checkpoint
-from egosim_jax.convert.lora import read_lora
+from egosim_jax.convert.lora import check_base, read_lora
 from egosim_jax.convert.plan import merged
 from egosim_jax.convert.tables import table_of, weight_shapes
-from egosim_jax.io.mapped import read_safetensors
+from egosim_jax.io.mapped import read_metadata, read_safetensors
+from egosim_jax.io.weights import hashes
 from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.lora import Delta, Value, apply
@@ -230,3 +231,33 @@ def test_weights_in_the_blocks_have_no_name_in_a_checkpoint():
 def test_other_models_have_no_such_checkpoints():
     with pytest.raises(InputError, match=r"only the models dwm_\*"):
         checkpoint({}, configs.get("debug").dit, None)
+
+
+def test_a_file_without_its_weights_in_full_is_refused(tiny, tmp_path, capsys):
+    """Read alone, it would be applied without the projection of the hands."""
+    released("cogvideox", tmp_path / "checkpoint")
+    file = tmp_path / "checkpoint" / "pytorch_lora_weights.safetensors"
+    for act in (read_lora, lambda path, _: check_base(path, ["0"])):
+        with pytest.raises(InputError, match="only a part of a LoRA"):
+            act(file, COGVIDEOX)
+    assert main(["lora", str(file), "--config", "x", "--out", str(tmp_path / "out")]) == 2
+    assert f"two files, {tmp_path / 'checkpoint'}" in capsys.readouterr().err
+
+
+def test_a_checkpoint_says_on_which_weights_it_was_trained(tiny, tmp_path, capsys):
+    """A LoRA that continues from merged weights does not fit the release's base."""
+    released("cogvideox", tmp_path / "checkpoint")
+    for name in ("base", "other"):
+        (tmp_path / name).mkdir()
+        save_file({"a": jnp.zeros(len(name))}, tmp_path / name / "dit.safetensors")
+    convert = lambda source, *to: main(["lora", str(tmp_path / source), "--config", "x", *to])  # noqa: E731
+    dwm = ("--layout", "dwm", "--out")
+    assert convert("checkpoint", "--base", str(tmp_path / "base"), *dwm, str(tmp_path / "1")) == 0
+    assert convert("1", *dwm, str(tmp_path / "2")) == 0
+    known = hashes(tmp_path / "base", only=("dit",))["dit"]
+    for file in [*(tmp_path / "1").iterdir(), *(tmp_path / "2").iterdir()]:
+        assert file.name.startswith(".") or read_metadata(file)["base_sha256"] == known
+    capsys.readouterr()
+    out = str(tmp_path / "3")
+    assert convert("2", "--merge", str(tmp_path / "other"), "--out", out) == 2
+    assert "was trained on other weights" in capsys.readouterr().err
