@@ -279,6 +279,7 @@ class BatchJob:
                     decoding=self.decoding,
                     grid=self.model.grid,
                 )
+                self.model.layout.check_mask(triplet.mask)
                 loaded.append((window, triplet, digest))
             except InputError as error:
                 failed.append((window, str(error)))

@@ -33,6 +33,7 @@ from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
+from egosim_jax.data.static import check_static
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.encoding import Inputs
 from egosim_jax.generator import batches, targets_of
@@ -200,6 +201,8 @@ def encode_shards(
     }
     if (mask := mask_of(config)) != OLD_MASK:
         provenance["mask"] = mask
+    if config.layout.mask_packing == "observed":
+        check_static(source.manifest, source=str(source.folder))
     _open(
         out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
     )

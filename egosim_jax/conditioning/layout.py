@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, UInt8
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.mask import Packing, pack_mask
+from egosim_jax.data.static import check_observed
 from egosim_jax.grid import VideoGrid
 from egosim_jax.types import InputError
 
@@ -43,7 +44,7 @@ class ChannelLayout:
 
     `space`: 2 x 2 of one frame in 4 channels (EgoSim); `time`: one of each pixel frame (Wan's
     inpainting models); `single`: one in all; `observed`: none, the mask is constant and says that
-    everything was observed (DWM).
+    everything was observed (DWM); one that says otherwise is refused.
     """
     mask_one: Literal["generate", "keep"] = "generate"
     """Meaning of a mask of 1 to the denoiser: `generate` (EgoSim) or `keep` (Wan, CogVideoX)."""
@@ -100,6 +101,11 @@ class ChannelLayout:
     ) -> UInt8[np.ndarray, "lf lh lw m"]:
         """Pack a gray mask video (255 = not observed) into the mask's channels."""
         return pack_mask(frames, packing=self.mask_packing, channels=self.count("mask"), grid=grid)
+
+    def check_mask(self, frames: UInt8[np.ndarray, "f h w"]) -> None:
+        """Raise `InputError` for a mask video with holes, if the model has a constant mask."""
+        if self.mask_packing == "observed":
+            check_observed(frames)
 
     def condition_channels(
         self, condition: Condition, noisy: Float[Array, "b f h w z"]

@@ -18,7 +18,7 @@ floor(61 i / 16) = 0, 3, 7, 11, 15, 19, ...; `padding="none"` reproduces it.
 These are the rules of the packing `space` with a codec of strides 4 and 8. The others keep rules 1
 and 2 and take one pixel of each latent cell: `single` that of the same frame, in one channel, and
 `time` those of all pixel frames that the latent frame encodes, a channel each (Wan 2.1).
-`observed` looks at no pixel: all is 0.
+`observed` is 0 everywhere, and refuses a mask that says otherwise.
 """
 
 from __future__ import annotations
@@ -29,12 +29,11 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import UInt8
 
+from egosim_jax.data.static import HALF_WHITE, check_observed
 from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.types import InputError
 
 Packing = Literal["space", "time", "single", "observed"]
-HALF_WHITE = 127
-"""Highest gray level that is not above one half of 255."""
 
 
 def pack_mask(
@@ -47,7 +46,8 @@ def pack_mask(
 ) -> UInt8[np.ndarray, "lf lh lw {channels}"]:
     """Return mask channels, 0 or 1, of a gray mask video (255 = not observed).
 
-    Raises `InputError` for a number of frames or a size without latent cells of the grid.
+    Raises `InputError` for a number of frames or a size without latent cells of the grid, and in
+    the packing `observed` for pixels that were not observed.
     """
     count, height, width = frames.shape
     time, space = grid.temporal_stride, grid.spatial_stride
@@ -59,6 +59,7 @@ def pack_mask(
         )
     latent_frames = (count - 1) // time + 1
     if packing == "observed":
+        check_observed(frames)
         return np.zeros((latent_frames, height // space, width // space, channels), np.uint8)
     if packing == "time":
         # The first latent frame encodes one pixel frame.

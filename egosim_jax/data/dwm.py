@@ -24,6 +24,7 @@ from pathlib import Path
 
 from egosim_jax.data.metadata import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, Prompts, is_safe_id
 from egosim_jax.data.readers import inside, make_id
+from egosim_jax.data.static import check_observed
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.video import write_video
@@ -132,8 +133,8 @@ def write_folders(
     """Write triplets in DWM's folders below a root, and their list; return its path.
 
     The id A/B/CLIP gives NAME/A/B/videos/CLIP.mp4; `name` is also that of the list, without its
-    suffix. Raises `InputError` for a name or id that is not a valid file name, and without a target
-    video.
+    suffix. Raises `InputError` for a name or id that is not a valid file name, without a target
+    video, and for a mask with holes, which the folders cannot hold.
     """
     if "/" in name or not is_safe_id(f"{name}/0"):
         raise InputError(
@@ -151,6 +152,10 @@ def write_folders(
                 f"{triplet.video_id} has no recorded video, which DWM's lists name: it must have "
                 "a target."
             )
+        try:
+            check_observed(triplet.mask)
+        except InputError as error:
+            raise InputError(f"{triplet.video_id}: {error}") from error
         place = Path(name) / triplet.video_id
         videos = {VIDEOS: triplet.target, STATIC: triplet.prior, HANDS: triplet.hands}
         for kind, frames in videos.items():

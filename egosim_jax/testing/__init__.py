@@ -42,8 +42,11 @@ def tiny_model(**changes: Any) -> ModelConfig:
     return dataclasses.replace(configs.get("debug"), **{**fields, **changes})
 
 
-def random_triplet(video: VideoSpec, seed: int = 0) -> Triplet:
-    """Return a triplet of noise, without a target, so that nothing has to be rendered."""
+def random_triplet(video: VideoSpec, seed: int = 0, *, observed: bool = False) -> Triplet:
+    """Return a triplet of noise, without a target, so that nothing has to be rendered.
+
+    Its mask is noise too or, as DWM's models need it, says that everything was `observed`.
+    """
     rng = np.random.default_rng(seed)
     frames = (video.frames, video.height, video.width)
 
@@ -54,7 +57,7 @@ def random_triplet(video: VideoSpec, seed: int = 0) -> Triplet:
         video_id=f"clip_{seed}",
         prompt=f"take cup {seed}",
         prior=draw(*frames, 3),
-        mask=255 * draw(*frames).astype(bool).astype(np.uint8),
+        mask=(0 if observed else 255) * draw(*frames).astype(bool).astype(np.uint8),
         hands=draw(*frames, 3),
         first_frame=draw(*frames[1:], 3),
     )

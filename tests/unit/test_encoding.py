@@ -26,7 +26,7 @@ def uncached(monkeypatch):
 @pytest.fixture(scope="module")
 def clip():
     """A prior whose left half is black, and hands of another gray."""
-    noise = random_triplet(MODEL.video)
+    noise = random_triplet(MODEL.video, observed=True)
     prior, hands = np.full_like(noise.prior, 140), np.full_like(noise.hands, 200)
     prior[:, :, : prior.shape[2] // 2] = 0
     return replace(noise, prior=prior, hands=hands)

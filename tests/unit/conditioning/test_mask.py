@@ -118,7 +118,9 @@ def test_another_codec_has_other_cells(frames):
     np.testing.assert_array_equal(packed[3, 2, 5].reshape(2, 2), frames[6, 8:12:2, 20:24:2] > 127)
 
 
-def test_a_mask_that_is_always_observed_looks_at_no_pixel(frames):
-    packed = pack_mask(frames, packing="observed", channels=3)
+def test_a_constant_mask_is_zero_and_refuses_holes(frames):
+    packed = pack_mask(frames // 2, packing="observed", channels=3)
     assert packed.shape == (4, 4, 6, 3)
     assert packed.max() == 0
+    with pytest.raises(InputError, match=r"% of the pixels were not observed: .*--prior static"):
+        pack_mask(frames, packing="observed", channels=3)

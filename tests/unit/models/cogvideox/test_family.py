@@ -32,7 +32,7 @@ def networks():
 
 @pytest.fixture(scope="module")
 def condition(networks):
-    inputs = Inputs.of([random_triplet(TINY.video, seed) for seed in range(2)], TINY)
+    inputs = Inputs.of([random_triplet(TINY.video, seed, observed=True) for seed in range(2)], TINY)
     return CompiledFn(encode_condition, networks)(inputs)
 
 
@@ -46,7 +46,7 @@ def test_a_prompt_that_is_dropped_is_the_empty_one(networks, condition):
 
 
 def test_it_generates_and_guidance_leads_away_from_the_empty_prompt(networks):
-    triplets = [random_triplet(TINY.video, 0)]
+    triplets = [random_triplet(TINY.video, 0, observed=True)]
     (clip,) = Generator(TINY, networks).generate(triplets, [0])
     assert clip.frames.shape == (9, 32, 48, 3)
     same = [replace(triplets[0], prompt="")]
@@ -65,7 +65,7 @@ def test_the_mask_of_dwm_is_the_scale_of_the_latents(condition):
 
 
 def test_cached_clips_hold_the_empty_prompt_that_training_drops_to(networks):
-    triplet = random_triplet(TINY.video, 0)
+    triplet = random_triplet(TINY.video, 0, observed=True)
     triplet = replace(triplet, target=triplet.prior)
     encoders = Networks(vae=networks.vae, text=networks.text)
     (record,) = Encoding(TINY, encoders)([triplet])
