@@ -115,8 +115,9 @@ def _read(folder: Path) -> tokenizers.Tokenizer:
         return tokenizer
     if not file.is_file():
         raise InputError(
-            f"No tokenizer at {file}: umT5 needs the tokenizer.json of google/umt5-xxl, which the "
-            "released weights of Wan 2.1 and EgoSim hold in their folder google/umt5-xxl."
+            f"No tokenizer in {folder}: it must hold the tokenizer.json or spiece.model of the "
+            "model's text encoder. Releases have it in google/umt5-xxl (Wan 2.1, EgoSim) or "
+            "tokenizer (CogVideoX), from where `egosim convert weights` copies it."
         )
     try:
         tokenizer = Tokenizer.from_file(str(file))
