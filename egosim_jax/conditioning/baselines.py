@@ -14,22 +14,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
 from egosim_jax.conditioning.condition import Name
+from egosim_jax.rendering.mesh import hand_mask
 from egosim_jax.types import Triplet
 
 Baseline = Literal["no_hands", "hand_mask", "sdedit"]
 STRENGTH = 0.75
 """Share of the noise levels at which SDEdit begins (DWM)."""
-DRAWN_SUM = 100
-"""Sum of red, green and blue above which a pixel counts as drawn (DWM)."""
 DROPPED: dict[Baseline, Name | None] = {"no_hands": "hands", "hand_mask": None, "sdedit": "hands"}
 """Condition that a baseline does without; SDEdit's sampling drops prior and mask as well."""
 
 
 def with_hand_mask(triplet: Triplet) -> Triplet:
     """Return the triplet with hands in white wherever they are drawn."""
-    drawn = triplet.hands.sum(axis=-1, dtype=np.int32) > DRAWN_SUM
-    white = np.where(drawn, 255, 0).astype(np.uint8)
-    return replace(triplet, hands=np.repeat(white[..., None], 3, axis=-1))
+    return replace(triplet, hands=hand_mask(triplet.hands))
