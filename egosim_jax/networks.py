@@ -24,6 +24,7 @@ from egosim_jax.diffusion.unipc import UniPC
 from egosim_jax.grid import VideoGrid
 from egosim_jax.io import weights
 from egosim_jax.models import (
+    ChunkedCodecConfig,
     Denoiser,
     DenoiserConfig,
     ImageEncoder,
@@ -129,6 +130,8 @@ class ModelConfig:
             )
         # Raises if the solver does not fit the process, or the steps.
         self.solver.coefficients(self.process, self.process.times(self.visited))
+        if isinstance(self.vae, ChunkedCodecConfig):
+            self.vae.check_frames(self.video.frames)
         self.grid.check(self.video)
         frames, patch = self.latent_shape[0], dit.patch[0]
         if frames % patch:

@@ -163,6 +163,15 @@ class VideoCodecConfig(NetworkConfig, Protocol):
 
 
 @runtime_checkable
+class ChunkedCodecConfig(Protocol):
+    """Config of a video codec that takes fewer lengths than its strides allow."""
+
+    def check_frames(self, frames: int) -> None:
+        """Raise `InputError` for a number of frames that the codec does not take."""
+        ...
+
+
+@runtime_checkable
 class TextEncoderConfig(NetworkConfig, Protocol):
     """Config of a text encoder."""
 

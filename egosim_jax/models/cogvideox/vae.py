@@ -83,6 +83,16 @@ class CogVideoXVAEConfig:
                 "multiple. Change groups."
             )
 
+    def check_frames(self, frames: int) -> None:
+        """Raise `InputError` unless a video of so many frames divides into chunks."""
+        unit = CHUNK * self.temporal_stride
+        if frames % unit != 1:
+            below = max(1, (frames - 1) // unit * unit + 1)
+            raise InputError(
+                f"A video of {frames} frames cannot be encoded: CogVideoX's VAE needs {unit}k+1 "
+                f"frames. Nearest: {below} or {below + unit}. (--num-frames)"
+            )
+
     @property
     def spatial_stride(self) -> int:
         """Pixels per latent cell, along each axis."""
@@ -323,13 +333,8 @@ class CogVideoXVAE(nnx.Module):
                 "For uint8 frames: frames / 127.5 - 1."
             )
         _, frames, height, width, _ = video.shape
-        unit, space = CHUNK * self.config.temporal_stride, self.config.spatial_stride
-        if frames % unit != 1:
-            below = max(1, (frames - 1) // unit * unit + 1)
-            raise InputError(
-                f"A video of {frames} frames cannot be encoded: CogVideoX's VAE needs {unit}k+1 "
-                f"frames. Nearest: {below} or {below + unit}. (--num-frames)"
-            )
+        space = self.config.spatial_stride
+        self.config.check_frames(frames)
         if height % space or width % space:
             raise InputError(
                 f"A video of {height} x {width} pixels cannot be encoded: rows and columns must "

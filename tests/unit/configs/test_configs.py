@@ -68,6 +68,13 @@ def test_an_unknown_sampling_is_refused(name, sampling, message):
         configs.sampled(configs.get(name), sampling)
 
 
+@pytest.mark.parametrize(("frames", "nearest"), [(13, "9 or 17"), (51, "49 or 57")])
+def test_a_length_that_the_chunks_of_a_codec_do_not_take_is_refused(frames, nearest):
+    config = configs.get("dwm_cogvideox_5b")
+    with pytest.raises(InputError, match=rf"needs 8k\+1 frames\. Nearest: {nearest}"):
+        dataclasses.replace(config, video=dataclasses.replace(config.video, frames=frames))
+
+
 def test_dwm_on_wan_has_image_tokens_of_zeros_and_no_encoder():
     config = configs.get("dwm_wan_14b")
     assert "image" not in config.networks
