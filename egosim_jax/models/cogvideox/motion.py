@@ -19,6 +19,7 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
+from egosim_jax.models import Flops
 from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
 from egosim_jax.models.cogvideox.dit import (
     MLP,
@@ -55,6 +56,23 @@ class MotionDiTConfig(CogVideoXDiTConfig):
     def build(self, *, rngs: nnx.Rngs) -> MotionDiT:
         """Build the network with random weights."""
         return MotionDiT(self, rngs=rngs)
+
+    def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
+        """Count a forward pass of one sample, with the poses of `image` pixel frames.
+
+        To CogVideoX's, with P poses of width p, F latent frames, a time embedding of width e and L
+        blocks of width d, they add
+
+            embedding     2 P e (p + e) + 6 e^2 (convolved frames of both convolutions)
+            modulation    L 24 e d (F + 1)
+        """
+        base = super().forward_flops(latents=latents, text=text, image=0)
+        frames, e = latents[0], self.time_dim
+        convolved = 3 * frames if self.frames == "frame" else 2 * image
+        embedding = 2 * image * e * (self.pose_dim + e) + 6 * e**2 * convolved
+        rows = frames + 1  # of the poses of each latent frame, and of their mean
+        modulation = self.layers * 24 * e * self.dim * rows
+        return base._replace(weights=base.weights + embedding + modulation)
 
     @property
     def image_dim(self) -> int:

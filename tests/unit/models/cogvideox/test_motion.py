@@ -1,6 +1,6 @@
 """Hand poses in the modulation: embedded by frame or for all alike, without effect at first."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.models.cogvideox.motion import Motion, MotionDiTConfig, PoseModulation
+from egosim_jax.preflight.flops import count
 from egosim_jax.types import InputError
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
 
@@ -89,8 +90,35 @@ def test_poses_do_not_count_until_they_are_trained(frames):
     assert np.abs(predict(params, still) - predict(params, moving)).max() > 1e-3
 
 
-@pytest.mark.parametrize(("given", "count"), [(None, 0), (jnp.zeros((1, 8, POSES)), 8)])
-def test_poses_of_every_pixel_frame_are_needed(given, count):
+@pytest.mark.parametrize("frames", ["frame", "global"])
+def test_the_flops_of_poses_are_those_of_their_layers(frames):
+    """By hand and, as the difference from a transformer without them, in the traced programs."""
+    sizes = {"latents": (LATENTS, 4, 6), "text": 5, "image": FRAMES}
+    plain, posed = replace(TINY.dit, in_channels=33), config(frames)
+    dim, depth, wide = plain.dim, plain.layers, plain.time_dim
+    layers = FRAMES * POSES * wide + FRAMES * wide * wide
+    # 11 padded frames give 6 by stride 2, then 3; without a stride, all 9 stay.
+    layers += 3 * wide * wide * (6 + 3 if frames == "frame" else 9 + 9)
+    layers += depth * 2 * (LATENTS + 1) * wide * 6 * dim
+    added = posed.forward_flops(**sizes).total - plain.forward_flops(**sizes).total
+    assert added == 2 * layers
+
+    def counted(chosen, *poses):
+        graph, params = nnx.split(nnx.eval_shape(lambda: chosen.build(rngs=nnx.Rngs(0))))
+
+        def predict(params, noisy, t, condition, text, *poses):
+            dit = nnx.merge(graph, params)
+            return dit.denoise(noisy, t, dit.prepare(condition, text, *poses))
+
+        shapes = (1, LATENTS, 4, 6, 16), (1,), (1, LATENTS, 4, 6, 17), (1, 5, 16), *poses
+        given = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+        return count(jax.make_jaxpr(predict)(params, *given))
+
+    assert counted(posed, (1, FRAMES, POSES)) - counted(plain) == added
+
+
+@pytest.mark.parametrize(("given", "number"), [(None, 0), (jnp.zeros((1, 8, POSES)), 8)])
+def test_poses_of_every_pixel_frame_are_needed(given, number):
     network = nnx.eval_shape(lambda: config("frame").build(rngs=nnx.Rngs(0)))
-    with pytest.raises(InputError, match=rf"{count} poses .* each of the 9 pixel frames"):
+    with pytest.raises(InputError, match=rf"{number} poses .* each of the 9 pixel frames"):
         network.prepare(jnp.zeros((1, LATENTS, 4, 6, 17)), jnp.zeros((1, 5, 16)), given)
