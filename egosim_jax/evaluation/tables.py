@@ -189,7 +189,7 @@ TABLES = {
     ),
     "dwm_4": _dwm_table(
         title="DWM: Table 4, initial weights, by training step",
-        groups={"synthetic_dynamic": _SETS["synthetic_dynamic"]},
+        groups={"synthetic_dynamic": f"{_SETS['synthetic_dynamic']}; in the paper not stated"},
         published={
             "synthetic_dynamic": {
                 f"{name}, step {1000 * number}": {"dreamsim": value}

@@ -153,7 +153,7 @@ PAPER: Mapping[str, Figures] = {
         "hand_mask": {"psnr": 22.876, "ssim": 0.797, "lpips": 0.338, "dreamsim": 0.137},
         "moving_only": {"psnr": 24.151, "ssim": 0.834, "lpips": 0.304, "dreamsim": 0.094},
     },
-    "Table 4, real, moving, at 0 and 4000 updates": {
+    "Table 4, clips not stated, at 0 and 4000 updates": {
         "image_untrained": {"dreamsim": 0.337},
         "untrained": {"dreamsim": 0.110},
         "image_base": {"dreamsim": 0.103},
