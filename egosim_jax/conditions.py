@@ -62,11 +62,28 @@ def static_of(
     return view.frames, view.mask
 
 
-def repeated(target: UInt8[np.ndarray, "f h w 3"]) -> Static:
+MOST_MOVED_M, MOST_TURNED_DEG = 0.005, 0.2
+"""Largest motion of a camera that counts as fixed: about a pixel."""
+
+
+def repeated(target: UInt8[np.ndarray, "f h w 3"], cameras: Cameras) -> Static:
     """Return the static video of a fixed camera: the first frame, repeated.
 
-    Hands that the first frame shows stay in it, as in DWM's data of TASTE-Rob.
+    Hands that the first frame shows stay in it, as in DWM's data of TASTE-Rob. Raises `InputError`
+    if the camera moves.
     """
+    poses = np.asarray(cameras.world_from_camera)
+    moved = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=-1).max()
+    # The chord between two rotations, which unlike their cosine is exact for small angles.
+    chords = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2))
+    turned = np.degrees(2 * np.arcsin(np.minimum(chords.max() / np.sqrt(8), 1)))
+    if moved > MOST_MOVED_M or turned > MOST_TURNED_DEG:
+        raise InputError(
+            "The first frame of a video can only be repeated if its camera is fixed, to "
+            f"{MOST_MOVED_M:g} m and {MOST_TURNED_DEG:g} degrees: this one moves by up to "
+            f"{moved:.3f} m and turns by up to {turned:.1f} degrees. Give a scene to render along "
+            "its path. (--scene)"
+        )
     return np.repeat(target[:1], len(target), axis=0), np.zeros(target.shape[:3], np.uint8)
 
 

@@ -72,7 +72,7 @@ class Static:
         if self.scene is not None:
             static = static_of(self.scene, action.cameras)
         elif target is not None:
-            static = repeated(target)
+            static = repeated(target, action.cameras)
         else:
             raise InputError(
                 "There is no scene: give one, or the video of a fixed camera, whose first frame is "

@@ -13,6 +13,7 @@ from egosim_jax.data.dwm import write_folders
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.mixing import open_shards
 from egosim_jax.data.pack import pack
+from egosim_jax.geometry import rotation_z
 from egosim_jax.io.video import probe_video, read_video, write_video
 from egosim_jax.state.snapshot import save, write_ply
 from egosim_jax.types import InputError, Triplet, VideoSpec
@@ -42,6 +43,16 @@ def action(clip, tmp_path):
         "joints_m": np.where(np.isnan(joints), None, joints).tolist(),
         "prompt": clip.caption,
     }
+    path.write_text(json.dumps(values), "utf-8")
+    return path
+
+
+@pytest.fixture
+def fixed(action):
+    """File of those cameras and hands with the first camera in all frames."""
+    values = json.loads(action.read_text("utf-8"))
+    values["world_from_camera"] = [values["world_from_camera"][0]] * 5
+    path = action.with_name("fixed.json")
     path.write_text(json.dumps(values), "utf-8")
     return path
 
@@ -119,9 +130,29 @@ def test_wrong_meshes_are_refused(clip, action, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_fixed_camera_repeats_the_first_frame(clip, action, tmp_path):
+def test_a_moving_camera_needs_a_scene(clip, action, fixed, tmp_path):
     write_video(tmp_path / "clip.mp4", clip.frames, 8)
-    files = {"action": action, "out": tmp_path / "out", **FILES}
+    values = json.loads(fixed.read_text("utf-8"))
+    values["world_from_camera"][3][1][3] += 0.25
+    moved, turned = tmp_path / "moved.json", tmp_path / "turned.json"
+    moved.write_text(json.dumps(values), "utf-8")
+    values["world_from_camera"][3] = values["world_from_camera"][0]
+    rotated = np.array(values["world_from_camera"][4])
+    rotated[:3, :3] = rotated[:3, :3] @ rotation_z(np.radians(3))
+    values["world_from_camera"][4] = rotated.tolist()
+    turned.write_text(json.dumps(values), "utf-8")
+    for path, message in (
+        (action, "moves by up to"),
+        (moved, r"by up to 0\.250 m and turns by up to 0\.0 degrees\. .*\(--scene\)"),
+        (turned, r"by up to 0\.000 m and turns by up to 3\.0 degrees"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Static(action=path, out=tmp_path, video=tmp_path / "clip.mp4", **FILES).run()
+
+
+def test_a_fixed_camera_repeats_the_first_frame(clip, fixed, tmp_path):
+    write_video(tmp_path / "clip.mp4", clip.frames, 8)
+    files = {"action": fixed, "out": tmp_path / "out", **FILES}
     assert Static(video=tmp_path / "clip.mp4", **files).run() == 0
     triplet = made(tmp_path / "out" / "metadata.csv")
     assert near(triplet.prior, clip.frames[:1].repeat(5, axis=0))
@@ -137,23 +168,23 @@ def test_a_fixed_camera_repeats_the_first_frame(clip, action, tmp_path):
         Static(video=tmp_path / "short.mp4", **files).run()
 
 
-def test_keypoints_in_another_order_are_refused(clip, action, tmp_path):
-    values = json.loads(action.read_text("utf-8"))
+def test_keypoints_in_another_order_are_refused(clip, fixed, tmp_path):
+    values = json.loads(fixed.read_text("utf-8"))
     for hands in values["joints_m"]:
         for number, joints in enumerate(hands):
             hands[number] = [*joints[1:], joints[0]]
-    action.write_text(json.dumps(values), "utf-8")
+    fixed.write_text(json.dumps(values), "utf-8")
     write_video(tmp_path / "clip.mp4", clip.frames, 8)
-    files = {"action": action, "out": tmp_path / "out", **FILES}
+    files = {"action": fixed, "out": tmp_path / "out", **FILES}
     with pytest.raises(InputError, match=r"order with the wrist last: .*\(--action\)"):
         Static(video=tmp_path / "clip.mp4", **files).run()
     assert not (tmp_path / "out").exists()
 
 
-def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, action, tmp_path):
+def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, fixed, tmp_path):
     rate = Fraction(30000, 1001)
     write_video(tmp_path / "clip.mp4", clip.frames, rate)
-    command = Static(action=action, out=tmp_path / "out", video=tmp_path / "clip.mp4", **FILES)
+    command = Static(action=fixed, out=tmp_path / "out", video=tmp_path / "clip.mp4", **FILES)
     assert command.run() == 0
     (files,) = read_metadata(tmp_path / "out" / "metadata.csv")
     assert probe_video(files.target).fps == probe_video(files.prior).fps == rate
@@ -202,7 +233,7 @@ def test_videos_of_several_rates_are_not_one_set_of_dwm(clip, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_hands_of_mano_replace_those_of_keypoints(clip, action, tmp_path):
+def test_hands_of_mano_replace_those_of_keypoints(clip, fixed, tmp_path):
     (tmp_path / "MANO_RIGHT.pkl").write_bytes(model_pickle(random_model()))
     write_video(tmp_path / "clip.mp4", clip.frames, 8)
     poses = {
@@ -214,7 +245,7 @@ def test_hands_of_mano_replace_those_of_keypoints(clip, action, tmp_path):
     for name in ("global_orient", "hand_pose", "translation_m"):
         poses[name][:, 0] = np.nan
     np.savez(tmp_path / "poses.npz", **poses)
-    files = {"action": action, "out": tmp_path / "out", "video": tmp_path / "clip.mp4", **FILES}
+    files = {"action": fixed, "out": tmp_path / "out", "video": tmp_path / "clip.mp4", **FILES}
     mano = {"mano_right": tmp_path / "MANO_RIGHT.pkl", "mano_poses": tmp_path / "poses.npz"}
     assert Static(**files, **mano).run() == 0
     hands = made(tmp_path / "out" / "metadata.csv").hands[0].astype(int)
