@@ -14,6 +14,7 @@ from egosim_jax.progress import track
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
+    from egosim_jax.networks import ModelConfig
     from egosim_jax.rendering.mesh import MovingMesh
 
 
@@ -182,6 +183,13 @@ class ToDwm:
     Frames that `data pack` took by another rule than rate do not say theirs."""
     limit: int | None = None
     """Maximum number of clips."""
+    caches: str | None = None
+    """Name of a model for which the caches of latents and captions are written, too.
+
+    The folders are video_latents, static_video_latents, hand_video_latents and
+    prompt_embeds_rewrite; `data from-caches` reads them."""
+    weights: Path | None = None
+    """With --caches, folder of weights with the VAE and the text encoder."""
 
     def run(self) -> int:
         """Write clip after clip."""
@@ -192,12 +200,38 @@ class ToDwm:
         from egosim_jax.data.shards import ShardReader
 
         check_counts({"--fps": self.fps, "--limit": self.limit})
+        model = self._cached_model()
         reader = ShardReader(self.shards)
         count = min(len(reader), self.limit or len(reader))
         fps = _one_rate(frame_rates(reader, count), self.fps, of="--shards")
         triplets = track(islice(read_triplets(reader), count), "writing", total=count)
-        print(write_folders(self.out, triplets, name=self.name, fps=fps))
+        path = write_folders(self.out, triplets, name=self.name, fps=fps)
+        if model is not None and self.weights is not None:
+            from egosim_jax.data.dwm import read_list
+            from egosim_jax.train.cached import write_caches
+
+            clips = read_list(path, first_line=True)
+            written = write_caches(model, self.weights, clips)
+            for _ in track(written, "encoding", total=len(clips)):
+                pass
+        print(path)
         return ExitCode.DONE
+
+    def _cached_model(self) -> ModelConfig | None:
+        """Return the model whose caches are asked for, if any."""
+        if self.caches is None or self.weights is None:
+            if self.caches is None and self.weights is None:
+                return None
+            raise InputError(
+                f"Caches are made by a model with its weights: give both, not --caches "
+                f"{self.caches} with --weights {self.weights}. (--caches, --weights)"
+            )
+        from egosim_jax import configs
+        from egosim_jax.train.cached import check_cached
+
+        model = configs.get(self.caches).at(self.weights)
+        check_cached(model)
+        return model
 
 
 def _one_rate(known: Collection[Fraction], given: int | None, *, of: str) -> Fraction:
@@ -273,7 +307,7 @@ class FromCaches:
     out: Path
     """Folder of the latents shards."""
     prompts: Prompts = "prompts_rewrite"
-    """Captions of the list, which the caches must be of.
+    """Captions of the list, of whose first lines the caches must be.
 
     prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
     has none; prompts: the original ones, of the paper's evaluation."""
@@ -283,10 +317,12 @@ class FromCaches:
     def run(self) -> int:
         """Check the first clip, then read cache after cache."""
         from egosim_jax import configs
-        from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.data.dwm import read_list
+        from egosim_jax.data.metadata import select
         from egosim_jax.train.cached import shard_caches
 
-        clips = select(read_metadata(self.metadata, prompts=self.prompts), limit=self.limit)
+        clips = read_list(self.metadata, prompts=self.prompts, first_line=True)
+        clips = select(clips, limit=self.limit)
         model = configs.get(self.config).at(self.weights)
         for _ in track(
             shard_caches(model, self.weights, clips, out=self.out), "reading", total=len(clips)

@@ -43,10 +43,12 @@ MAX_LIST_BYTES, MAX_PROMPT_BYTES = 1 << 26, 1 << 16
 """Largest list and caption in bytes."""
 
 
-def read_list(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
+def read_list(
+    path: Path, *, prompts: Prompts = "prompts_rewrite", first_line: bool = False
+) -> list[ClipFiles]:
     """Return the clips of a list, whose ids are their paths with underscores.
 
-    `prompts` are the captions to take.
+    `prompts` are the captions to take, or the `first_line` of each, of which DWM's caches are.
     Raises one `InputError` that lists the problems: no root, paths outside of it or not in a folder
     `videos`, absent and empty captions, duplicates.
     """
@@ -59,7 +61,8 @@ def read_list(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipF
     problems = Problems()
     for line, entry in entries:
         try:
-            files = _files(root, entry, f"{path.name} line {line}", prompts)
+            row = f"{path.name} line {line}"
+            files = _files(root, entry, row, prompts, first_line=first_line)
             if files.video_id in clips:
                 raise InputError(f"its id {files.video_id} is also that of another line")
             clips[files.video_id] = files
@@ -99,7 +102,7 @@ def _root_of(path: Path, entry: str) -> Path:
     )
 
 
-def _files(root: Path, entry: str, row: str, prompts: Prompts) -> ClipFiles:
+def _files(root: Path, entry: str, row: str, prompts: Prompts, *, first_line: bool) -> ClipFiles:
     video = inside(root, entry, what="the path")
     if video.parent.name != VIDEOS or video.suffix != ".mp4":
         raise InputError(
@@ -109,7 +112,8 @@ def _files(root: Path, entry: str, row: str, prompts: Prompts) -> ClipFiles:
     folder = video.parent.parent
     texts = [folder / name / f"{video.stem}.txt" for name in PROMPTS[prompts]]
     found = next((text for text in texts if text.is_file()), texts[0])
-    prompt = " ".join(_text(found, MAX_PROMPT_BYTES).split())
+    text = _text(found, MAX_PROMPT_BYTES)
+    prompt = " ".join((text.partition("\n")[0] if first_line else text).split())
     if not prompt:
         raise InputError(f"the caption {quote_path(found)} is empty")
     static = folder / STATIC / video.name

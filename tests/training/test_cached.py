@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.data.dwm import write_folders
+from egosim_jax.cli.triplets import FromCaches, ToDwm
 from egosim_jax.data.metadata import read_metadata
-from egosim_jax.data.moments import cache_of, write_moments
-from egosim_jax.data.pack import pack
-from egosim_jax.data.shards import ShardReader
-from egosim_jax.io.pth import write_pth
+from egosim_jax.data.pack import pack, triplet_record
+from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.networks import Networks
 from egosim_jax.train.cached import shard_caches
 from egosim_jax.train.encode import check_encoders, encode_shards
@@ -39,28 +37,38 @@ def make_triplet(number):
     )
 
 
-def test_caches_give_the_latents_of_their_videos_and_those_of_another_vae_are_refused(tmp_path):
+def test_caches_give_the_latents_of_their_videos_and_those_of_another_vae_are_refused(
+    tmp_path, monkeypatch
+):
+    """DWM's caches are of the first line of a caption."""
     weights, others = tmp_path / "weights", tmp_path / "others"
     Networks.random(MODEL, seed=0).save(weights)
     Networks.random(MODEL, seed=1).save(others)
-    path = write_folders(tmp_path, [make_triplet(n) for n in range(2)], name="home", fps=8)
+    with ShardWriter(tmp_path / "made", kind="frames", spec=SPEC, grid=MODEL.grid) as writer:
+        for record in map(triplet_record, map(make_triplet, range(2))):
+            writer.add(record.arrays, record.metadata)
+    with monkeypatch.context() as patch:
+        patch.setattr(configs, "get", lambda _: MODEL)
+        options = {"caches": MODEL.name, "weights": weights}
+        assert ToDwm(shards=tmp_path / "made", out=tmp_path, name="home", **options).run() == 0
+    path = tmp_path / "dataset_files" / "home.txt"
     clips = read_metadata(path)
     list(pack(clips, out=tmp_path / "videos", spec=SPEC, provenance={}, grid=MODEL.grid))
     source = ShardReader(tmp_path / "videos")
     encode_shards(MODEL, weights, source=source, out=tmp_path / "encoded", stride=1, batch_size=1)
     expected = list(ShardReader(tmp_path / "encoded"))
-    for clip, record in zip(clips, expected, strict=True):
-        for name in ("target", "prior", "hands"):
-            mean, std = (record.arrays[f"{name}{end}"] / 0.7 for end in ("", "_std"))
-            cache = cache_of(clip.target, name)
-            cache.parent.mkdir(exist_ok=True)
-            write_moments(cache, mean, 2 * np.log(std))
-        cache_of(clip.target, "text").parent.mkdir(exist_ok=True)
-        write_pth(cache_of(clip.target, "text"), record.arrays["text"])
-    ids = list(shard_caches(MODEL, weights, clips, out=tmp_path / "cached"))
-    assert ids == ["home_videos_0", "home_videos_1"]
+    for caption in (tmp_path / "home" / "prompts_rewrite").iterdir():
+        caption.write_text(caption.read_text("utf-8") + "Nothing else moves.\n", "utf-8")
+    with pytest.raises(InputError, match=r"prompt_embeds_rewrite/0\.pt is not of these weights"):
+        list(shard_caches(MODEL, weights, read_metadata(path), out=tmp_path / "whole"))
+    with monkeypatch.context() as patch:
+        patch.setattr(configs, "get", lambda _: MODEL)
+        files = {"metadata": path, "out": tmp_path / "cached"}
+        assert FromCaches(config=MODEL.name, weights=weights, **files).run() == 0
+    records = list(ShardReader(tmp_path / "cached"))
+    assert [record.metadata["prompt"] for record in records] == ["take cup 0", "take cup 1"]
     check_encoders(tmp_path / "cached", MODEL, weights)
-    for record, wanted in zip(ShardReader(tmp_path / "cached"), expected, strict=True):
+    for record, wanted in zip(records, expected, strict=True):
         assert record.arrays.keys() == wanted.arrays.keys()
         for name, array in wanted.arrays.items():
             size = np.abs(array).max()
