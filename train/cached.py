@@ -1,8 +1,8 @@
-"""Latents shards from DWM's caches, which replace the encoding of all clips but the first.
+"""DWM's caches: latents shards of them, in place of encoding the videos, and the caches of videos.
 
-The first clip is encoded from its videos as well. So the caches are shown to be of the given VAE
-and text encoder, and what does not depend on the clip, as the embeddings of the empty prompt, is
-known.
+For shards, the first clip is encoded from its videos as well. So the caches are shown to be of the
+given VAE and text encoder, and what does not depend on the clip, as the embeddings of the empty
+prompt, is known.
 """
 
 from __future__ import annotations
@@ -11,21 +11,43 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
 
 from egosim_jax.conditioning.posterior import STD
+from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.clips import load_triplet
 from egosim_jax.data.metadata import ClipFiles
-from egosim_jax.data.moments import cache_of, check_alike, read_moments, read_tensor
+from egosim_jax.data.moments import (
+    MOST_DIFFERENT_STD,
+    cache_of,
+    check_alike,
+    read_moments,
+    read_tensor,
+    write_moments,
+)
 from egosim_jax.data.pack import clip_metadata
 from egosim_jax.data.shards import ShardWriter
+from egosim_jax.encoding import Inputs
+from egosim_jax.io.pth import write_pth
 from egosim_jax.io.weights import hashes
 from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.program import CompiledFn
 from egosim_jax.train.encode import Encoding, mask_of
 from egosim_jax.types import InputError
 
 VIDEOS = ("target", "prior", "hands")
+
+
+def check_cached(config: ModelConfig) -> None:
+    """Raise `InputError` for a model that does not train on cached moments."""
+    if config.posterior != "sampled" or config.encoders == "joint":
+        raise InputError(
+            f"{config.name} does not train on cached moments: it must draw latents from them and "
+            "have frozen encoders, as dwm_cogvideox_5b. Encode the videos. (egosim data encode)"
+        )
 
 
 def shard_caches(
@@ -36,11 +58,7 @@ def shard_caches(
     `folder` holds the weights. Raises `InputError` for a model that does not draw latents, and for
     caches of another shape or of other weights.
     """
-    if config.posterior != "sampled" or config.encoders == "joint":
-        raise InputError(
-            f"{config.name} does not train on cached moments: it must draw latents from them and "
-            "have frozen encoders, as dwm_cogvideox_5b. Encode the videos. (--config)"
-        )
+    check_cached(config)
     networks = Networks.load(config, folder, only=config.cached_networks)
     triplet = load_triplet(clips[0], config.video, grid=config.grid)
     (first,) = Encoding(config, networks)([triplet])
@@ -58,6 +76,9 @@ def shard_caches(
             if number == 0:
                 for name in (*VIDEOS, "text"):
                     check_alike(_cache(files, name), arrays[name], first[name])
+                for name in VIDEOS:
+                    deviations = (given[f"{name}{STD}"] for given in (arrays, first))
+                    check_alike(_cache(files, name), *deviations, most=MOST_DIFFERENT_STD)
             writer.add(arrays, {**clip_metadata(files), "start": 0})
             yield files.video_id
 
@@ -79,3 +100,30 @@ def _cache(files: ClipFiles, array: str) -> Path:
     if files.target is None:
         raise InputError(f"{files.row}: it has no recorded video, next to which its caches are.")
     return cache_of(files.target, array)
+
+
+def write_caches(config: ModelConfig, folder: Path, clips: Sequence[ClipFiles]) -> Iterator[str]:
+    """Write the caches of clips next to their recorded videos; yield the id of each.
+
+    `folder` holds the weights. Raises `InputError` for a model that does not draw latents, and for
+    clips that do not have its length.
+    """
+    check_cached(config)
+    networks = Networks.load(config, folder, only=config.cached_networks)
+    encode = CompiledFn(_moments, networks)
+    for files in clips:
+        triplet = load_triplet(files, config.video, grid=config.grid)
+        inputs = Inputs.of([triplet], config)
+        videos = np.stack([getattr(triplet, name)[None] for name in VIDEOS])
+        means, logvars, text = encode(videos, inputs.ids, inputs.ids_mask)
+        for name, mean, logvar in zip(VIDEOS, means, logvars, strict=True):
+            write_moments(_cache(files, name), np.asarray(mean[0]), np.asarray(logvar[0]))
+        write_pth(_cache(files, "text"), np.asarray(text[0]).astype(ml_dtypes.bfloat16))
+        yield files.video_id
+
+
+def _moments(encoders: Networks, videos: jax.Array, ids: jax.Array, mask: jax.Array) -> Any:
+    """Return means and log variances of the latents of each video, and embeddings of a prompt."""
+    codec: Any = encoders.vae
+    means, logvars = jax.lax.map(lambda video: codec.moments(to_model(video)), videos)
+    return means, logvars, encoders.text(ids, mask)
