@@ -135,7 +135,7 @@ def test_captions_of_a_column_cannot_be_chosen(clips, tmp_path):
         ("train/open/videos/00000.mp4\ntrain/open/videos/00000.mp4", "another line"),
         ("train/open/videos/00000.mp4\ntrain/open/00000.mp4", "in a folder videos"),
         ("train/open/videos/00000.mp4\ntrain/open/videos/7.mp4", "prompts_rewrite/7.txt"),
-        ("train/else/videos/00000.mp4", "--metadata"),
+        ("train/else/videos/00000.mp4", "and is in neither"),
         ("\n\n", "lists 0 clips"),
     ],
 )
