@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -47,8 +47,8 @@ from egosim_jax.train.update import (
     MAX_CONSECUTIVE_SKIPS,
     Programs,
     TrainState,
-    average,
     mean_metrics,
+    mean_validation,
 )
 from egosim_jax.types import InputError
 
@@ -123,6 +123,17 @@ class Latents:
         """Return batch `number`, from 0, of the shuffled endless sequence."""
         places = (divmod(p, len(self)) for p in range(number * size, (number + 1) * size))
         return self.take(np.array([order(len(self), seed, epoch)[row] for epoch, row in places]))
+
+    def one_pass(self, size: int) -> Iterator[dict[str, np.ndarray]]:
+        """Yield batches of all records in order; copies of the last one fill up, with weight 0."""
+        for start in range(0, len(self), size):
+            records = np.arange(start, start + size, dtype=np.int32)
+            weight = (records < len(self)).astype(np.float32)
+            yield {
+                **self.take(np.minimum(records, len(self) - 1)),
+                "record": records,
+                "weight": weight,
+            }
 
     def take(self, records: np.ndarray) -> dict[str, np.ndarray]:
         """Return some records as a batch; latents, which are float16 on disk, are float32."""
@@ -233,15 +244,11 @@ class BundleRun:
 
     def _validate(self, state: TrainState) -> dict[str, float]:
         test, size = self.data["test"], self.recipe.training.batch_size
-        count = max(1, len(test) // size)
-        rows = [
-            jax.device_get(self.programs.validate(state.eval_params, self.frozen, batch))
-            for batch in (
-                self._to_devices(test.take(np.arange(n * size, (n + 1) * size) % len(test)))
-                for n in range(count)
-            )
-        ]
-        return {f"validation_{name}": average(rows, name) for name in rows[0]}
+        metrics, _ = mean_validation(
+            self.programs.validate(state.eval_params, self.frozen, self._to_devices(batch))
+            for batch in test.one_pass(size)
+        )
+        return metrics
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         return {name: jax.device_put(value, self.sharding) for name, value in batch.items()}

@@ -13,12 +13,12 @@ the devices never wait for the host.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,7 +26,7 @@ from flax import nnx
 from jax.experimental import multihost_utils
 
 from egosim_jax.command import CommandExit, ExitCode
-from egosim_jax.data.loader import Loader, make_loader
+from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
@@ -38,11 +38,8 @@ from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
 from egosim_jax.train.page import TIMES, write_page
-from egosim_jax.train.update import Programs, Task, TrainState, average, mean_metrics
+from egosim_jax.train.update import Programs, Task, TrainState, mean_metrics, mean_validation
 from egosim_jax.types import InputError
-
-Use = Literal["train", "peek", "validate"]
-"""Use of the batches of a data set."""
 
 
 def train(
@@ -139,7 +136,7 @@ class Run:
     def compile(self) -> None:
         """Compile the update, unless the run is at its end, and check the room for checkpoints."""
         if max(self.checkpoints.steps, default=0) < self.training.steps:
-            with self.clock.phase("data"), closing(self._batches(self.source, "peek")) as peek:
+            with self.clock.phase("data"), closing(self._batches(self.source, peek=True)) as peek:
                 example = self._to_devices(next(peek))
             self.clock.flops = self.task.flops(self.training.batch_size)
             with self.clock.phase("compile"):
@@ -208,19 +205,21 @@ class Run:
         self.write(step, {**metrics, **self.clock.tick(step, self.training.steps)})
 
     def validate(self, shards: Path, step: int, state: TrainState) -> None:
-        """Write the validation metrics, means over the batches of `shards`."""
+        """Write the validation metrics, means over the readable records of `shards`."""
         self.watchdog.rest()
-        with (
-            self.clock.phase("validate"),
-            closing(self._batches(open_shards(shards), "validate")) as batches,
-        ):
-            rows = [
-                jax.device_get(
-                    self.programs.validate(state.eval_params, self.frozen, self._to_devices(batch))
-                )
+        with self.clock.phase("validate"):
+            source, params = open_shards(shards), state.eval_params
+            batches = validation_batches(source, self.task, self.training, self.sharding)
+            metrics, readable = mean_validation(
+                self.programs.validate(params, self.frozen, self._to_devices(batch))
                 for batch in batches
-            ]
-        self.write(step, {f"validation_{name}": average(rows, name) for name in rows[0]})
+            )
+        if (bad := len(source) - readable) > Loader.MAX_BAD:  # of all processes, who all stop
+            raise InputError(
+                f"{bad} of {len(source)} records of {shards} cannot be read: at most "
+                f"{Loader.MAX_BAD} may be damaged. Encode or pack them again. (--validation)"
+            )
+        self.write(step, metrics)
 
     def sample(self, samples: Samples, step: int, state: TrainState) -> None:
         """Generate and write sample clips."""
@@ -279,8 +278,8 @@ class Run:
         )
         return jax.jit(create, out_shardings=sharding, donate_argnums=0)(loaded)
 
-    def _batches(self, source: ShardReader | Mixture, use: Use = "train") -> Loader:
-        return make_batches(source, self.task, self.training, self.sharding, use)
+    def _batches(self, source: ShardReader | Mixture, *, peek: bool = False) -> Loader:
+        return make_batches(source, self.task, self.training, self.sharding, peek=peek)
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         return {
@@ -294,27 +293,37 @@ def make_batches(
     task: Task,
     training: TrainConfig,
     sharding: Any,
-    use: Use = "train",
+    *,
+    peek: bool = False,
 ) -> Loader:
-    """Return an iterator over this process's shard of each batch.
+    """Return an iterator over this process's shard of each batch, shuffled and endless.
 
-    To train, it shuffles and repeats the records; `peek` is the same without worker processes. To
-    validate, it makes one pass in order, over the records that fill a batch.
+    `peek` is the same without worker processes.
     """
-    once, size = use == "validate", training.batch_size
-    if once:
-        devices = parts("batch", sharding.mesh)
-        size = min(size, max(devices, len(source) // devices * devices))
-    index, count = process_shard(sharding, size)
+    index, count = process_shard(sharding, training.batch_size)
     return make_loader(
         source,
-        batch_size=size,
-        seed=0 if once else training.seed,
-        shuffle=not once,
-        repeat=not once,
+        batch_size=training.batch_size,
+        seed=training.seed,
         process_index=index,
         process_count=count,
-        workers=training.workers if use == "train" else 0,
+        workers=0 if peek else training.workers,
+        transform=task.examples(),
+    )
+
+
+def validation_batches(
+    source: ShardReader | Mixture, task: Task, training: TrainConfig, sharding: Any
+) -> Iterator[dict[str, np.ndarray]]:
+    """Return this process's shard of each batch of one pass (`one_pass`), of all records."""
+    devices = parts("batch", sharding.mesh)
+    size = min(training.batch_size, -(-len(source) // devices) * devices)
+    index, count = process_shard(sharding, size)
+    return one_pass(
+        source,
+        batch_size=size,
+        process_index=index,
+        process_count=count,
         transform=task.examples(),
     )
 

@@ -8,7 +8,7 @@ norm is far above its running mean; a skipped update changes no weight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
 
@@ -74,7 +74,7 @@ class Task(Protocol):
         ...
 
     def validate(self, networks: Any, batch: Batch) -> Metrics:
-        """Return deterministic metrics of a batch: fixed noise, the same at every call."""
+        """Return deterministic metrics of each sample, which depend on it and its `record` only."""
         ...
 
     def flops(self, samples: int) -> float:
@@ -247,12 +247,26 @@ def average(rows: Sequence[Mapping[str, np.ndarray]], name: str) -> float:
 def make_validation(
     task: Task, graph: nnx.GraphDef
 ) -> Callable[[nnx.State, nnx.State, Batch], Metrics]:
-    """Return the validation, a function of trained weights, frozen weights and batch."""
+    """Return the validation, a function of trained weights, frozen weights and batch.
+
+    It returns the sums of the metrics by the samples' `weight`, and that of the weights.
+    """
 
     def validate(params: nnx.State, frozen: nnx.State, batch: Batch) -> Metrics:
-        return task.validate(nnx.merge(graph, params, frozen), batch)
+        weight = batch["weight"]
+        metrics = task.validate(nnx.merge(graph, params, frozen), batch)
+        sums = {name: (weight * each).sum() for name, each in metrics.items()}
+        return {**sums, "weight": weight.sum()}
 
     return validate
+
+
+def mean_validation(rows: Iterable[Mapping[str, jax.Array]]) -> tuple[dict[str, float], int]:
+    """Return the means over the samples of all batches (`make_validation`), and their number."""
+    fetched = [jax.device_get(row) for row in rows]
+    totals = {name: sum(float(row[name]) for row in fetched) for name in fetched[0]}
+    samples = totals.pop("weight")
+    return {f"validation_{name}": total / samples for name, total in totals.items()}, int(samples)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,9 @@ positions for any number of processes. Worker processes share the positions in t
 A record that cannot be read is skipped, counted in `Loader.skipped` under its file and position,
 and replaced by the next one; more than `Loader.MAX_BAD` different ones stop the run.
 
+To validate, `one_pass` takes every record once, in order, and gives it a weight: 1, or 0 for what
+only fills a batch, so that all processes get as many batches.
+
 Of a mixture, position k is of the part whose share is furthest behind its weight, so that any long
 stretch of the sequence has the proportions of the weights.
 """
@@ -16,7 +19,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +40,7 @@ logger = logging.getLogger(__name__)
 LATENTS = ("target", "prior", "hands", "mask")
 """Arrays of a latents record with latent frames, rows and columns."""
 _THREADS = 4
+_READING = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=2 * _THREADS)
 
 Example = Mapping[str, np.ndarray]
 Transform = grain.transforms.RandomMap | grain.transforms.Map | Callable[[Example], Example] | None
@@ -50,38 +55,27 @@ def make_loader(
     process_count: int = 1,
     workers: int = 0,
     shuffle: bool = True,
-    repeat: bool = True,
     transform: Transform = None,
 ) -> Loader:
     """Return an iterator over this process's examples of each batch.
 
     A process gets `batch_size / process_count` examples of each batch. `transform` maps a record's
     arrays to an example, with random numbers if it is a `RandomMap`; examples also get `record`,
-    their index in the source. Without `repeat` the iterator ends after one pass and drops an
-    incomplete last batch; the weights of a mixture do not matter then. `workers` processes prepare
-    examples; 0 prepares them in threads of this process.
+    their index in the source. `workers` processes prepare examples; 0 prepares them in threads of
+    this process.
     """
     if batch_size < 1 or batch_size % process_count:
         raise InputError(
             f"A batch of {batch_size} cannot be shared by {process_count} processes: it must be a "
             "multiple of their number. (--batch-size)"
         )
-    if len(source) < batch_size and not repeat:
-        raise InputError(
-            f"{source.folder} holds {len(source)} records, fewer than one batch of {batch_size}."
-        )
-    mixed = isinstance(source, Mixture) and repeat
-    if isinstance(source, Mixture) and repeat:
+    mixed = isinstance(source, Mixture)
+    if isinstance(source, Mixture):
         positions = _mixed(source, seed, shuffle)
     else:
-        positions = _positions(source, seed, shuffle)
-        full_batches = slice(len(source) // batch_size * batch_size)
-        positions = positions.repeat() if repeat else positions[full_batches]
+        positions = _positions(source, seed, shuffle).repeat()
     examples = positions.random_map(_Read(source, transform), seed=seed if mixed else None)
-    mine = examples[process_index::process_count]
-    stream = mine.to_iter_dataset(
-        grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=2 * _THREADS)
-    )
+    stream = examples[process_index::process_count].to_iter_dataset(_READING)
     if workers:
         flags.FLAGS.mark_as_parsed()
         stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
@@ -97,11 +91,56 @@ def make_loader(
         "process_count": process_count,
         "workers": workers,
         "shuffle": shuffle,
-        "repeat": repeat,
     }
     if isinstance(source, Mixture):
         contract["weights"] = list(source.weights)
     return Loader(iter(batches), contract, skipped)
+
+
+def one_pass(
+    source: ShardReader | Mixture,
+    *,
+    batch_size: int,
+    process_index: int = 0,
+    process_count: int = 1,
+    transform: Transform = None,
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yield this process's examples of each batch of one pass, in order, with their `weight`.
+
+    Every readable record is there once with weight 1. Others, and what the last batch lacks, are
+    replaced by a copy of a readable one with weight 0, the same one on all processes. Raises
+    `InputError` if none of the first records can be read.
+    """
+    examples = _positions(source, 0, shuffle=False).random_map(_Read(source, transform))
+    filler = _first_readable(examples, source)
+    own = batch_size // process_count
+    with closing(iter(examples[process_index::process_count].to_iter_dataset(_READING))) as stream:
+        for _ in range(0, len(source), batch_size):
+            read = [next(stream, None) for _ in range(own)]
+            for bad in read:
+                if isinstance(bad, _Bad):
+                    logger.warning("skipping %s", bad.message)
+            kept = [example if isinstance(example, dict) else filler for example in read]
+            batch = {name: np.stack([example[name] for example in kept]) for name in filler}
+            weight = [isinstance(example, dict) for example in read]
+            yield {**batch, "weight": np.array(weight, np.float32)}
+
+
+def _first_readable(
+    examples: grain.MapDataset, source: ShardReader | Mixture
+) -> dict[str, np.ndarray]:
+    """Return the first example that is not a placeholder of a bad record."""
+    bad = []
+    for number in range(min(len(source), Loader.MAX_BAD + 1)):
+        example: Any = examples[number]
+        if not isinstance(example, _Bad):
+            return example
+        bad.append(example.message)
+    raise InputError(
+        f"None of the first {len(bad)} records of {source.folder} can be read: at most "
+        f"{Loader.MAX_BAD} of all, and not all, may be damaged. Encode or pack them again: "
+        f"{listing(bad)}"
+    )
 
 
 def _positions(source: ShardReader | Mixture, seed: int, shuffle: bool) -> grain.MapDataset:

@@ -39,10 +39,10 @@ from egosim_jax.io.weights import place
 from egosim_jax.metrics import lpips
 from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.sharding import batch_sharding, make_mesh
-from egosim_jax.train.loop import make_batches
+from egosim_jax.train.loop import make_batches, validation_batches
 from egosim_jax.train.recipes import TABLETOP, TABLETOP_VAE
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.update import Programs, Stage, TrainState
+from egosim_jax.train.update import Programs, Stage, TrainState, mean_validation
 from egosim_jax.types import InputError
 from tests.benchmarks.critic import Adversarial
 from tests.benchmarks.routing import Routing
@@ -228,14 +228,10 @@ def spend(settings: Settings, stage: Stage, data: Path, *, random: bool) -> Trai
     with jax.set_mesh(make_mesh(stage.training.mesh)):
         sharding = batch_sharding(jax.sharding.get_mesh())
         source = ShardReader(data / "test")
-        with closing(
-            make_batches(source, stage.task, stage.training, sharding, "validate")
-        ) as all_:
-            found = [
-                jax.device_get(programs.validate(state.eval_params, frozen, arrays(batch)))
-                for batch in all_
-            ]
-    means = {f"validation_{k}": float(np.mean([m[k] for m in found])) for k in found[0]}
+        means, _ = mean_validation(
+            programs.validate(state.eval_params, frozen, batch)
+            for batch in validation_batches(source, stage.task, stage.training, sharding)
+        )
     return Trained(networks, {**row, **means})
 
 

@@ -64,19 +64,26 @@ class Line:
         return jnp.square(error).mean(), {"ids": (places * batch["record"]).mean()}
 
     def validate(self, networks, batch):
-        return {"loss": jnp.square(networks(batch["x"]) - batch["y"]).mean()}
+        return {"loss": jnp.square(networks(batch["x"]) - batch["y"]).mean(axis=-1)}
 
     def flops(self, samples):
         return 6.0 * 4 * WIDTH * samples
 
 
-def write_points(folder: Path, *, huge: tuple[int, ...] = (), factor: float = 1e30) -> Path:
-    """Points of a line with some noise; those that are `huge` are far from it."""
+def write_points(
+    folder: Path,
+    *,
+    huge: tuple[int, ...] = (),
+    factor: float = 1e30,
+    unreadable: tuple[int, ...] = (),
+) -> Path:
+    """Points of a line with some noise; the `huge` are far from it, the `unreadable` are NaN."""
     rng = np.random.default_rng(0)
     kernel = rng.normal(size=(4, WIDTH))
     with ShardWriter(folder, kind="latents") as writer:
         for number in range(POINTS):
             x = rng.normal(size=4).astype(np.float32)
+            x = x * np.float32("nan") if number in unreadable else x
             y = (x @ kernel + 0.1 * rng.normal(size=WIDTH)).astype(np.float32)
             y = y * np.float32(factor) if number in huge else y
             arrays = {"x": x, "y": y, "number": np.array(number, np.int32)}

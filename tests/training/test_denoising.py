@@ -136,9 +136,21 @@ def test_a_model_of_zero_image_tokens_is_trained_and_validated_with_zeros(batch)
     loss, dit = seen(batch, model)
     np.testing.assert_array_equal(dit.image, np.zeros((2, 3, 32), np.float32))
     assert loss == seen(batch | {"image": jnp.zeros_like(given)}, model)[0]
-    Denoising(model=model).validate(Networks(dit=dit), batch)
+    Denoising(model=model).validate(Networks(dit=dit), batch | {"record": jnp.arange(2)})
     np.testing.assert_array_equal(dit.image, np.zeros((2, 3, 32), np.float32))
     np.testing.assert_array_equal(seen(batch | {"image": given}, model)[1].image, given)
+
+
+def test_a_validation_error_is_of_the_sample_and_its_record_alone(batch):
+    dit = Seen()
+    batch = batch | {"record": jnp.array([3, 8])}
+    both = Denoising(model=MODEL).validate(Networks(dit=dit), batch)
+    turned = {name: array[::-1] for name, array in batch.items()}
+    other = Denoising(model=MODEL).validate(Networks(dit=dit), turned)
+    assert set(both) == {"loss", "loss_0.2", "loss_0.5", "loss_0.8", "loss_0.97"}
+    for name in both:
+        np.testing.assert_allclose(other[name][::-1], both[name], rtol=1e-6)
+    assert both["loss"][0] != both["loss"][1]
 
 
 def test_a_lora_is_all_that_its_task_trains_and_the_rest_is_in_the_compute_dtype():

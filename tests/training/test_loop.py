@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
 from egosim_jax.command import CommandExit, ExitCode
+from egosim_jax.data.shards import ShardReader
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.loop import train
@@ -46,6 +48,28 @@ def test_the_loss_falls_and_the_time_spent_is_reported(points, tmp_path, capsys)
     assert f"curves, sample clips and settings: {tmp_path / 'index.html'}" in said
     assert "step 20 of 20" in (tmp_path / "index.html").read_text()
     assert json.loads((tmp_path / "times.json").read_text())["updates"] > 0
+
+
+@pytest.mark.parametrize("size", [1, 16, 64])
+def test_a_validation_has_all_records_whatever_the_batch(tmp_path, size):
+    """Forty points; in float32, whose sums are taken in another order."""
+    points = write_points(tmp_path / "points", unreadable=(POINTS - 1,))
+    fit(tmp_path / "run", points, validation=points, batch_size=size, steps=1)
+    begun = next(line["validation_loss"] for line in logged(tmp_path / "run"))
+    networks = Line().networks(nnx.Rngs(0))
+    errors = [
+        np.square(networks(jnp.asarray(record["x"])) - record["y"]).mean()
+        for record in (record.arrays for record in ShardReader(points))
+        if np.isfinite(record["x"]).all()
+    ]
+    assert len(errors) == POINTS - 1
+    assert begun == pytest.approx(np.mean(errors), rel=1e-6)
+
+
+def test_a_validation_with_too_many_damaged_records_stops_the_run(points, tmp_path):
+    bad = write_points(tmp_path / "points", unreadable=tuple(range(1, 18)))
+    with pytest.raises(InputError, match=r"17 of 40 records .* cannot be read"):
+        fit(tmp_path / "run", points, validation=bad)
 
 
 def test_an_update_that_is_not_finite_is_skipped_and_named(tmp_path, capsys):

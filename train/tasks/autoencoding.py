@@ -104,7 +104,7 @@ class Autoencoding:
         mse = self.squared_error(decoded, video)
         edge_loss = _edge_error(decoded, video)
         kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
-        psnr = _psnr(decoded, video)
+        psnr = _psnr(decoded, video).mean()
         metrics = {"mse": mse, "edge_loss": edge_loss, "kl": kl, "psnr": psnr}
         return decoded, mse + self.edge_weight * edge_loss + self.kl_weight * kl, metrics
 
@@ -119,7 +119,7 @@ class Autoencoding:
         return float("nan")
 
     def validate(self, networks: Any, batch: Batch) -> Metrics:
-        """Return the PSNR of the reconstruction from the mean latents."""
+        """Return the PSNR of each clip's reconstruction from the mean latents."""
         video = to_model(batch["video"])
         decoded = networks.decode_whole(networks.moments(video)[0])
         return {"psnr": _psnr(decoded, video)}
@@ -132,10 +132,12 @@ def _edge_error(a: Float[Array, "b f h w 3"], b: Float[Array, "b f h w 3"]) -> j
     return rows + columns
 
 
-def _psnr(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) -> jax.Array:
-    """Return the mean PSNR over clips in dB, of float frames clipped to [-1, 1]."""
+def _psnr(
+    decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
+) -> Float[Array, " b"]:
+    """Return the PSNR of each clip in dB, of float frames clipped to [-1, 1]."""
     error = jnp.square(jnp.clip(decoded, -1, 1) - video).mean(axis=(1, 2, 3, 4))
-    return (10 * jnp.log10(4.0 / jnp.maximum(error, 1e-10))).mean()
+    return 10 * jnp.log10(4.0 / jnp.maximum(error, 1e-10))
 
 
 def latent_statistics(vae: Any, videos: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

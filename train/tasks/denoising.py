@@ -126,18 +126,22 @@ class Denoising:
         return loss, {}
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
-        """Return the errors at fixed noise levels with fixed noise, under the full condition."""
+        """Return each sample's errors at fixed noise levels, under the full condition.
+
+        The noise is fixed by the number of the record, in whatever batch it is.
+        """
         target = batch["target"]
         condition = condition_of(networks, batch, self.model.zero_image(len(target)))
         denoise = _denoise(self.model, networks, condition, target)
-        noise = jax.random.normal(jax.random.key(0), target.shape)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), batch["record"])
+        noise = jax.vmap(lambda key: jax.random.normal(key, target.shape[1:]))(keys)
         errors = {
             f"loss_{sigma}": self.objective.loss_at(
                 self.model.process, denoise, target, noise, jnp.full(target.shape[:1], sigma)
-            ).mean()
+            )
             for sigma in VALIDATION_SIGMAS
         }
-        return {"loss": jnp.mean(jnp.stack(list(errors.values()))), **errors}
+        return {"loss": jnp.stack(list(errors.values())).mean(axis=0), **errors}
 
     def flops(self, samples: int) -> float:
         """Return the model FLOPs of an update, of the denoiser only, which has nearly all."""

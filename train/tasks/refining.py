@@ -110,18 +110,19 @@ class Refining(Autoencoding):
         """Return what `reconstruct` does, with the perceptual term of some frames in the loss."""
         decoded, loss, metrics = self.reconstruct(vae, video, key)
         if self.perceptual_weight:
-            metrics["lpips"] = _lpips(decoded[:, frames], video[:, frames])
+            metrics["lpips"] = _lpips(decoded[:, frames], video[:, frames]).mean()
             loss = loss + self.perceptual_weight * metrics["lpips"]
         return decoded, loss, metrics
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
-        """Return PSNR and LPIPS of the reconstruction from the mean latents."""
+        """Return PSNR and LPIPS of each clip's reconstruction from the mean latents."""
         vae: Any = networks.vae
         metrics = super().validate(vae, batch)
         if self.perceptual_weight:
             video = to_model(batch["video"])
             decoded = vae.decode_whole(vae.moments(video)[0])
-            metrics["lpips"] = _lpips(decoded.clip(-1, 1), video)
+            distances = _lpips(decoded.clip(-1, 1), video)
+            metrics["lpips"] = distances.reshape(video.shape[:2]).mean(axis=1)
         return metrics
 
 
@@ -132,7 +133,9 @@ def motion_weights(video: Float[Array, "b f h w 3"], weight: float) -> Float[Arr
     return weights / weights.mean(axis=(2, 3), keepdims=True)
 
 
-def _lpips(decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]) -> jax.Array:
-    """Return the mean distance between frames."""
+def _lpips(
+    decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
+) -> Float[Array, " n"]:
+    """Return the distances of all b f frames."""
     images = (x.reshape(-1, *x.shape[2:]) for x in (decoded, video))
-    return Lpips.load("alex").compare(*images).mean()
+    return Lpips.load("alex").compare(*images)

@@ -4,7 +4,7 @@ import grain
 import numpy as np
 import pytest
 
-from egosim_jax.data.loader import Loader, make_loader
+from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import DecodeWindow
@@ -59,9 +59,19 @@ def test_another_seed_gives_another_order(source):
     )
 
 
-def test_without_shuffle_and_repeat_it_is_one_pass_of_whole_batches(source):
-    loader = make_loader(source, batch_size=5, seed=0, shuffle=False, repeat=False)
-    assert [batch["record"].tolist() for batch in loader] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
+@pytest.mark.parametrize(("size", "processes"), [(5, 1), (4, 2), (20, 1), (16, 4), (32, 16)])
+def test_one_pass_has_every_record_once_on_as_many_batches_of_all_processes(
+    source, size, processes
+):
+    passes = [
+        list(one_pass(source, batch_size=size, process_index=p, process_count=processes))
+        for p in range(processes)
+    ]
+    assert [len(batches) for batches in passes] == [-(-RECORDS // size)] * processes
+    batches = [batch for batches in passes for batch in batches]
+    assert {len(batch["x"]) for batch in batches} == {size // processes}
+    seen = np.concatenate([batch["record"][batch["weight"] == 1] for batch in batches])
+    assert sorted(seen) == list(range(RECORDS))
 
 
 def test_two_processes_read_disjoint_halves_of_an_epoch(source):
@@ -165,6 +175,21 @@ def test_a_damaged_record_is_skipped_counted_and_named(damaged, workers):
     loader.close()
 
 
+def test_one_pass_gives_a_damaged_record_no_weight(damaged, caplog):
+    first, *_ = one_pass(damaged, batch_size=4)
+    assert first["record"].tolist() == [0, 0, 2, 3]
+    assert first["weight"].tolist() == [1, 0, 1, 1]
+    assert "record 1" in caplog.text
+
+
+def test_one_pass_over_records_of_which_none_can_be_read_is_refused(source):
+    def refuse(arrays):
+        raise InputError("no good")
+
+    with pytest.raises(InputError, match=r"(?s)None of the first 12 records.*no good"):
+        next(one_pass(source, batch_size=4, transform=refuse))
+
+
 def test_too_many_damaged_records_stop_the_run_with_their_names(source, monkeypatch):
     def refuse(arrays):
         raise InputError("no good")
@@ -200,11 +225,6 @@ def test_a_mistake_in_a_transform_is_not_taken_for_a_bad_record(source):
 def test_a_batch_that_processes_cannot_share_is_refused(source):
     with pytest.raises(InputError, match="A batch of 5 cannot be shared by 2 processes"):
         make_loader(source, batch_size=5, seed=0, process_count=2)
-
-
-def test_a_single_pass_over_less_than_a_batch_is_refused(source):
-    with pytest.raises(InputError, match="fewer than one batch"):
-        make_loader(source, batch_size=RECORDS + 1, seed=0, repeat=False)
 
 
 def test_a_window_is_cut_from_all_videos_alike(tmp_path):
