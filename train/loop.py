@@ -135,7 +135,8 @@ class Run:
 
     def compile(self) -> None:
         """Compile the update, unless the run is at its end, and check the room for checkpoints."""
-        if max(self.checkpoints.steps, default=0) < self.training.steps:
+        done, steps = max(self.checkpoints.steps, default=0), self.training.steps
+        if done < steps:
             with self.clock.phase("data"), closing(self._batches(self.source, peek=True)) as peek:
                 example = self._to_devices(next(peek))
             self.clock.flops = self.task.flops(self.training.batch_size)
@@ -143,7 +144,9 @@ class Run:
                 self.update = self.update.lower(self.programs.state, self.frozen, example).compile()
             seconds = self.clock.seconds["compile"]
             log0(f"compiled in {seconds:.1f} s{memory_summary(self.update)}")
-        self.checkpoints.check_room(self.programs.state)
+        every = self.training.save_every
+        saved = [step for step in range(done + 1, steps + 1) if step % every == 0 or step == steps]
+        self.checkpoints.check_room(self.programs.state, saved)
 
     def start(self, weights: Path | None) -> TrainState:
         """Return the state of the newest checkpoint, or the initial state."""

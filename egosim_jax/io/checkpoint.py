@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -41,7 +41,7 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, *, keep: int = 2, keep_every: int | None = None):
-        self.folder, self.keep = folder.absolute(), keep
+        self.folder, self.keep, self.keep_every = folder.absolute(), keep, keep_every
         policies = ocp.training.preservation_policies
         preserve: Any = [policies.LatestN(keep)]
         if keep_every is not None:
@@ -73,17 +73,24 @@ class Checkpoints:
         """Steps of the checkpoints, ascending."""
         return sorted(checkpoint.step for checkpoint in self._checkpointer.checkpoints)
 
-    def check_room(self, state: Any) -> None:
-        """Raise `InputError` unless the disk has room for the checkpoints that will be kept."""
+    def check_room(self, state: Any, saved: Sequence[int]) -> None:
+        """Raise `InputError` unless the disk has room for the checkpoints that will be kept.
+
+        `saved` are the steps at which there will be one.
+        """
         sizes = [leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)]
+        steps = [*self.steps, *saved]
+        every = self.keep_every
+        older = sum(every is not None and step % every == 0 for step in steps[: -self.keep])
         # The newest one is complete before the oldest one is deleted.
-        need = sum(sizes) * (self.keep + 1 - min(self.keep, len(self.steps)))
+        most = min(len(steps), older + self.keep + 1)
+        need = sum(sizes) * (most - len(self.steps))
         free = shutil.disk_usage(self.folder).free
         if free < need:
             raise InputError(
                 f"The disk of {self.folder} has {free / 1e9:.1f} GB free, and checkpoints will "
                 f"take {need / 1e9:.1f} GB: free space, keep fewer or choose another disk. "
-                "(--training.keep, --out)"
+                "(--training.keep, --training.keep-every, --out)"
             )
 
     def save(self, step: int, state: Any, data: Any) -> None:

@@ -165,8 +165,21 @@ def test_a_disk_without_room_is_refused_before_anything_is_saved(tmp_path, monke
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=12_000))
     checkpoints = Checkpoints(tmp_path, keep=2)
     with pytest.raises(InputError, match=r"--training.keep"):
-        checkpoints.check_room(abstract(state(1024)))
-    checkpoints.check_room(abstract(state(900)))
+        checkpoints.check_room(abstract(state(1024)), [10, 20, 30, 40])
+    checkpoints.check_room(abstract(state(900)), [10, 20, 30, 40])
+    checkpoints.check_room(abstract(state(1024)), [10, 20])
+    checkpoints.close()
+
+
+def test_the_disk_must_have_room_for_what_is_kept_every_so_often(tmp_path, monkeypatch):
+    """Keep 20, 40 and 60 of the steps 10 to 80, the newest two and, meanwhile, one more."""
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=6 * 4004 - 1))
+    checkpoints = Checkpoints(tmp_path, keep=2, keep_every=20)
+    steps = range(10, 90, 10)
+    with pytest.raises(InputError, match=r"--training.keep-every"):
+        checkpoints.check_room(abstract(state(1000)), steps)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=6 * 4004))
+    checkpoints.check_room(abstract(state(1000)), steps)
     checkpoints.close()
 
 
