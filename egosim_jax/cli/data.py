@@ -299,18 +299,19 @@ class Look:
 
     def run(self) -> int:
         """Draw the contact sheet of the chosen clips."""
-        import numpy as np
-
         from egosim_jax.data.inspect import choose_clips
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.data.sheet import draw_sheet
 
         check_counts({"--limit": self.limit, "--moments": self.moments, "--width": self.width})
-        reader = ShardReader(self.shards)
-        clips = choose_clips(reader, by=self.by, streams=self.streams, limit=self.limit)
-        last = (reader.manifest.spec or VideoSpec()).frames - 1
-        moments = np.linspace(0, last, self.moments).round().astype(int).tolist()
-        draw_sheet(clips, self.out, moments=moments, width=self.width)
+        clips = choose_clips(
+            ShardReader(self.shards),
+            by=self.by,
+            streams=self.streams,
+            limit=self.limit,
+            moments=self.moments,
+        )
+        draw_sheet(clips, self.out, moments=range(self.moments), width=self.width)
         print(self.out)
         return ExitCode.DONE
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
 
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.sheet import SheetClip
-from egosim_jax.data.transforms import decode_record, record_length
+from egosim_jax.data.transforms import decode_record, record_length, video_shape
 from egosim_jax.progress import track
 from egosim_jax.types import InputError, VideoSpec
 
@@ -26,31 +29,34 @@ class SplitStatistics:
 
 
 def choose_clips(
-    reader: ShardReader, *, by: Sequence[str], streams: Collection[str], limit: int
+    reader: ShardReader, *, by: Sequence[str], streams: Collection[str], limit: int, moments: int
 ) -> list[SheetClip]:
     """Decode some videos of the first clip of each combination of values of the columns `by`.
 
-    Without columns, decode those of the first `limit` clips. Raises `InputError` for latents and
-    for unknown columns.
+    Without columns, decode those of the first `limit` clips, in their order. Of each, `moments`
+    frames are kept, from the first to the last, at the clip's own size. Raises `InputError` for
+    latents and for unknown columns.
     """
     if reader.manifest.kind == "latents":
         raise InputError(f"{reader.folder} holds latents, not videos or frames. (--shards)")
-    spec = reader.manifest.spec or VideoSpec()
-    clips: dict[object, SheetClip] = {}
+    clips: dict[tuple[Any, ...], SheetClip] = {}
     for number, record in enumerate(track(reader, "reading", total=len(reader))):
         extra = record.metadata.get("extra", {})
         unknown = [name for name in by if name not in extra]
         if unknown:
             known = ", ".join(sorted(extra)) or "none"
             raise InputError(f"The clips have no column {', '.join(unknown)}; known: {known}.")
-        key = tuple(extra[name] for name in by) if by else number
+        key = tuple(extra[name] for name in by) if by else (number,)
         if key not in clips:
+            frames, height, width = video_shape(record.arrays)
+            spec = VideoSpec(frames=frames, height=height, width=width)
+            places = np.linspace(0, frames - 1, moments).round().astype(int)
             videos = decode_record(record.arrays, spec)
-            shown = [videos[name] for name in streams if name in videos]
+            shown = [videos[name][places] for name in streams if name in videos]
             clips[key] = SheetClip(str(record.metadata.get("prompt", "")), shown)
         if len(clips) == limit:
             break
-    return [clips[key] for key in sorted(clips, key=str)]
+    return [clips[key] for key in sorted(clips)]
 
 
 def split_statistics(reader: ShardReader) -> dict[str, SplitStatistics]:

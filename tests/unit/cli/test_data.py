@@ -16,7 +16,7 @@ from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.grid import VideoGrid
 from egosim_jax.io.atomic import LOCK, hold_folder
-from egosim_jax.io.video import read_video
+from egosim_jax.io.video import decode_video, read_video
 from egosim_jax.types import InputError, VideoSpec
 
 
@@ -136,6 +136,19 @@ def test_look_draws_the_first_clip_of_each_value_of_a_column(make_clips, out, tm
         drawn = np.asarray(picture)
     assert drawn.shape == (4 * (16 + 16), 3 * 32, 3)
     np.testing.assert_array_equal(drawn[16:32, 32:64], ShardReader(out)[0].arrays["hands"][2])
+
+
+def test_look_draws_videos_of_any_length_and_size_in_their_order(make_clips, out, tmp_path):
+    Pack(metadata=make_clips(clips=12, frames=5), out=out).run()
+    sheet = tmp_path / "sheet.png"
+    Look(shards=out, out=sheet, streams=("prior",), moments=2, width=48).run()
+    with Image.open(sheet) as picture:
+        drawn = np.asarray(picture)
+    assert drawn.shape == (12 * (16 + 32), 2 * 48, 3)
+    for number, record in enumerate(ShardReader(out)):
+        last = decode_video(record.arrays["prior"].tobytes(), name="prior").frames[4]
+        top = number * (16 + 32) + 16
+        np.testing.assert_array_equal(drawn[top : top + 32, 48:], last)
 
 
 def test_look_refuses_unknown_columns_and_latents(clips, out, tmp_path):
