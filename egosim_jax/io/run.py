@@ -75,13 +75,18 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Return the commit of the checkout that this package runs from, if it is one."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    """Return the commit of the checkout that this package runs from, if it is one.
+
+    A package that is installed in an environment within another checkout has none.
+    """
+    root = Path(__file__).resolve().parents[2]
+    command = ["git", "-C", str(root), "rev-parse", "--show-toplevel", "HEAD"]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
-    return result.stdout.strip()
+    toplevel, commit = result.stdout.splitlines()
+    return commit if Path(toplevel).resolve() == root else None
 
 
 def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> None:

@@ -1,11 +1,13 @@
 """Run folders: the config and environment that they record, and the runs that they refuse."""
 
 import json
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from egosim_jax.io import run
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.types import InputError, VideoSpec
 
@@ -27,6 +29,22 @@ def test_a_new_folder_records_config_and_environment(tmp_path):
                                  "fps": 16}  # fmt: skip
     environment = json.loads((tmp_path / "run/environment.json").read_text("utf-8"))
     assert environment["packages"]["jax"]
+
+
+def test_the_commit_is_of_this_packages_checkout_alone(tmp_path, monkeypatch):
+    def git(*arguments: str) -> str:
+        user = ("-c", "user.name=a", "-c", "user.email=a@example.com")
+        command = ["git", "-C", str(tmp_path), *user, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    git("init")
+    git("commit", "--allow-empty", "--message", "Begin")
+    monkeypatch.setattr(run, "__file__", str(tmp_path / "egosim_jax/io/run.py"))
+    assert run._commit() == git("rev-parse", "HEAD")
+    installed = tmp_path / ".venv/lib/egosim_jax/io"
+    installed.mkdir(parents=True)
+    monkeypatch.setattr(run, "__file__", str(installed / "run.py"))
+    assert run._commit() is None
 
 
 def test_the_same_config_continues_the_folder(tmp_path):
