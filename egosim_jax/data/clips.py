@@ -32,7 +32,7 @@ from egosim_jax.data.transforms import (
     resize_mask,
 )
 from egosim_jax.grid import WAN_GRID, VideoGrid
-from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.decoding import Damage, Decoding
 from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
@@ -56,15 +56,18 @@ def write_clips(
 
     Each clip has a folder; the entries of `extra` become columns. All clips must have the same
     columns, and either all or none a target video. `append` keeps the rows of other clips in an
-    existing metadata.csv. Raises `InputError` for an id that is not a valid file name.
+    existing metadata.csv, also of those that other processes append meanwhile. Raises `InputError`
+    for an id that is not a valid file name.
     """
     path = folder / "metadata.csv"
-    rows: dict[str, dict[str, str]] = {}
-    if append and path.exists():
-        rows = {row.get("video_id", ""): row for _, row in csv_rows(path)}
-    for triplet in triplets:
-        rows[triplet.video_id] = write_clip(folder, triplet, fps=fps)
-    write_table(path, list(rows.values()))
+    rows = {triplet.video_id: write_clip(folder, triplet, fps=fps) for triplet in triplets}
+    if not append:
+        write_table(path, list(rows.values()))
+        return path
+    with lock_folder(folder, wait=True):
+        before = csv_rows(path) if path.exists() else ()
+        rows = {row.get("video_id", ""): row for _, row in before} | rows
+        write_table(path, list(rows.values()))
     return path
 
 

@@ -170,19 +170,20 @@ _held: dict[Path, tuple[int, int]] = {}
 
 
 @contextmanager
-def lock_folder(folder: Path, *, option: str = "--out") -> Iterator[None]:
+def lock_folder(folder: Path, *, option: str = "--out", wait: bool = False) -> Iterator[None]:
     """Keep other processes from writing to a folder, which is made if need be.
 
-    The same process may lock a folder again. Raises `InputError` naming the process that has it.
+    The same process may lock a folder again. Raises `InputError` naming the process that has it,
+    or, with `wait`, waits for it.
     """
-    hold_folder(folder, option=option)
+    hold_folder(folder, option=option, wait=wait)
     try:
         yield
     finally:
         _release(folder.resolve())
 
 
-def hold_folder(folder: Path, *, option: str = "--out") -> None:
+def hold_folder(folder: Path, *, option: str = "--out", wait: bool = False) -> None:
     """Lock a folder (`lock_folder`) until the process ends."""
     folder.mkdir(parents=True, exist_ok=True)
     key = folder.resolve()
@@ -193,7 +194,7 @@ def hold_folder(folder: Path, *, option: str = "--out") -> None:
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(key / LOCK, flags, 0o666)
     try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.lockf(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip() or "unknown"
         os.close(descriptor)

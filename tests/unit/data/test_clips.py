@@ -3,6 +3,8 @@
 import dataclasses
 import io
 import os
+import subprocess
+import sys
 
 import av
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from PIL import Image
 
 from egosim_jax.data.clips import check_clip, load_triplet, write_clips
-from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.metadata import csv_rows, read_metadata
 from egosim_jax.io.images import read_image
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.types import InputError, Triplet, VideoSpec
@@ -210,6 +212,30 @@ def test_clips_that_were_written_are_read_back(tmp_path):
         for name in ("prior", "hands", "target"):
             gap = getattr(back, name).astype(float) - getattr(triplet, name)
             assert np.abs(gap).mean() < 6
+
+
+def test_rows_that_processes_append_at_once_are_all_kept(tmp_path):
+    program = """if True:
+        import sys, numpy as np
+        from pathlib import Path
+        from egosim_jax.data import clips
+        from egosim_jax.types import Triplet
+        names = ("ego_prior_video", "hand_keypoint_video", "first_frame", "prompt")
+        row = dict.fromkeys(names, "a")
+        clips.write_clip = lambda folder, triplet, fps: {**row, "video_id": triplet.video_id}
+        for number in range(20):
+            video = np.zeros((1, 16, 16, 3), np.uint8)
+            triplet = Triplet(
+                video_id=f"{sys.argv[2]}_{number}", prompt="", prior=video, hands=video,
+                mask=video[..., 0], first_frame=video[0],
+            )
+            clips.write_clips(Path(sys.argv[1]), [triplet], fps=8, append=True)
+    """
+    commands = [[sys.executable, "-c", program, str(tmp_path), name] for name in "ab"]
+    running = [subprocess.Popen(command) for command in commands]
+    assert [process.wait() for process in running] == [0, 0]
+    ids = {row["video_id"] for _, row in csv_rows(tmp_path / "metadata.csv")}
+    assert ids == {f"{name}_{number}" for name in "ab" for number in range(20)}
 
 
 def cut_off(path):
