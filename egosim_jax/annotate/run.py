@@ -78,12 +78,13 @@ def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
     """Measure a video and choose its clips, or load the result; report one that is not readable.
 
-    Raises `InputError` if the file was replaced by another one since.
+    One that had no clips is measured again. Raises `InputError` if the file of another one was
+    replaced since.
     """
     path = out / WORK / "scans" / f"{source.name}.json"
     size = 0 if source.path.is_dir() else source.path.stat().st_size
-    if path.exists():
-        written = read_json(path)
+    written = read_json(path) if path.exists() else None
+    if written is not None and "problem" not in written:
         if written["path"] != str(source.path) or written["bytes"] != size:
             raise InputError(
                 f"{source.path} is not the file that {out} was made of: {written['path']} of "

@@ -141,6 +141,16 @@ def test_one_bad_video_does_not_stop_the_others(video, tmp_path):
     assert "not a readable video" in (tmp_path / "out/index.html").read_text()
 
 
+def test_a_bad_video_that_was_replaced_is_annotated(tmp_path):
+    bad, out = tmp_path / "cup.mp4", tmp_path / "out"
+    bad.write_bytes(b"not a video")
+    assert "problem" in annotate([bad], out)["videos"]["cup"]
+    write(bad, textured_video(17))
+    report = annotate([bad], out)
+    assert report["clips"]["done"] == 1
+    assert "problem" not in report["videos"]["cup"]
+
+
 def test_another_configuration_in_the_same_folder_is_refused(video, tmp_path):
     annotate([video], tmp_path / "out")
     with pytest.raises(InputError, match=r"scale: recorded 'None', given '0\.5'"):
