@@ -46,6 +46,8 @@ Policy = Literal["strict", "lenient"]
 SAME_RATE = 1.01
 """Largest ratio of the frame rates of a clip's videos that are taken as equal, as 24 and 23.976."""
 DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
+LENIENT = "egosim generate --lenient"
+"""Option with the lenient policy, of the one command that has it."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
@@ -209,7 +211,7 @@ def load_triplet(
                 f"{quote_path(path)}"
             )
             if policy == "strict":
-                raise InputError(f"{why}. (--lenient repeats the last frame)")
+                raise InputError(f"{why}. ({LENIENT} repeats the last frame)")
             logger.warning("%s; the last frame is repeated", why)
         arrays[name] = fit_length(frames, spec.frames)
     image = _read_first_frame(files.first_frame, decoding)
@@ -275,17 +277,17 @@ def _length_problems(
 ) -> list[str]:
     counts = {name: info.frames for name, info in probed.items()}
     if len(set(counts.values())) > 1:
-        return [f"the frame counts disagree: {_table(counts)}. (--lenient repeats or cuts)"]
+        return [f"the frame counts disagree: {_table(counts)}. ({LENIENT} repeats or cuts)"]
     problems = []
     for count in set(taken.values()):
         try:
-            grid.check_frames(count, what="a clip", fix="--lenient cuts or repeats frames")
+            grid.check_frames(count, what="a clip", fix=f"{LENIENT} cuts or repeats frames")
         except InputError as error:
             problems.append(str(error))
         if count < needed:
             problems.append(
                 f"{count} frames are fewer than the {needed} that the window needs. "
-                "(--lenient repeats the last frame)"
+                f"({LENIENT} repeats the last frame)"
             )
     return problems
 
@@ -293,10 +295,10 @@ def _length_problems(
 def _size_problems(sizes: dict[str, tuple[int, int]], unit: int) -> list[str]:
     written = {name: f"{width}x{height}" for name, (height, width) in sizes.items()}
     if len(set(written.values())) > 1:
-        return [f"the sizes disagree: {_table(written)}. (--lenient resizes each)"]
+        return [f"the sizes disagree: {_table(written)}. ({LENIENT} resizes each)"]
     return [
-        f"{width}x{height} pixels: width and height must be multiples of {unit}. (--lenient "
-        "resizes)"
+        f"{width}x{height} pixels: width and height must be multiples of {unit}. "
+        f"({LENIENT} resizes)"
         for height, width in set(sizes.values())
         if height % unit or width % unit
     ]

@@ -104,8 +104,9 @@ def test_every_missing_file_is_listed(files):
 
 def test_strict_refuses_frame_counts_that_disagree(files):
     shorten(files.hands, 5)
-    with pytest.raises(InputError, match="disagree: prior 9, hands 5, mask 9, target 9"):
+    with pytest.raises(InputError, match="disagree: prior 9, hands 5, mask 9, target 9") as caught:
         load_triplet(files, NATIVE)
+    assert "(egosim generate --lenient repeats or cuts)" in str(caught.value)
 
 
 def test_strict_refuses_a_count_that_is_not_4k_plus_1(make_clips):
