@@ -326,7 +326,8 @@ class Page:
         self._tell("Saved", f"{folder}: episode.zip and episode.mp4")
 
     def _begin(self) -> None:
-        self.played = self._new(int(self._seed.value))
+        before, self.played = self.played, self._new(int(self._seed.value))
+        before.close()
         self._open()
 
 

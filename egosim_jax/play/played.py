@@ -101,6 +101,10 @@ class Played:
         ]
         self.at = 0
 
+    def close(self) -> None:
+        """End the thread that films the true world, once it has filmed what was asked of it."""
+        self._filming.shutdown(wait=False)
+
     @property
     def now(self) -> Moment:
         """Moment from which the next clip continues."""

@@ -57,6 +57,14 @@ def test_frames_are_shown_as_they_come_and_truth_is_filmed(played):
     assert np.abs(moved).max() > 0.01
 
 
+def test_a_closed_episode_films_what_was_asked_of_it_and_no_more(played):
+    carry(played)
+    played.close()
+    assert played.now.truth.result()[1].shape == played.now.frames.shape
+    with pytest.raises(RuntimeError, match="after shutdown"):
+        carry(played)
+
+
 def test_a_moment_is_returned_to_and_its_future_is_forgotten_by_another_clip(played):
     first = snapshot.fingerprint(played.state)
     carry(played)
