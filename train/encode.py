@@ -6,14 +6,21 @@ its folder, OUT/parts/00000, ...; process p of n writes parts p, p + n, ... and 
 exist. When all parts exist, the first process renames their shards into OUT and writes the
 manifest. Its provenance names the config, the source's fingerprint and the hashes of the networks
 that made the arrays.
+
+A clip that cannot be read is skipped, with all its windows. OUT/parts/00000.json lists the windows
+of a part and those that were skipped, since which windows there are depends on what can be read; a
+part of other windows is written again. The provenance has the record numbers of skipped clips.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
@@ -30,8 +37,10 @@ from jax.sharding import Mesh
 from egosim_jax.conditioning.posterior import STD
 from egosim_jax.conditioning.posterior import posterior as moments_of
 from egosim_jax.conditioning.video import to_model
+from egosim_jax.data.loader import Loader
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.mixing import MIXTURE, read_mixture
+from egosim_jax.data.records import RecordError
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.static import check_static
 from egosim_jax.data.transforms import decode_record, record_length
@@ -45,7 +54,10 @@ from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import CompiledFn, shard_params
 from egosim_jax.progress import track
 from egosim_jax.sharding import check_batch
+from egosim_jax.train.encoded_parts import PartWindows, Window
 from egosim_jax.types import InputError, Triplet, check_counts
+
+logger = logging.getLogger(__name__)
 
 MAX_PARTS = 100_000
 """Maximum number of shards, whose names have five digits."""
@@ -53,9 +65,6 @@ OLD_MASK = {"packing": "space", "channels": 4}
 """Packing and channels of the mask in shards that do not name them."""
 READ_THREADS = min(8, os.cpu_count() or 1)
 """Threads that read clips while others are encoded."""
-
-Window = tuple[int, int]
-"""Record number and first frame of a window."""
 
 
 class Encoding:
@@ -142,8 +151,9 @@ def mask_of(config: ModelConfig) -> dict[str, Any]:
 def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     """Return every window of `frames` frames, `stride` apart.
 
-    Reads every record of encoded videos. Raises `InputError` if a clip is shorter than a window, or
-    if the records are not clips with their target video.
+    Reads every record of encoded videos; one that cannot be read has one window. Raises
+    `InputError` if a clip is shorter than a window, or if the records are not clips with their
+    target video.
     """
     manifest = source.manifest
     if manifest.kind == "latents" or "target" not in manifest.arrays:
@@ -154,7 +164,11 @@ def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     known = manifest.arrays["prior"].shape[0] if manifest.kind == "frames" else None
     found = []
     for number in range(len(source)):
-        last = (known or record_length(source[number].arrays)) - frames
+        try:
+            last = (known or record_length(source[number].arrays)) - frames
+        except InputError:  # reported when the window is read
+            found.append((number, 0))
+            continue
         if last < 0:
             raise InputError(
                 f"{source.name(number)} has {last + frames} frames; a window needs {frames}."
@@ -177,14 +191,17 @@ def encode_shards(
     process_index: int | None = None,
     process_count: int | None = None,
     verb: str = "encoding",
-) -> None:
+) -> list[int]:
     """Write the latents shards of every window of `source`, resuming an interrupted run.
+
+    Returns the record numbers of the clips that cannot be read, which are skipped.
 
     `folder` holds the weights, of which `config.cached_networks` are read. Each batch is split over
     `mesh`, which has devices of this process only. All processes call this with the same arguments
     and share `out`, which is complete when they return. `decoding` is recorded in the manifest;
     that of frames was chosen when they were packed. Raises `InputError` if `out` was started with
-    another config, source, stride or number of windows per shard, or with other encoders.
+    another config, source, stride or number of windows per shard, or with other encoders, and if
+    more clips cannot be read than a training tolerates.
     """
     check_counts({"--stride": stride, "--batch-size": batch_size, "--shard-windows": shard_windows})
     if mesh is not None:
@@ -209,7 +226,7 @@ def encode_shards(
     _wait_for_all("opened")  # early: the first collective must not come late
     if (out / MANIFEST).exists():
         shutil.rmtree(out / "parts", ignore_errors=True)
-        return
+        return read_manifest(out).provenance.get("skipped", [])
     todo = list(batches(windows(source, frames=config.video.frames, stride=stride), shard_windows))
     if len(todo) > MAX_PARTS:
         raise InputError(
@@ -220,7 +237,7 @@ def encode_shards(
     missing = {
         parts[number]: todo[number]
         for number in range(index, len(todo), count)
-        if not (parts[number] / MANIFEST).exists()
+        if not PartWindows.read(parts[number]).is_done(parts[number], todo[number])
     }
     if missing:
         networks = Networks.load(config, folder, only=config.cached_networks, mesh=mesh)
@@ -229,10 +246,24 @@ def encode_shards(
         for _ in track(progress, verb, total=sum(map(len, missing.values()))):
             pass
     _wait_for_all("encoded")
+    lists = {part: PartWindows.read(part) for part in parts}
+    skipped = sorted({number for listed in lists.values() for number, _ in listed.skipped})
+    written = [part for part, listed in lists.items() if not listed.is_empty]
+    _check_skipped(skipped, source, none_left=not written)
+    _wait_for_all("counted")
     if index == 0:
-        gather(parts, out)
+        gather(written, out, provenance={"skipped": skipped} if skipped else {})
         shutil.rmtree(out / "parts")
     _wait_for_all("gathered")
+    return skipped
+
+
+def _check_skipped(skipped: Collection[int], source: ShardReader, *, none_left: bool) -> None:
+    if none_left or len(skipped) > Loader.MAX_BAD:
+        raise InputError(
+            f"{len(skipped)} of {len(source)} clips of {source.folder} cannot be read: at most "
+            f"{Loader.MAX_BAD}, and not all, may be damaged. Pack them again. (--shards)"
+        )
 
 
 def _packed_decoding(source: ShardReader, decoding: Decoding) -> Decoding:
@@ -264,24 +295,49 @@ def _write(
     provenance: Mapping[str, Any],
     decoding: Decoding,
 ) -> Iterator[Window]:
-    """Write part after part, yielding each window once it is encoded."""
+    """Write part after part, yielding each window once it is encoded or skipped."""
     jobs = [(part, batch) for part, todo in parts.items() for batch in batches(todo, batch_size)]
-    spec = encode.config.video
+    damaged: set[int] = set()
     for part, group in groupby(_read(source, jobs, encode.config, decoding), key=itemgetter(0)):
-        with ShardWriter(
-            part,
-            kind="latents",
-            spec=spec,
-            grid=encode.config.grid,
-            provenance=provenance,
-            shard_bytes=2**62,
-        ) as writer:
-            for _, clips in group:
+        skipped: list[Window] = []
+        shutil.rmtree(part, ignore_errors=True)  # of other windows
+        with ExitStack() as stack:
+            writer: ShardWriter | None = None
+            for _, read in group:
+                for bad in (each for each in read if isinstance(each, _Bad)):
+                    skipped.append(bad.window)
+                    if bad.window[0] not in damaged:
+                        logger.warning("skipping %s", bad.message)
+                    damaged.add(bad.window[0])
+                    _check_skipped(damaged, source, none_left=False)
+                    yield bad.window
+                clips = [each for each in read if not isinstance(each, _Bad)]
+                if not clips:
+                    continue
+                writer = writer or stack.enter_context(
+                    ShardWriter(
+                        part,
+                        kind="latents",
+                        spec=encode.config.video,
+                        grid=encode.config.grid,
+                        provenance=provenance,
+                        shard_bytes=2**62,
+                    )
+                )
                 fill = [clips[-1]] * (batch_size - len(clips))
                 examples = encode([triplet for _, _, triplet in (*clips, *fill)])
                 for (window, metadata, _), arrays in zip(clips, examples, strict=False):
                     writer.add(arrays, {**metadata, "start": window[1]})
                     yield window
+            PartWindows(parts[part], skipped).write(part)
+
+
+@dataclass(frozen=True)
+class _Bad:
+    """A window of a clip that cannot be read."""
+
+    window: Window
+    message: str
 
 
 Example = tuple[Window, Mapping[str, Any], Triplet]
@@ -292,10 +348,10 @@ def _read(
     jobs: Sequence[tuple[Path, Sequence[Window]]],
     config: ModelConfig,
     decoding: Decoding,
-) -> Iterator[tuple[Path, list[Example]]]:
+) -> Iterator[tuple[Path, list[Example | _Bad]]]:
     """Yield the clips of each job, read while the job before is encoded."""
     with ThreadPoolExecutor(READ_THREADS) as pool:
-        before: tuple[Path, list[Future[Example]]] | None = None
+        before: tuple[Path, list[Future[Example | _Bad]]] | None = None
         for part, batch in jobs:
             now = part, [pool.submit(_clip, source, window, config, decoding) for window in batch]
             if before is not None:
@@ -305,15 +361,19 @@ def _read(
             yield before[0], [future.result() for future in before[1]]
 
 
-def _clip(source: ShardReader, window: Window, config: ModelConfig, decoding: Decoding) -> Example:
+def _clip(
+    source: ShardReader, window: Window, config: ModelConfig, decoding: Decoding
+) -> Example | _Bad:
     number, start = window
-    record = source[number]
     try:
+        record = source[number]
         arrays: dict[str, Any] = decode_record(
             record.arrays, config.video, start=start, decoding=decoding
         )
+    except RecordError as error:
+        return _Bad(window, str(error))
     except InputError as error:
-        raise InputError(f"{source.name(number)}: {error}") from error
+        return _Bad(window, f"{source.name(number)}: {error}")
     metadata = record.metadata
     names = {name: str(metadata.get(name, "")) for name in ("video_id", "prompt")}
     return window, metadata, Triplet(**names, **arrays)

@@ -127,10 +127,10 @@ class Pack:
 class Encode:
     """Encode shards of clips once, so that training reads latents and embeddings.
 
-    Every window of a clip becomes a record. The same command resumes an interrupted one. Several
-    processes share the work, each with its own devices and all with the same OUT: start them with
-    Slurm or Open MPI, or set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID for
-    each. Prints the folder.
+    Every window of a clip becomes a record. A clip that cannot be read is reported and skipped
+    (exit code 3). The same command resumes an interrupted one. Several processes share the work,
+    each with its own devices and all with the same OUT: start them with Slurm or Open MPI, or set
+    JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each. Prints the folder.
     """
 
     config: str
@@ -164,12 +164,13 @@ class Encode:
         from egosim_jax.train.encode import encode_shards
 
         share_with_jax()
+        source = ShardReader(self.shards)
         with launched_context():
             mesh = make_mesh(MeshConfig(data=-1, fsdp=1), jax.local_devices())
-            encode_shards(
+            skipped = encode_shards(
                 configs.get(self.config).at(self.weights),
                 self.weights,
-                source=ShardReader(self.shards),
+                source=source,
                 out=self.out,
                 stride=self.stride,
                 batch_size=mesh.size if self.batch_size is None else self.batch_size,
@@ -177,8 +178,10 @@ class Encode:
                 shard_windows=self.shard_windows,
                 decoding=self.decoding,
             )
+        for number in skipped:
+            print(f"skipped: {source.name(number)}", file=sys.stderr)
         print(self.out)
-        return ExitCode.DONE
+        return ExitCode.PARTIAL if skipped else ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -193,12 +193,14 @@ def _merge(
     return merged
 
 
-def gather(parts: Sequence[Path], out: Path) -> Manifest:
+def gather(
+    parts: Sequence[Path], out: Path, *, provenance: Mapping[str, Any] | None = None
+) -> Manifest:
     """Concatenate folders of shards into one by renaming their files; write its manifest last.
 
-    All parts were written with the same kind, spec and provenance. The same call resumes an
-    interrupted one. Raises `InputError` naming missing parts, and shards that differ from the
-    manifest of their part.
+    All parts were written with the same kind, spec and provenance, to which `provenance` is added.
+    The same call resumes an interrupted one. Raises `InputError` naming missing parts, and shards
+    that differ from the manifest of their part.
     """
     missing = [part.name for part in parts if not (part / MANIFEST).exists()]
     if missing:
@@ -221,7 +223,13 @@ def gather(parts: Sequence[Path], out: Path) -> Manifest:
                 problems.append(f"{problem}: remove {part} to write it again")
     if problems:
         raise InputError(f"{out} cannot be concatenated: {listing(problems)}.")
-    manifest = dataclasses.replace(read_manifest(parts[0]), arrays=arrays, shards=tuple(shards))
+    manifest = read_manifest(parts[0])
+    manifest = dataclasses.replace(
+        manifest,
+        arrays=arrays,
+        shards=tuple(shards),
+        provenance={**manifest.provenance, **(provenance or {})},
+    )
     write_manifest(out, manifest)
     return manifest
 

@@ -4,10 +4,12 @@ import dataclasses
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,9 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data import manifest
 from egosim_jax.data.check import check
+from egosim_jax.data.loader import Loader
 from egosim_jax.data.manifest import MANIFEST, read_manifest
+from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
@@ -65,10 +69,10 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ShardReader:
     return ShardReader(write_clips(tmp_path_factory.mktemp("clips"), CONFIG.video))
 
 
-def encode(source: ShardReader, weights: Path, out: Path, **options) -> None:
+def encode(source: ShardReader, weights: Path, out: Path, **options) -> list[int]:
     """Twelve windows in three shards of five, five and two."""
     fixed = {"stride": 1, "batch_size": 2, "shard_windows": 5}
-    encode_shards(CONFIG, weights, source=source, out=out, **{**fixed, **options})
+    return encode_shards(CONFIG, weights, source=source, out=out, **{**fixed, **options})
 
 
 @pytest.fixture(scope="module")
@@ -227,6 +231,50 @@ def test_what_cannot_be_encoded_is_refused(encoded, source, weights, tmp_path):
         encode(short, weights, tmp_path / "b")
     with pytest.raises(InputError, match="--batch-size must be at least 1"):
         encode(source, weights, tmp_path / "c", batch_size=0)
+
+
+def damage(source: ShardReader, numbers: Collection[int], folder: Path) -> ShardReader:
+    """A copy of a source with a flipped byte in some records."""
+    shutil.copytree(source.folder, folder)
+    path = folder / source.manifest.shards[0].file
+    data = bytearray(path.read_bytes())
+    for number in numbers:
+        data[data.index(to_bytes(source[number])[-100:])] ^= 0xFF
+    path.write_bytes(data)
+    return ShardReader(folder)
+
+
+def test_a_damaged_clip_is_skipped_and_named(encoded, source, weights, tmp_path, caplog):
+    """Its four windows are in the first part and in the second one.
+
+    Others have other places in their batches, in float32.
+    """
+    bad = damage(source, [1], tmp_path / "bad")
+    assert encode(bad, weights, tmp_path / "out") == [1]
+    assert "bad/shard-00000.array_record, record 1" in caplog.text
+    reader, whole = ShardReader(tmp_path / "out"), ShardReader(encoded)
+    assert reader.manifest.provenance["skipped"] == [1]
+    assert [record.metadata["video_id"] for record in reader] == ["clip_0"] * 4 + ["clip_2"] * 4
+    found, expected = reader[4].arrays["target"], whole[8].arrays["target"]
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    assert encode(bad, weights, tmp_path / "out") == [1]
+
+
+def test_a_part_of_a_damaged_clip_alone_has_no_shard(source, weights, tmp_path):
+    bad = damage(source, [1], tmp_path / "bad")
+    for process in (1, 0):
+        shared = {"shard_windows": 4, "process_index": process, "process_count": 2}
+        assert encode(bad, weights, tmp_path / "out", **shared) == [1]
+    assert [shard.records for shard in read_manifest(tmp_path / "out").shards] == [4, 4]
+
+
+def test_too_many_damaged_clips_are_refused(source, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(Loader, "MAX_BAD", 1)
+    with pytest.raises(InputError, match=r"2 of 3 clips of .* cannot be read: at most 1"):
+        encode(damage(source, [0, 2], tmp_path / "bad"), weights, tmp_path / "out")
+    monkeypatch.setattr(Loader, "MAX_BAD", 3)
+    with pytest.raises(InputError, match=r"3 of 3 clips of .* and not all"):
+        encode(damage(source, [0, 1, 2], tmp_path / "none"), weights, tmp_path / "out2")
 
 
 def test_a_part_that_lost_its_bytes_is_named(source, weights, tmp_path):
