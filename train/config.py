@@ -179,6 +179,11 @@ class Recipe(ABC):
     def run(self) -> int:
         """Train, or run the preflight, and return the exit code."""
         if self.preflight is None:
+            for option, given in {"--json": self.json, "--no-search": not self.search}.items():
+                if given:
+                    raise InputError(
+                        f"{option} has no effect without --preflight: give it, or leave this out."
+                    )
             for stage in self.stages().values():
                 stage.training.check_packages()
             share_with_jax()

@@ -87,6 +87,11 @@ class Simulate:
 
         check_counts({"--clips": self.clips, "--steps": self.steps})
         check_seed(self.seed)
+        if self.update == "none" and self.perception != Simulate.perception:
+            raise InputError(
+                f"--perception {self.perception} has no effect with --update none: give --update "
+                "full, or leave this out."
+            )
         share_with_jax()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)

@@ -103,6 +103,12 @@ def test_only_a_training_needs_paths(args, said, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--json", "--no-search"])
+def test_an_option_of_the_report_is_refused_by_a_training(option, capsys):
+    assert egosim_train(["debug", option]) == 2
+    assert f"{option} has no effect without --preflight" in capsys.readouterr().err
+
+
 @pytest.fixture
 def room(monkeypatch):
     """Compile nothing: what fits is what is said here, and what was tried can be read."""

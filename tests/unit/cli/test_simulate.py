@@ -1,7 +1,10 @@
 """`egosim simulate`: the table of scores."""
 
+import pytest
+
 from egosim_jax.cli import simulate
 from egosim_jax.metrics.loop import MEASURES
+from egosim_jax.types import InputError
 
 
 def test_clips_with_other_ground_truth_have_empty_cells(capsys):
@@ -15,3 +18,8 @@ def test_clips_with_other_ground_truth_have_empty_cells(capsys):
     table = capsys.readouterr().out
     for text in (MEASURES[names[0]][0], MEASURES[names[1]][0], "1: lift", "2: drop", "3: wave"):
         assert text in table
+
+
+def test_a_perception_of_a_state_that_is_kept_is_refused():
+    with pytest.raises(InputError, match="oracle has no effect with --update none"):
+        simulate.Simulate(perception="oracle", update="none").run()
