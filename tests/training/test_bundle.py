@@ -91,6 +91,13 @@ def trained(written, tmp_path_factory):
     return out
 
 
+def test_a_validation_has_every_record_once_in_batches_of_one_size(written):
+    batches = list(Latents(written, "test").one_pass(2))
+    assert [batch["record"].tolist() for batch in batches] == [[0, 1], [2, 3], [4, 5]]
+    assert [batch["weight"].tolist() for batch in batches] == [[1, 1], [1, 1], [1, 0]]
+    assert {len(batch["target"]) for batch in batches} == {2}
+
+
 def losses(out: Path) -> list[float]:
     return [line["loss"] for line in logged(out) if "loss" in line]
 
