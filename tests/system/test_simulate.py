@@ -22,7 +22,8 @@ from egosim_jax.types import SceneState, VideoSpec
 
 def simulate(weights: Path, out: Path, *more: str) -> int:
     fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out), "--clips", "2"]
-    return main(["simulate", *fixed, "--perception", "oracle", *more])
+    perception = [] if "--update" in more else ["--perception", "oracle"]
+    return main(["simulate", *fixed, *perception, *more])
 
 
 @pytest.fixture(scope="module")
