@@ -298,7 +298,7 @@ class BatchJob:
         try:
             clips = self._clips(generator, triplets, seeds)
         except NonFiniteError as error:
-            bad = {n for n in error.places if n < len(loaded)}
+            bad = {min(n, len(loaded) - 1) for n in error.places}  # the last one fills up
             problem = "The latents of the clip are not finite (NaN or infinity)."
             failed = [(windows[n], problem) for n in sorted(bad)]
             for window, _ in failed:

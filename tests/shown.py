@@ -1,11 +1,17 @@
 """Networks without layers, by which a generated clip shows one of its conditions."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 from einops import reduce, repeat
 from flax import nnx
 
+from egosim_jax.data.clips import write_clips
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.data.windows import windows_of
 from egosim_jax.networks import Networks
+from egosim_jax.testing import random_triplet, tiny_model
 
 CELL, STRIDE = 8, 4
 
@@ -60,6 +66,27 @@ def networks(model, part):
     where, noisy = model.layout.slice(part), model.layout.count("noisy")
     dit = Denoiser(slice(where.start - noisy, where.stop - noisy), model.image_tokens)
     return Networks(dit=dit, vae=Codec(), text=Text(model.text.dim))
+
+
+MODEL = tiny_model(image=None, dit=replace(tiny_model().dit, image_dim=None), steps=1)
+"""Model of one Euler step, whose condition has no image."""
+
+
+def show_hands(monkeypatch):
+    """Replace the networks of batch jobs of `MODEL`: a clip ends as bright as its hands."""
+    uncached(monkeypatch)
+    made = networks(MODEL, "hands")
+    monkeypatch.setattr("egosim_jax.batch.Networks.random", lambda config, *, seed: made)
+
+
+def windows_of_hands(folder, grays, **changes):
+    """Write a clip of `MODEL` for each gray of its hands; return their windows."""
+    clip = replace(random_triplet(MODEL.video), **changes)
+    clips = [
+        replace(clip, video_id=name, hands=np.full_like(clip.hands, gray))
+        for name, gray in grays.items()
+    ]
+    return windows_of(read_metadata(write_clips(folder, clips, fps=8)), (0,))
 
 
 def uncached(monkeypatch):

@@ -219,9 +219,9 @@ class ToDwm:
 
     def _cached_model(self) -> ModelConfig | None:
         """Return the model whose caches are asked for, if any."""
+        if self.caches is None and self.weights is None:
+            return None
         if self.caches is None or self.weights is None:
-            if self.caches is None and self.weights is None:
-                return None
             raise InputError(
                 f"Caches are made by a model with its weights: give both, not --caches "
                 f"{self.caches} with --weights {self.weights}. (--caches, --weights)"

@@ -1,41 +1,26 @@
 """Batch generation, by networks without layers that show the hands."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from egosim_jax.batch import BatchJob
-from egosim_jax.data.clips import write_clips
-from egosim_jax.data.metadata import read_metadata
-from egosim_jax.data.windows import read_results, windows_of
+from egosim_jax.data.windows import read_results
 from egosim_jax.generator import Generator, NonFiniteError
 from egosim_jax.io.video import read_video
-from egosim_jax.testing import random_triplet, tiny_model
+from egosim_jax.testing import random_triplet
 from tests import shown
-
-MODEL = tiny_model(image=None, dit=replace(tiny_model().dit, image_dim=None), steps=1)
 
 
 @pytest.fixture(autouse=True)
 def generated_clips_show_the_hands(monkeypatch):
-    shown.uncached(monkeypatch)
-    made = shown.networks(MODEL, "hands")
-    monkeypatch.setattr("egosim_jax.batch.Networks.random", lambda config, *, seed: made)
+    shown.show_hands(monkeypatch)
 
 
 def windows(folder, **grays):
-    """Write a clip for each gray of its hands; return their windows."""
-    clip = random_triplet(MODEL.video)
-    clips = [
-        replace(clip, video_id=name, hands=np.full_like(clip.hands, gray), target=clip.prior)
-        for name, gray in grays.items()
-    ]
-    return windows_of(read_metadata(write_clips(folder, clips, fps=8)), (0,))
+    return shown.windows_of_hands(folder, grays, target=random_triplet(shown.MODEL.video).prior)
 
 
 def job(out, **changes):
-    return BatchJob(model=MODEL, out=out, weights=None, **changes)
+    return BatchJob(model=shown.MODEL, out=out, weights=None, **changes)
 
 
 def brightness(path):

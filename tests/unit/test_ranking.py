@@ -1,7 +1,6 @@
 """Ranking of candidate actions."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +9,7 @@ from PIL import Image
 from egosim_jax import ranking
 from egosim_jax.batch import BatchJob
 from egosim_jax.cli.__main__ import main
-from egosim_jax.data.clips import write_clips
-from egosim_jax.data.metadata import read_metadata
-from egosim_jax.data.windows import windows_of
 from egosim_jax.perception.networks.xclip import prepare
-from egosim_jax.testing import random_triplet, tiny_model
 from egosim_jax.types import InputError
 from tests import shown
 
@@ -25,30 +20,18 @@ def test_the_candidate_with_the_highest_mean_score_is_first():
     assert found[0].score == pytest.approx(0.3)
 
 
-MODEL = tiny_model(image=None, dit=replace(tiny_model().dit, image_dim=None), steps=1)
-
-
 @pytest.fixture(autouse=True)
 def generated_clips_show_the_hands(monkeypatch):
-    """Replace the networks: a clip ends as bright as the hands of its candidate."""
-    shown.uncached(monkeypatch)
-    made = shown.networks(MODEL, "hands")
-    monkeypatch.setattr("egosim_jax.batch.Networks.random", lambda config, *, seed: made)
+    shown.show_hands(monkeypatch)
 
 
 def candidates(folder, **grays):
-    """Write a candidate for each gray of its hands; return their windows."""
-    clip = random_triplet(MODEL.video)
-    clips = [
-        replace(clip, video_id=name, hands=np.full_like(clip.hands, gray))
-        for name, gray in grays.items()
-    ]
-    return windows_of(read_metadata(write_clips(folder, clips, fps=8)), (0,))
+    return shown.windows_of_hands(folder, grays)
 
 
 def jobs(out):
     return [
-        BatchJob(model=MODEL, out=out / str(s), weights=None, seed=s, skip_existing=True)
+        BatchJob(model=shown.MODEL, out=out / str(s), weights=None, seed=s, skip_existing=True)
         for s in (0, 1)
     ]
 
