@@ -332,11 +332,16 @@ class FromTabletop(FromScratch):
     """Train a small model from scratch on scenes of the tabletop world, a quarter with a robot."""
 
     help_groups: ClassVar[HelpGroups] = {
-        "data": ("held_out", "black_cloths", "attempts", "rollouts", "rollout_clips", "twins"),
+        "data": (
+            "first_scene", "held_out", "black_cloths", "attempts", "rollouts", "rollout_clips",
+            "twins",
+        ),
         **FromScratch.help_groups,
-    }
+    }  # fmt: skip
     scenes: int = 1000
     """Scenes to train on, two clips of each."""
+    first_scene: int = FIRST_TRAINED
+    """Seed of the first of these scenes; other scenes train given weights further."""
     held_out: int = 48
     """Scenes to validate on, one clip of each."""
     black_cloths: int | None = None
@@ -352,7 +357,15 @@ class FromTabletop(FromScratch):
     """True: static twins and hands as meshes, as DWM is conditioned on, of human hands alone."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for rollouts without a model that makes them, or of static twins."""
+        """Raise `InputError` for scenes that are held out, and for rollouts that cannot be made.
+
+        Those need a model that makes them, and have no static twins.
+        """
+        if self.first_scene < FIRST_TRAINED:
+            raise InputError(
+                f"Scenes of seeds below {FIRST_TRAINED} are held out: --first-scene must be at "
+                f"least {FIRST_TRAINED}, not {self.first_scene}."
+            )
         if self.twins and self.rollouts is not None:
             raise InputError(
                 f"{self.rollouts} scenes of rollouts cannot have static twins, which show each "
@@ -366,7 +379,7 @@ class FromTabletop(FromScratch):
 
     def frames(self, out: Path) -> Mapping[str, Path]:
         """Make the clips of all splits."""
-        first, last = FIRST_TRAINED, FIRST_TRAINED + self.scenes
+        first, last = self.first_scene, self.first_scene + self.scenes
         frames = {
             "train": self._make("train", range(first, last), 2, out),
             "test": self._make("test", range(self.held_out), 1, out),
