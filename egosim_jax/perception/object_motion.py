@@ -10,9 +10,9 @@ refined by `pose_refinement`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -33,6 +33,9 @@ from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState
 TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Joints that grasp: thumb, index and middle finger; both jaws of a gripper."""
 
+MIN_HELD = 2
+"""Fewest frames between a grasp and a release."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrackObjects:
@@ -40,15 +43,17 @@ class TrackObjects:
 
     reach_m: float = 0.06
     """An object is a candidate if a fingertip comes this near to it, in meters."""
+    opening_tolerance_m: float = 0.01
+    """Fingertips that hold something change their distance by less than this, in meters."""
     min_points: int = 30
     """Fewest points of an object, and of a surface around it."""
     compared_points: int = 150
     """About how many points of an object are compared in a trial."""
     min_visible: float = 0.2
     """Smallest visible fraction of the compared points."""
-    max_cost_ratio: float = 0.8
+    max_cost_ratio: float = 0.9
     """A motion is accepted if its cost is at most this fraction of the cost of resting."""
-    min_improvement: float = 5.0
+    min_improvement: float = 2.0
     """A motion is accepted if it costs less than resting by this much, in 8-bit levels."""
     prompt_prior: float = 0.9
     """Factor on the costs of an object that the prompt names."""
@@ -112,7 +117,7 @@ def estimate_object_motion(
                     best, action.cameras, state, shown, hidden, config.refinement, config.color
                 )
                 before = found.get(best.model.number)
-                if before is None or best.cost < before.cost:
+                if before is None or best.change < before.change:
                     found[best.model.number] = best
     return list(found.values())
 
@@ -127,18 +132,19 @@ def _best(
 ) -> ObjectMotion | None:
     """Return the accepted motion of least cost among the candidates of one hand."""
     best: ObjectMotion | None = None
+    holds = _holds(joints_m[:, TIPS[action.kind]], config)
     for number in _near_tips(joints_m, action.kind, state, config):
         model = object_model(number, state, config)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
         still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
         rest = _cost(model, still, action.cameras, shown, hidden, config)
-        least = min(config.max_cost_ratio * rest, rest - config.min_improvement)
-        for grasped, released, path in _paths(joints_m[:, PALM[action.kind]], model.plane[:3]):
+        most = min(config.max_cost_ratio * rest, rest - config.min_improvement)
+        for grasped, released, path in _paths(joints_m[:, PALM[action.kind]], model.plane[:3], holds):
             cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
-            if cost < least and (best is None or cost < best.cost):
+            if cost < most and (best is None or cost - rest < best.change):
                 best = ObjectMotion(
-                    model=model, grasped=grasped, released=released, path=path, cost=cost
+                    model=model, grasped=grasped, released=released, path=path, change=cost - rest
                 )
     return best
 
@@ -196,8 +202,29 @@ def _support_plane(
     return np.array(plane)
 
 
+def _holds(
+    tips_m: Float[np.ndarray, "f j 3"], config: TrackObjects
+) -> list[tuple[int, int]]:
+    """Return pairs of frames at which a hand may have grasped and released something rigid.
+
+    What is held keeps the fingertips apart: between both frames their distance stays as it is, from
+    a closing of the hand, or the first frame, to an opening, or the last. A hand that never closes
+    may have pushed between any two frames.
+    """
+    opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+    pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
+    if np.ptp(opening) <= config.opening_tolerance_m:
+        return pairs
+    steady = [
+        (g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= config.opening_tolerance_m
+    ]
+    return [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
+
+
 def _paths(
-    palm_m: Float[np.ndarray, "f j 3"], normal: Float[np.ndarray, " 3"]
+    palm_m: Float[np.ndarray, "f j 3"],
+    normal: Float[np.ndarray, " 3"],
+    holds: Sequence[tuple[int, int]],
 ) -> Iterator[tuple[int, int, Float[np.ndarray, "f 4 4"]]]:
     """Yield frame of the grasp, frame of the release, and motion, for each of the couplings."""
     rigid = np.stack([umeyama(palm_m[0], frame) for frame in palm_m])
@@ -209,11 +236,10 @@ def _paths(
         for other in (upright, sliding):
             other[frame, :3, 3] = center[frame] - other[frame, :3, :3] @ center[0]
     frames = range(len(palm_m))
-    for grasped, released in product(frames, frames):
-        if released - grasped >= 2:
-            when = np.clip(frames, grasped, released)
-            for motion in (sliding, upright, rigid):
-                yield grasped, released, motion[when] @ invert(motion[grasped])
+    for grasped, released in holds:
+        when = np.clip(frames, grasped, released)
+        for motion in (sliding, upright, rigid):
+            yield grasped, released, motion[when] @ invert(motion[grasped])
 
 
 def _twist(
