@@ -1,17 +1,18 @@
 """Motion of held objects, found by analysis by synthesis: the one that explains the colors best.
 
 An object that was grasped moves with the hand. Candidates are every object that a fingertip comes
-near, every pair of frames in which it may have been grasped and released, and three couplings to
-the palm: translation only, translation with rotation about the normal of the supporting surface,
-and the full rigid motion. The cost of a candidate is the mean difference between the object's
-colors and those of the clip where it would be visible. The end of the best candidate is then
-refined by `pose_refinement`.
+near, the pairs of frames between which the fingers may have held something (`_holds`), and three
+couplings to the palm: translation only, translation with rotation about the normal of the
+supporting surface, and the full rigid motion. The cost of a candidate is the mean difference
+between the object's colors and those of the clip where it would be visible; the best is the one
+that most improves on the object at rest. Its end is then refined by `pose_refinement`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -65,7 +66,9 @@ class TrackObjects:
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with those predicted."""
-    refinement: Refinement = field(default_factory=Refinement)
+    refinement: Refinement = field(
+        default_factory=partial(Refinement, deviation_m=0.005, deviation_deg=5.0)
+    )
     """Refinement of the object's last pose."""
 
     def __post_init__(self) -> None:
@@ -107,19 +110,20 @@ def estimate_object_motion(
     pixels that hands cover. A hand that is missing in any frame is ignored.
     """
     shown = _smooth(clip.frames, config.blur_px)
-    found: dict[int, ObjectMotion] = {}
+    found: dict[int, tuple[float, ObjectMotion]] = {}
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
         if np.isfinite(joints).all():
             best = _best(joints, action, state, shown, hidden, config)
             if best is not None:
-                best = refine_pose(
-                    best, action.cameras, state, shown, hidden, config.refinement, config.color
+                change, motion = best
+                motion = refine_pose(
+                    motion, action.cameras, state, shown, hidden, config.refinement, config.color
                 )
-                before = found.get(best.model.number)
-                if before is None or best.change < before.change:
-                    found[best.model.number] = best
-    return list(found.values())
+                number = motion.model.number
+                if number not in found or change < found[number][0]:
+                    found[number] = change, motion
+    return [motion for _, motion in found.values()]
 
 
 def _best(
@@ -129,9 +133,13 @@ def _best(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> ObjectMotion | None:
-    """Return the accepted motion of least cost among the candidates of one hand."""
-    best: ObjectMotion | None = None
+) -> tuple[float, ObjectMotion] | None:
+    """Return the accepted candidate of one hand that explains most, after the change of its cost.
+
+    The change is relative to the object at rest: an object of the color of the table costs little
+    wherever it is.
+    """
+    best: tuple[float, ObjectMotion] | None = None
     holds = _holds(joints_m[:, TIPS[action.kind]], config)
     for number in _near_tips(joints_m, action.kind, state, config):
         model = object_model(number, state, config)
@@ -140,12 +148,13 @@ def _best(
         still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
         rest = _cost(model, still, action.cameras, shown, hidden, config)
         most = min(config.max_cost_ratio * rest, rest - config.min_improvement)
-        for grasped, released, path in _paths(joints_m[:, PALM[action.kind]], model.plane[:3], holds):
+        for grasped, released, path in _paths(
+            joints_m[:, PALM[action.kind]], model.plane[:3], holds
+        ):
             cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
-            if cost < most and (best is None or cost - rest < best.change):
-                best = ObjectMotion(
-                    model=model, grasped=grasped, released=released, path=path, change=cost - rest
-                )
+            if cost < most and (best is None or cost - rest < best[0]):
+                motion = ObjectMotion(model=model, grasped=grasped, released=released, path=path)
+                best = cost - rest, motion
     return best
 
 
@@ -202,23 +211,20 @@ def _support_plane(
     return np.array(plane)
 
 
-def _holds(
-    tips_m: Float[np.ndarray, "f j 3"], config: TrackObjects
-) -> list[tuple[int, int]]:
+def _holds(tips_m: Float[np.ndarray, "f j 3"], config: TrackObjects) -> list[tuple[int, int]]:
     """Return pairs of frames at which a hand may have grasped and released something rigid.
 
     What is held keeps the fingertips apart: between both frames their distance stays as it is, from
-    a closing of the hand, or the first frame, to an opening, or the last. A hand that never closes
-    may have pushed between any two frames.
+    a closing of the hand, or the first frame, to an opening, or the last. A hand that never closes,
+    or is never steady, may have moved something between any two frames.
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
     if np.ptp(opening) <= config.opening_tolerance_m:
         return pairs
-    steady = [
-        (g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= config.opening_tolerance_m
-    ]
-    return [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
+    steady = [(g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= config.opening_tolerance_m]
+    longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
+    return longest or pairs
 
 
 def _paths(

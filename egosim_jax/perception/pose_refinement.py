@@ -50,10 +50,10 @@ class Refinement:
     """Translation step of each round in meters."""
     steps_deg: tuple[float, ...] = (12.0, 6.0, 3.0)
     """Rotation step of each round in degrees."""
-    deviation_m: float = 0.005
-    """Distance from where the hand put the object that must explain 1 level more, in meters."""
-    deviation_deg: float = 5.0
-    """Rotation that must explain 1 level more, in degrees."""
+    deviation_m: float | None = None
+    """Translation that must explain 1 level more, in meters, if the path is well known."""
+    deviation_deg: float | None = None
+    """Rotation that must explain 1 level more, in degrees, if the path is well known."""
     min_frames: int = 3
     """Fewest frames at the end of the clip that are compared."""
     margin: float = 0.03
@@ -94,8 +94,6 @@ class ObjectMotion:
     """Frame of the release."""
     path: Float[np.ndarray, "f 4 4"]
     """Motion in the world relative to the pose before the clip, frame by frame."""
-    change: float
-    """Cost relative to that of resting, in 8-bit levels; negative if the motion explains more."""
 
 
 def refine_pose(
@@ -118,7 +116,10 @@ def refine_pose(
     share = np.clip(
         (np.arange(len(best.path)) - best.grasped) / (best.released - best.grasped), 0, 1
     )
-    scale = np.array([*[config.deviation_m] * 3, np.radians(config.deviation_deg)])
+    meters, degrees = (
+        deviation or np.inf for deviation in (config.deviation_m, config.deviation_deg)
+    )
+    scale = np.array([meters, meters, meters, np.radians(degrees)])
     change, least = np.zeros(4), scene.cost(best.path[frames], color)
     for meters, degrees in zip(config.steps_m, config.steps_deg, strict=True):
         steps = np.diag([meters, meters, meters, np.radians(degrees)])

@@ -10,6 +10,7 @@ are those of the object in its pose of that frame. The last pose is refined by `
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from egosim_jax.geometry import cameras_in_object_frame, invert, project, transform
 from egosim_jax.perception.object_motion import TrackObjects, object_model
 from egosim_jax.perception.pipeline import Observation
-from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion, refine_pose
+from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion, Refinement, refine_pose
 from egosim_jax.rendering.reference import splat
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
@@ -44,7 +45,7 @@ class TrackMasks:
     """Error of depth, as a fraction of it, that counts as much as a pixel."""
     point_px: int = 2
     """Size of the points with which the object is drawn, in pixels."""
-    model: TrackObjects = field(default_factory=TrackObjects)
+    model: TrackObjects = field(default_factory=partial(TrackObjects, refinement=Refinement()))
     """Supporting planes, comparison of colors, and refinement of the last pose."""
 
     def __post_init__(self) -> None:
@@ -187,7 +188,7 @@ class TrackMasks:
         first, last = (int(f) for f in np.flatnonzero(moving)[[0, -1]])
         grasped = max(0, first - 1)
         motion = ObjectMotion(
-            model=model, grasped=grasped, released=max(last, grasped + 1), path=path, cost=np.inf
+            model=model, grasped=grasped, released=max(last, grasped + 1), path=path
         )
         shown = clip.frames.astype(np.float32)
         refined = refine_pose(

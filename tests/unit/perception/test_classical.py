@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from egosim_jax.geometry import transform
+from egosim_jax.geometry import invert, transform
 from egosim_jax.perception.classical import ClassicalConfig, HandMasks, hand_silhouette
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.state.fuse import fuse
@@ -42,6 +43,19 @@ def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
     gaps = np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)
     assert np.percentile(gaps, 95) < 0.01
     assert np.linalg.norm(there.mean(axis=0) - points.mean(axis=0)) > 0.1
+
+
+@pytest.mark.parametrize("sigma_px", [2.0, 3.0])
+def test_a_blurred_object_ends_where_the_hand_put_it(clip, sigma_px):
+    blurred = np.stack([cv2.GaussianBlur(frame, (0, 0), sigma_px) for frame in clip.frames])
+    found = (
+        ClassicalConfig()
+        .build()(Clip(frames=blurred, fps=8), to_action(clip), clip.state)
+        .world_from_object[clip.body_ids[clip.target]]
+    )
+    true = clip.world_from_body[clip.target]
+    gap = (found[-1] @ invert(found[0]) - true[-1] @ invert(true[0])) @ true[0][:, 3]
+    assert np.linalg.norm(gap) < 0.01
 
 
 def test_the_table_under_a_moved_object_is_revealed(clip, found):
