@@ -72,10 +72,11 @@ class TrackObjects:
     """Refinement of the object's last pose."""
 
     def __post_init__(self) -> None:
-        """Check that the numbers of points and the blur are positive."""
+        """Check that the numbers of points, the tolerance and the blur are positive."""
         check_counts({"min_points": self.min_points, "compared_points": self.compared_points})
-        if self.blur_px <= 0:
-            raise InputError(f"blur_px must be positive, not {self.blur_px}.")
+        for name in ("opening_tolerance_m", "blur_px"):
+            if getattr(self, name) <= 0:
+                raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation

@@ -62,12 +62,15 @@ class Refinement:
     """Size of the drawn points in pixels."""
 
     def __post_init__(self) -> None:
-        """Check that each round has both steps, and the counts."""
+        """Check that each round has both steps, the deviations, and the counts."""
         if len(self.steps_m) != len(self.steps_deg):
             raise InputError(
                 f"steps_m {self.steps_m} and steps_deg {self.steps_deg} must have one step per "
                 "round each."
             )
+        for name in ("deviation_m", "deviation_deg"):
+            if (value := getattr(self, name)) is not None and value <= 0:
+                raise InputError(f"{name} must be positive, or None for any, not {value}.")
         check_counts({"min_frames": self.min_frames, "point_px": self.point_px})
 
 
