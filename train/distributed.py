@@ -12,16 +12,20 @@ interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall (docs/sec
 from __future__ import annotations
 
 import ipaddress
+import itertools
 import os
 import socket
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 from jax._src import xla_bridge
+from jax.experimental import multihost_utils
 
+from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.types import InputError
 
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
@@ -29,6 +33,9 @@ NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 FOREVER_S = 10**8
 """Heartbeat timeout of a run of one process, which may be suspended for long, in seconds."""
+
+_questions = itertools.count(1)
+"""Numbers of the calls of `is_preempted`, the same in all processes."""
 
 
 @contextmanager
@@ -53,6 +60,21 @@ def distributed_context() -> Iterator[None]:
         yield
     finally:
         jax.distributed.shutdown()
+
+
+def is_preempted() -> bool:
+    """Return whether to save and stop: True once, soon after any process of the run got SIGTERM.
+
+    All processes must call this equally often, and are told at the same call. False outside of
+    `distributed_context`, where the signal ends the process.
+    """
+    return multihost_utils.reached_preemption_sync_point(next(_questions))
+
+
+def stop_if_preempted(out: Path) -> None:
+    """End a run of one process that got SIGTERM; called where the same command resumes it."""
+    if is_preempted():
+        raise CommandExit(f"{out}: stopped; run the same command again", ExitCode.RESUBMIT)
 
 
 def launched_context() -> AbstractContextManager[None]:

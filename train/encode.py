@@ -54,6 +54,7 @@ from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.program import CompiledFn, shard_params
 from egosim_jax.progress import track
 from egosim_jax.sharding import check_batch
+from egosim_jax.train.distributed import stop_if_preempted
 from egosim_jax.train.encoded_parts import PartWindows, Window
 from egosim_jax.types import InputError, Triplet, check_counts
 
@@ -244,7 +245,8 @@ def encode_shards(
         encode = Encoding(config, networks, mesh)
         progress = _write(encode, missing, source, batch_size, provenance, decoding)
         for _ in track(progress, verb, total=sum(map(len, missing.values()))):
-            pass
+            if jax.process_count() == 1:
+                stop_if_preempted(out)
     _wait_for_all("encoded")
     lists = {part: PartWindows.read(part) for part in parts}
     skipped = sorted({number for listed in lists.values() for number, _ in listed.skipped})

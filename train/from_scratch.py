@@ -22,7 +22,7 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import Products
 from egosim_jax.progress import track
 from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
-from egosim_jax.train.distributed import require_single_process
+from egosim_jax.train.distributed import require_single_process, stop_if_preempted
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError, check_counts
 
@@ -302,6 +302,7 @@ class FromClips(FromScratch):
             for problem in track(progress, f"packing {split}", total=len(items)):
                 if problem:
                     print(f"skipped: {problem}", file=sys.stderr)
+                stop_if_preempted(out)
         return frames
 
 
@@ -411,5 +412,5 @@ class FromTabletop(FromScratch):
             workers, states = 1, OwnRollouts.of(self.config, self.weights)
         scenes = make_shards(plan, out=frames, workers=workers, grid=model.grid, states=states)
         for _ in track(scenes, f"making {split}", total=len(seeds)):
-            pass
+            stop_if_preempted(out)
         return frames

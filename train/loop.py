@@ -23,7 +23,6 @@ from typing import Any
 import jax
 import numpy as np
 from flax import nnx
-from jax.experimental import multihost_utils
 
 from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.data.loader import Loader, make_loader, one_pass
@@ -36,6 +35,7 @@ from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Wr
 from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
+from egosim_jax.train.distributed import is_preempted
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
 from egosim_jax.train.page import TIMES, write_page
 from egosim_jax.train.update import Programs, Task, TrainState, mean_metrics, mean_validation
@@ -174,7 +174,7 @@ class Run:
             last = step == self.training.steps
             for hook in hooks:
                 hook(step, state, last=last)
-            preempted = multihost_utils.reached_preemption_sync_point(step)
+            preempted = is_preempted()
             if step % self.training.save_every == 0 or last or preempted:
                 self.save(step, state, wait=last or preempted)
             if preempted and not last:

@@ -160,3 +160,21 @@ def test_an_incomplete_or_invalid_process_environment_is_refused(points, tmp_pat
     process = start(tmp_path / "run", points, env=given)
     assert said in process.communicate(timeout=120)[1]
     assert process.returncode == 2
+
+
+def test_sigterm_ends_the_making_of_clips_which_the_same_command_resumes(tmp_path):
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "egosim_jax.train", "tabletop", "--scenes", "400"]
+    process = subprocess.Popen(
+        [*command, "--out", str(out)], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    parts, deadline = out / "frames" / "train" / "parts", time.monotonic() + 120
+    while len(list(parts.glob("*.record"))) < 2:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    said = process.communicate(timeout=120)[1]
+    assert process.returncode == ExitCode.RESUBMIT, said
+    assert "run the same command again" in said
+    assert len(list(parts.glob("*.record"))) < 400
