@@ -65,7 +65,7 @@ def distributed_context() -> Iterator[None]:
 def is_preempted() -> bool:
     """Return whether to save and stop: True once, soon after any process of the run got SIGTERM.
 
-    All processes must call this equally often, and are told at the same call. False outside of
+    All processes must call this equally often, and stop at the same call. False outside of
     `distributed_context`, where the signal ends the process.
     """
     return multihost_utils.reached_preemption_sync_point(next(_questions))
