@@ -119,10 +119,8 @@ def refine_pose(
     share = np.clip(
         (np.arange(len(best.path)) - best.grasped) / (best.released - best.grasped), 0, 1
     )
-    meters, degrees = (
-        deviation or np.inf for deviation in (config.deviation_m, config.deviation_deg)
-    )
-    scale = np.array([meters, meters, meters, np.radians(degrees)])
+    far, turned = config.deviation_m or np.inf, np.radians(config.deviation_deg or np.inf)
+    scale = np.array([far, far, far, turned])
     change, least = np.zeros(4), scene.cost(best.path[frames], color)
     for meters, degrees in zip(config.steps_m, config.steps_deg, strict=True):
         steps = np.diag([meters, meters, meters, np.radians(degrees)])

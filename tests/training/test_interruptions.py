@@ -162,7 +162,7 @@ def test_an_incomplete_or_invalid_process_environment_is_refused(points, tmp_pat
     assert process.returncode == 2
 
 
-def test_sigterm_ends_the_making_of_clips_which_the_same_command_resumes(tmp_path):
+def test_sigterm_ends_the_making_of_clips_with_75(tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "egosim_jax.train", "tabletop", "--scenes", "400"]
     process = subprocess.Popen(
