@@ -19,8 +19,8 @@ from egosim_jax.models.cogvideox.t5 import T5Config
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
 from tests.translation import translate
 
-TOLERANCE = 2e-6
-"""Relative L2 in float32: the order of sums."""
+TOLERANCE = 1e-5
+"""Relative L2 in float32: the order of sums, which differs between processors (2.2e-6 seen)."""
 DIT = CogVideoXDiTConfig(
     dim=96, heads=3, layers=2, text_dim=24, time_dim=40, base_rows=6, base_columns=9
 )
