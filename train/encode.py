@@ -15,12 +15,9 @@ part of other windows is written again. The provenance has the record numbers of
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
@@ -40,10 +37,8 @@ from egosim_jax.conditioning.video import to_model
 from egosim_jax.data.loader import Loader
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.mixing import MIXTURE, read_mixture
-from egosim_jax.data.records import RecordError
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.static import check_static
-from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.encoding import Inputs
 from egosim_jax.generator import batches, targets_of
 from egosim_jax.io.decoding import Decoding
@@ -56,6 +51,7 @@ from egosim_jax.progress import track
 from egosim_jax.sharding import check_batch
 from egosim_jax.train.distributed import stop_if_preempted
 from egosim_jax.train.encoded_parts import PartWindows, Window
+from egosim_jax.train.windows import Damaged, read_windows, windows
 from egosim_jax.types import InputError, Triplet, check_counts
 
 logger = logging.getLogger(__name__)
@@ -64,8 +60,6 @@ MAX_PARTS = 100_000
 """Maximum number of shards, whose names have five digits."""
 OLD_MASK = {"packing": "space", "channels": 4}
 """Packing and channels of the mask in shards that do not name them."""
-READ_THREADS = min(8, os.cpu_count() or 1)
-"""Threads that read clips while others are encoded."""
 
 
 class Encoding:
@@ -147,35 +141,6 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
 def mask_of(config: ModelConfig) -> dict[str, Any]:
     """Return packing and number of channels of a model's mask, as shards name them."""
     return {"packing": config.layout.mask_packing, "channels": config.layout.count("mask")}
-
-
-def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
-    """Return every window of `frames` frames, `stride` apart.
-
-    Reads every record of encoded videos; one that cannot be read has one window. Raises
-    `InputError` if a clip is shorter than a window, or if the records are not clips with their
-    target video.
-    """
-    manifest = source.manifest
-    if manifest.kind == "latents" or "target" not in manifest.arrays:
-        raise InputError(
-            f"{source.folder} holds {manifest.kind} of {', '.join(manifest.arrays)}; expected "
-            "videos or frames with their target. (--shards)"
-        )
-    known = manifest.arrays["prior"].shape[0] if manifest.kind == "frames" else None
-    found = []
-    for number in range(len(source)):
-        try:
-            last = (known or record_length(source[number].arrays)) - frames
-        except InputError:  # reported when the window is read
-            found.append((number, 0))
-            continue
-        if last < 0:
-            raise InputError(
-                f"{source.name(number)} has {last + frames} frames; a window needs {frames}."
-            )
-        found += [(number, start) for start in range(0, last + 1, stride)]
-    return found
 
 
 def encode_shards(
@@ -300,20 +265,22 @@ def _write(
     """Write part after part, yielding each window once it is encoded or skipped."""
     jobs = [(part, batch) for part, todo in parts.items() for batch in batches(todo, batch_size)]
     damaged: set[int] = set()
-    for part, group in groupby(_read(source, jobs, encode.config, decoding), key=itemgetter(0)):
+    for part, group in groupby(
+        read_windows(source, jobs, encode.config, decoding), key=itemgetter(0)
+    ):
         skipped: list[Window] = []
         shutil.rmtree(part, ignore_errors=True)  # of other windows
         with ExitStack() as stack:
             writer: ShardWriter | None = None
             for _, read in group:
-                for bad in (each for each in read if isinstance(each, _Bad)):
+                for bad in (each for each in read if isinstance(each, Damaged)):
                     skipped.append(bad.window)
                     if bad.window[0] not in damaged:
                         logger.warning("skipping %s", bad.message)
                     damaged.add(bad.window[0])
                     _check_skipped(damaged, source, none_left=False)
                     yield bad.window
-                clips = [each for each in read if not isinstance(each, _Bad)]
+                clips = [each for each in read if not isinstance(each, Damaged)]
                 if not clips:
                     continue
                 writer = writer or stack.enter_context(
@@ -332,53 +299,6 @@ def _write(
                     writer.add(arrays, {**metadata, "start": window[1]})
                     yield window
             PartWindows(parts[part], skipped).write(part)
-
-
-@dataclass(frozen=True)
-class _Bad:
-    """A window of a clip that cannot be read."""
-
-    window: Window
-    message: str
-
-
-Example = tuple[Window, Mapping[str, Any], Triplet]
-
-
-def _read(
-    source: ShardReader,
-    jobs: Sequence[tuple[Path, Sequence[Window]]],
-    config: ModelConfig,
-    decoding: Decoding,
-) -> Iterator[tuple[Path, list[Example | _Bad]]]:
-    """Yield the clips of each job, read while the job before is encoded."""
-    with ThreadPoolExecutor(READ_THREADS) as pool:
-        before: tuple[Path, list[Future[Example | _Bad]]] | None = None
-        for part, batch in jobs:
-            now = part, [pool.submit(_clip, source, window, config, decoding) for window in batch]
-            if before is not None:
-                yield before[0], [future.result() for future in before[1]]
-            before = now
-        if before is not None:
-            yield before[0], [future.result() for future in before[1]]
-
-
-def _clip(
-    source: ShardReader, window: Window, config: ModelConfig, decoding: Decoding
-) -> Example | _Bad:
-    number, start = window
-    try:
-        record = source[number]
-        arrays: dict[str, Any] = decode_record(
-            record.arrays, config.video, start=start, decoding=decoding
-        )
-    except RecordError as error:
-        return _Bad(window, str(error))
-    except InputError as error:
-        return _Bad(window, f"{source.name(number)}: {error}")
-    metadata = record.metadata
-    names = {name: str(metadata.get(name, "")) for name in ("video_id", "prompt")}
-    return window, metadata, Triplet(**names, **arrays)
 
 
 def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> None:
