@@ -6,8 +6,8 @@ joints (`HandMasks`); the motion of a held object is the one that explains the c
 (`RevealedSurfaces`). Depth is set only where the clip differs from the view of the state before;
 elsewhere it is unknown, and the state stays as it was.
 
-Limits: objects must be separate instances in the state, an object is moved by one hand at a time,
-and an articulated object is treated as a rigid body between the ends of its motion.
+Limits: objects must be separate instances in the state, and the moving part of an articulated one
+another than the rest; an object is moved by one hand at a time, and does not topple.
 """
 
 from __future__ import annotations

@@ -1,24 +1,33 @@
 """Motion of held objects, found by analysis by synthesis: the one that explains the colors best.
 
 An object that was grasped moves with the hand. Candidates are every object that a fingertip comes
-near, the pairs of frames between which the fingers may have held something (`_holds`), and three
-couplings to the palm: translation only, translation with rotation about the normal of the
-supporting surface, and the full rigid motion. The cost of a candidate is the mean difference
-between the object's colors and those of the clip where it would be visible; the best is the one
-that most improves on the object at rest. Its end is then refined by `pose_refinement`.
+near, the pairs of frames between which the fingers may have held something, and the ways in which
+that may have moved (`grasps`). The cost of a candidate is the mean difference between the object's
+colors and those of the clip where it would be visible; the best is the one that most improves on
+the object at rest. Of what was between the closing fingertips a motion counts unless the clip
+clearly shows it at rest. What was let go of falls (`falling`), and the end is refined by
+`pose_refinement`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixels_of, transform, umeyama
+from egosim_jax.geometry import invert, pixels_of, transform
+from egosim_jax.perception.falling import fall
+from egosim_jax.perception.grasps import (
+    TIPS,
+    couplings,
+    find_holds,
+    frame_pairs,
+    hinge_motion,
+    is_between,
+)
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -30,12 +39,6 @@ from egosim_jax.perception.pose_refinement import (
 from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
 from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
-
-TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
-"""Joints that grasp: thumb, index and middle finger; both jaws of a gripper."""
-
-MIN_HELD = 2
-"""Fewest frames between a grasp and a release."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +59,10 @@ class TrackObjects:
     """A motion is accepted if its cost is at most this fraction of the cost of resting."""
     min_improvement: float = 2.0
     """A motion is accepted if it costs less than resting by this much, in 8-bit levels."""
+    grip_radius_m: float = 0.012
+    """An object with a point this near to the line between the fingertips is in their grip."""
+    grip_evidence: float = 8.0
+    """A motion of what is in the grip may cost this much more than resting, in 8-bit levels."""
     prompt_prior: float = 0.9
     """Factor on the costs of an object that the prompt names."""
     plane_tolerance_m: float = 0.006
@@ -118,6 +125,8 @@ def estimate_object_motion(
             best = _best(joints, action, state, shown, hidden, config)
             if best is not None:
                 change, motion = best
+                others = state.points_m[state.object_ids != motion.model.number]
+                motion = fall(motion, others, clip.fps)
                 motion = refine_pose(
                     motion, action.cameras, state, shown, hidden, config.refinement, config.color
                 )
@@ -138,25 +147,45 @@ def _best(
     """Return the accepted candidate of one hand that explains most, after the change of its cost.
 
     The change is relative to the object at rest: an object of the color of the table costs little
-    wherever it is.
+    wherever it is. It is 0 where the object cannot be seen, and lowered for what is in the grip. A
+    hand that seems to hold nothing may have moved something between any two frames.
     """
     best: tuple[float, ObjectMotion] | None = None
-    holds = _holds(joints_m[:, TIPS[action.kind]], config)
+    palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
+    holds = find_holds(tips, config.opening_tolerance_m)
     for number in _near_tips(joints_m, action.kind, state, config):
         model = object_model(number, state, config)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
         still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
         rest = _cost(model, still, action.cameras, shown, hidden, config)
-        most = min(config.max_cost_ratio * rest, rest - config.min_improvement)
-        for grasped, released, path in _paths(
-            joints_m[:, PALM[action.kind]], model.plane[:3], holds
-        ):
-            cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
-            if cost < most and (best is None or cost - rest < best[0]):
-                motion = ObjectMotion(model=model, grasped=grasped, released=released, path=path)
-                best = cost - rest, motion
+        least = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
+        for hold in holds or frame_pairs(len(tips)):
+            grip = config.grip_radius_m
+            gripped = hold in holds and is_between(model.points_m, tips[hold[0]], grip)
+            most = config.grip_evidence if gripped else -least
+            for motion in _motions(palm, tips, model, hold):
+                cost = prior * _cost(model, motion.path, action.cameras, shown, hidden, config)
+                known = np.isfinite(cost) and np.isfinite(rest)
+                change = (cost - rest if known else 0.0) - most
+                if change < (0.0 if best is None else best[0]):
+                    best = change, motion
     return best
+
+
+def _motions(
+    palm_m: Float[np.ndarray, "f j 3"],
+    tips_m: Float[np.ndarray, "f k 3"],
+    model: ObjectModel,
+    hold: tuple[int, int],
+) -> Iterator[ObjectMotion]:
+    """Yield the motions that an object may have had in a hand: loose, then on a hinge."""
+    motion = partial(ObjectMotion, model=model, grasped=hold[0], released=hold[1])
+    for path in couplings(palm_m, model.plane[:3], hold):
+        yield motion(path=path)
+    turning = hinge_motion(tips_m, hold)
+    if turning is not None:
+        yield motion(path=turning, hinged=True)
 
 
 def _near_tips(
@@ -210,55 +239,6 @@ def _support_plane(
     with threadpool_limits(1, user_api="openmp"):  # else its threads race, and runs differ
         plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
     return np.array(plane)
-
-
-def _holds(tips_m: Float[np.ndarray, "f j 3"], config: TrackObjects) -> list[tuple[int, int]]:
-    """Return pairs of frames at which a hand may have grasped and released something rigid.
-
-    What is held keeps the fingertips apart: between both frames their distance stays as it is, from
-    a closing of the hand, or the first frame, to an opening, or the last. A hand that never closes,
-    or is never steady, may have moved something between any two frames.
-    """
-    opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
-    pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
-    if np.ptp(opening) <= config.opening_tolerance_m:
-        return pairs
-    steady = [(g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= config.opening_tolerance_m]
-    longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
-    return longest or pairs
-
-
-def _paths(
-    palm_m: Float[np.ndarray, "f j 3"],
-    normal: Float[np.ndarray, " 3"],
-    holds: Sequence[tuple[int, int]],
-) -> Iterator[tuple[int, int, Float[np.ndarray, "f 4 4"]]]:
-    """Yield frame of the grasp, frame of the release, and motion, for each of the couplings."""
-    rigid = np.stack([umeyama(palm_m[0], frame) for frame in palm_m])
-    center = palm_m.mean(axis=1)
-    upright, sliding = rigid.copy(), rigid.copy()
-    for frame, motion in enumerate(rigid):
-        upright[frame, :3, :3] = _twist(motion[:3, :3], normal)
-        sliding[frame, :3, :3] = np.eye(3)
-        for other in (upright, sliding):
-            other[frame, :3, 3] = center[frame] - other[frame, :3, :3] @ center[0]
-    frames = range(len(palm_m))
-    for grasped, released in holds:
-        when = np.clip(frames, grasped, released)
-        for motion in (sliding, upright, rigid):
-            yield grasped, released, motion[when] @ invert(motion[grasped])
-
-
-def _twist(
-    rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Return the part of a rotation that is about an axis (swing-twist decomposition)."""
-    import cv2
-
-    vector = cv2.Rodrigues(rotation)[0][:, 0]
-    half = np.linalg.norm(vector) / 2
-    along = np.sinc(half / np.pi) * (vector @ axis) / 2
-    return cv2.Rodrigues(2 * np.arctan2(along, np.cos(half)) * axis)[0]
 
 
 def _cost(

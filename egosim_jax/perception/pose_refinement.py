@@ -97,6 +97,8 @@ class ObjectMotion:
     """Frame of the release."""
     path: Float[np.ndarray, "f 4 4"]
     """Motion in the world relative to the pose before the clip, frame by frame."""
+    hinged: bool = False
+    """True for a part that turns about an axis and stays on it, such as a lid."""
 
 
 def refine_pose(

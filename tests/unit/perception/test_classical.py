@@ -109,3 +109,40 @@ def test_of_two_hands_on_one_object_one_moved_it(clip, found):
     ends = [transform(path[target][-1], points[None]) for path in
             (found.world_from_object, twice.world_from_object)]  # fmt: skip
     assert np.linalg.norm(ends[0] - ends[1]) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "number", "verb", "shape"),
+    [
+        ("human", 250, 2, "open", "chest"),
+        ("human", 242, 2, "close", "chest"),
+        ("robot", 244, 0, "open", "chest"),
+        ("robot", 245, 1, "open", "cabinet"),
+    ],
+)
+def test_furniture_is_found_open_or_shut(kind, seed, number, verb, shape):
+    *_, clip = make_sequence(seed, spec=SPEC, kind=kind, clips=number + 1)
+    target = clip.body_ids[clip.target]
+    assert clip.verb == verb
+    assert clip.state.names[target].endswith(shape)
+    found = (
+        ClassicalConfig()
+        .build()(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
+        .world_from_object
+    )
+    path = clip.world_from_body[clip.target]
+    points = clip.state.points_m[clip.state.object_ids == target].astype(float)
+    there = transform(path[-1] @ invert(path[0]), points)
+    assert set(found) == {target}
+    here = transform(found[target][-1] @ invert(found[target][0]), points)
+    assert np.linalg.norm(here - there, axis=1).mean() < 0.02
+    assert np.linalg.norm(there - points, axis=1).mean() > 0.07
+
+
+@pytest.mark.parametrize(("aside_m", "moved"), [(0.0, True), (0.06, False)])
+def test_in_frames_that_tell_nothing_the_grip_decides(clip, aside_m, moved):
+    gray = np.full_like(clip.frames, 127)
+    action = to_action(clip)
+    action = replace(action, joints_m=action.joints_m + np.array([0, 0, aside_m]), prompt="")
+    found = ClassicalConfig().build()(Clip(frames=gray, fps=8), action, clip.state)
+    assert set(found.world_from_object) == ({clip.body_ids[clip.target]} if moved else set())

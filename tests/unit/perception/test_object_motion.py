@@ -5,7 +5,6 @@ import pytest
 
 from egosim_jax.perception.object_motion import (
     TrackObjects,
-    _holds,
     _support_plane,
     object_model,
 )
@@ -40,28 +39,3 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
     plane = object_model(1, state, TrackObjects()).plane
     np.testing.assert_array_equal(plane[:3], up)
     assert np.isnan(plane[3])
-
-
-@pytest.mark.parametrize(
-    ("opening_cm", "holds"),
-    [
-        ([7, 8, 9, 5, 4.4, 4.4, 4.4, 4.4, 9, 7], [(3, 7)]),
-        ([4, 4, 4, 4, 9, 9.5, 9, 9, 9, 9], [(0, 3), (4, 9)]),
-        ([9, 5, 5, 5, 9, 3, 3, 3, 3, 9], [(1, 3), (5, 8)]),
-    ],
-    ids=["a grasp and a release", "held from the start", "two grasps"],
-)
-def test_fingers_hold_while_they_stay_as_far_apart(opening_cm, holds):
-    assert _holds(_fingers(opening_cm), TrackObjects()) == holds
-
-
-@pytest.mark.parametrize("opening_cm", [[7, 7.4, 7, 7.2, 7], [3, 5, 7, 9, 11]])
-def test_a_hand_that_does_not_close_may_have_moved_it_between_any_frames(opening_cm):
-    assert len(_holds(_fingers(opening_cm), TrackObjects())) == 3 + 2 + 1
-
-
-def _fingers(opening_cm):
-    """Return a thumb at the origin and two fingertips at the given distances, moving together."""
-    tips = np.zeros((len(opening_cm), 3, 3))
-    tips[:, 1:, 0] = np.array(opening_cm)[:, None] / 100
-    return tips + np.linspace(0, 1, len(opening_cm))[:, None, None]

@@ -1,0 +1,126 @@
+"""Grasps read from the joints of a hand: when it held something, what, and how that then moved.
+
+Times come from the distance of the fingertips, the object from what is between them, and its motion
+from its coupling to the hand: translation only, translation with rotation about the normal of the
+supporting surface, or the full motion of the palm (`couplings`); or rotation about the axis of the
+arc that the fingertips describe, as of a lid or a door (`hinge_motion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.geometry import umeyama
+from egosim_jax.types import Kind
+
+TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
+"""Joints that grasp: thumb, index and middle finger; both jaws of a gripper."""
+MIN_HELD = 2
+"""Fewest frames between a grasp and a release."""
+MIN_ARC_DEG = 25.0
+"""Smallest angle of an arc whose axis is known, in degrees."""
+MAX_ARC_ERROR = 0.05
+"""Largest distance of the fingertips from an arc, as a fraction of its radius."""
+
+
+def find_holds(tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float) -> list[tuple[int, int]]:
+    """Return the pairs of frames between which a hand seems to have held something rigid.
+
+    What is held keeps the fingertips apart: between both frames their distance stays as it is, from
+    a closing of the hand, or the first frame, to an opening, or the last. None of a hand that keeps
+    its opening all the time.
+    """
+    opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+    if np.ptp(opening) <= tolerance_m:
+        return []
+    steady = [
+        (g, r) for g, r in frame_pairs(len(tips_m)) if np.ptp(opening[g : r + 1]) <= tolerance_m
+    ]
+    longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
+    padded = np.pad(opening, 1, constant_values=np.inf)  # a hand may come with what it holds
+    return [(g, r) for g, r in longest if min(padded[g], padded[r + 2]) > opening[g : r + 1].mean()]
+
+
+def frame_pairs(frames: int) -> list[tuple[int, int]]:
+    """Return all pairs of frames at which something may have been grasped and released."""
+    return [(g, r) for g, r in combinations(range(frames), 2) if r - g >= MIN_HELD]
+
+
+def is_between(
+    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"], radius_m: float
+) -> bool:
+    """Return True if some point is between the thumb and the fingers, within a radius in meters."""
+    thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
+    across = fingers - thumb
+    share = (points_m - thumb) @ across / max(across @ across, 1e-12)
+    away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
+    return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+
+
+def couplings(
+    palm_m: Float[np.ndarray, "f j 3"], normal: Float[np.ndarray, " 3"], hold: tuple[int, int]
+) -> Iterator[Float[np.ndarray, "f 4 4"]]:
+    """Yield the motions in the world of something loose that is held, by each coupling to the hand.
+
+    They are relative to the first frame, and constant before the grasp and after the release.
+    """
+    grasped, released = hold
+    when = np.clip(np.arange(len(palm_m)), grasped, released)
+    rigid = np.stack([umeyama(palm_m[grasped], frame) for frame in palm_m])
+    center = palm_m.mean(axis=1)
+    upright, sliding = rigid.copy(), rigid.copy()
+    for frame, motion in enumerate(rigid):
+        upright[frame, :3, :3] = _twist(motion[:3, :3], normal)
+        sliding[frame, :3, :3] = np.eye(3)
+        for other in (upright, sliding):
+            other[frame, :3, 3] = center[frame] - other[frame, :3, :3] @ center[grasped]
+    for motion in (sliding, upright, rigid):
+        yield motion[when]
+
+
+def hinge_motion(
+    tips_m: Float[np.ndarray, "f j 3"], hold: tuple[int, int]
+) -> Float[np.ndarray, "f 4 4"] | None:
+    """Return the motion of something on a hinge; None unless the fingertips describe an arc.
+
+    It is constant before the grasp and after the release.
+    """
+    import cv2
+
+    grasped, released = hold
+    path_m = (tips_m[:, 0] + tips_m[:, 1:].mean(axis=1))[grasped : released + 1] / 2
+    middle = path_m.mean(axis=0)
+    across, along, normal = np.linalg.svd(path_m - middle, full_matrices=False)[2]
+    flat = (path_m - middle) @ np.stack([across, along], axis=1)
+    # |p|^2 = 2 p . center + (radius^2 - |center|^2), linear in the center
+    rows = np.concatenate([2 * flat, np.ones((len(flat), 1))], axis=1)
+    (x, y, rest), *_ = np.linalg.lstsq(rows, (flat**2).sum(axis=1), rcond=None)
+    radius = np.sqrt(max(rest + x * x + y * y, 0))
+    spokes = flat - [x, y]
+    angles = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
+    off = np.hypot(np.linalg.norm(spokes, axis=1) - radius, (path_m - middle) @ normal)
+    if np.ptp(angles) < np.radians(MIN_ARC_DEG) or off.max() > MAX_ARC_ERROR * radius:
+        return None
+    axis = np.cross(across, along)
+    center = middle + x * across + y * along
+    motion = np.repeat(np.eye(4)[None], len(path_m), axis=0)
+    for matrix, angle in zip(motion, angles - angles[0], strict=True):
+        matrix[:3, :3] = cv2.Rodrigues(angle * axis)[0]
+        matrix[:3, 3] = center - matrix[:3, :3] @ center
+    return motion[np.clip(np.arange(len(tips_m)), grasped, released) - grasped]
+
+
+def _twist(
+    rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the part of a rotation that is about an axis (swing-twist decomposition)."""
+    import cv2
+
+    vector = cv2.Rodrigues(rotation)[0][:, 0]
+    half = np.linalg.norm(vector) / 2
+    along = np.sinc(half / np.pi) * (vector @ axis) / 2
+    return cv2.Rodrigues(2 * np.arctan2(along, np.cos(half)) * axis)[0]

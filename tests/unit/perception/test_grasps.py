@@ -1,0 +1,113 @@
+"""Grasps read from joints: frames, objects between the fingertips, and the axis of a hinge."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.geometry import transform
+from egosim_jax.perception.grasps import (
+    couplings,
+    find_holds,
+    frame_pairs,
+    hinge_motion,
+    is_between,
+)
+
+TOLERANCE_M = 0.01
+
+
+@pytest.mark.parametrize(
+    ("opening_cm", "holds"),
+    [
+        ([7, 8, 9, 5, 4.4, 4.4, 4.4, 4.4, 9, 7], [(3, 7)]),
+        ([4, 4, 4, 4, 9, 9.5, 9, 9, 9, 9], [(0, 3)]),
+        ([9, 5, 5, 5, 9, 3, 3, 3, 3, 9], [(1, 3), (5, 8)]),
+        ([9, 9, 9, 9, 4, 4, 4, 4, 4, 4], [(4, 9)]),
+        ([4, 4, 4, 9, 9, 9, 9, 4, 4, 4], [(0, 2), (7, 9)]),
+    ],
+    ids=[
+        "a grasp and a release",
+        "held from the start",
+        "two grasps",
+        "held to the end",
+        "an open hand holds nothing",
+    ],
+)
+def test_fingers_hold_while_they_stay_as_far_apart(opening_cm, holds):
+    assert find_holds(fingers(opening_cm), TOLERANCE_M) == holds
+
+
+@pytest.mark.parametrize("opening_cm", [[7, 7.4, 7, 7.2, 7], [3, 5, 7, 9, 11]])
+def test_a_hand_that_does_not_close_holds_nothing(opening_cm):
+    assert find_holds(fingers(opening_cm), TOLERANCE_M) == []
+    assert len(frame_pairs(len(opening_cm))) == 3 + 2 + 1
+
+
+@pytest.mark.parametrize(
+    ("point_cm", "between"),
+    [
+        ([3, 0, 0], True),
+        ([3, 0.9, 0], True),
+        ([3, 1.1, 0], False),
+        ([-0.5, 0, 0], False),
+        ([6.5, 0, 0], False),
+    ],
+)
+def test_the_grip_is_a_cylinder_between_thumb_and_fingers(point_cm, between):
+    (tips,) = fingers([6])
+    away = np.array([[0.2, 0.2, 0.2], np.array(point_cm) / 100])
+    assert is_between(away, tips, radius_m=0.01) is between
+
+
+def test_a_hinge_turns_what_is_held_about_its_axis():
+    """Fingertips on a handle that turns by 80 degrees about an edge, and then leave it."""
+    axis = np.array([1.0, 0.2, 0]) / np.linalg.norm([1, 0.2, 0])
+    point = np.array([0.1, 0.5, 0.3])
+    true = np.stack([turn(axis, point, angle) for angle in np.radians(np.linspace(0, 80, 8))])
+    tips = np.array([[0.1, 0.4, 0.31], [0.1, 0.41, 0.30], [0.11, 0.41, 0.29]])
+    held = np.stack([transform(motion, tips) for motion in true])
+    path = np.concatenate([held[:1] + [0, 0, 0.1], held, held[-1:] + [0, -0.1, 0]])
+    found = hinge_motion(path, (1, 8))
+    np.testing.assert_allclose(found[1:9], true, atol=1e-9)
+    np.testing.assert_array_equal(found[0], np.eye(4))
+    np.testing.assert_array_equal(found[9], found[8])
+
+
+@pytest.mark.parametrize("bend_m", [0.0, 0.01])
+def test_a_straight_path_has_no_hinge(bend_m):
+    tips = fingers([3] * 8)
+    tips[:, :, 2] += bend_m * np.sin(np.linspace(0, np.pi, 8))[:, None]
+    assert hinge_motion(tips, (0, 7)) is None
+
+
+def test_what_is_loose_moves_with_the_palm_while_it_is_held():
+    motion = np.stack([turn(np.array([0, 0, 1.0]), np.zeros(3), a) for a in np.linspace(0, 1, 6)])
+    motion[:, :3, 3] += np.linspace(0, 1, 6)[:, None] * [0.1, 0.2, 0.3]
+    palm = np.stack([transform(m, np.eye(3) * 0.1 + 0.2) for m in motion])
+    sliding, upright, rigid = couplings(palm, np.array([0, 0, 1.0]), (1, 4))
+    relative = motion[4] @ np.linalg.inv(motion[1])
+    for path in (sliding, upright, rigid):
+        np.testing.assert_array_equal(path[0], path[1])
+        np.testing.assert_array_equal(path[5], path[4])
+        np.testing.assert_allclose(
+            transform(path[4], palm[1].mean(axis=0)[None])[0], palm[4].mean(axis=0)
+        )
+    np.testing.assert_allclose(rigid[4], relative, atol=1e-9)
+    np.testing.assert_allclose(upright[4], relative, atol=1e-9)
+    np.testing.assert_array_equal(sliding[4][:3, :3], np.eye(3))
+
+
+def fingers(opening_cm):
+    """Return a thumb at the origin and two fingertips at the given distances, moving together."""
+    tips = np.zeros((len(opening_cm), 3, 3))
+    tips[:, 1:, 0] = np.array(opening_cm)[:, None] / 100
+    return tips + np.linspace(0, 1, len(opening_cm))[:, None, None]
+
+
+def turn(axis, point, angle):
+    """Return the rotation about an axis through a point, by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    motion = np.eye(4)
+    motion[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    motion[:3, 3] = point - motion[:3, :3] @ point
+    return motion
