@@ -59,7 +59,7 @@ class Continuous(ModelExperiment):
     """Number of sequences, of consecutive seeds."""
     clips: int = 10
     """Clips of each sequence."""
-    first_scene: int = 200
+    first_scene: int = 600
     """Seed of the first sequence; the shipped model was trained on those from 1000 on."""
 
 
@@ -71,9 +71,9 @@ class Update(ModelExperiment):
     ground-truth and of generated frames. Prints a table and writes report.json.
     """
 
-    scenes: int = 8
+    scenes: int = 24
     """Number of scenes in which an object is carried."""
-    first_scene: int = 200
+    first_scene: int = 600
     """Seed of the first scene; the shipped model was trained on those from 1000 on."""
 
 
