@@ -68,7 +68,7 @@ class Update(ModelExperiment):
     """Carry an object in held-out scenes, update the state, and compare it with the ground truth.
 
     A row each for the oracle at 832 x 480 and at the model's size, and for classical perception of
-    ground-truth and of generated frames. Prints a table and writes report.json.
+    ground-truth, of generated and of gray frames. Prints a table and writes report.json.
     """
 
     scenes: int = 24

@@ -40,6 +40,7 @@ DEFINITIONS = {
     "ghost": "share of the object's earlier points off that surface that are still present",
     "background_mm": "95th percentile of the distances between nearest points of the background "
     "before and after, the larger of both directions, where it was seen before",
+    "gray frames": "one gray: what the action alone says",
     "spread": "standard deviation over scenes (n - 1)",
 }
 
@@ -77,6 +78,8 @@ def _rows(
     yield f"oracle, {spec.width} x {spec.height}", evaluate(clip, clip.frames, "oracle")
     yield "classical, ground-truth frames", evaluate(clip, clip.frames, "classical")
     yield "classical, generated frames", evaluate(clip, generated, "classical")
+    gray = np.full_like(clip.frames, 127)
+    yield "classical, gray frames", evaluate(clip, gray, "classical")
 
 
 def evaluate(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, float]:
