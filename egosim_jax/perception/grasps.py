@@ -27,27 +27,27 @@ MAX_ARC_ERROR = 0.05
 """Largest distance of the fingertips from an arc, as a fraction of its radius."""
 
 
-def find_holds(tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float) -> list[tuple[int, int]]:
-    """Return the pairs of frames between which a hand seems to have held something rigid.
+def find_holds(
+    tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float
+) -> tuple[list[tuple[int, int]], bool]:
+    """Return pairs of frames between which a hand may have held something, and if it surely did.
 
     What is held keeps the fingertips apart: between both frames their distance stays as it is, from
-    a closing of the hand, or the first frame, to an opening, or the last. None of a hand that keeps
-    its opening all the time.
+    a closing of the hand, or the first frame, to an opening, or the last. A hand that does not
+    close may have held something while its opening was steady; one that always is or never is, says
+    nothing, and may have done so between any two frames.
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+    pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
     if np.ptp(opening) <= tolerance_m:
-        return []
-    steady = [
-        (g, r) for g, r in frame_pairs(len(tips_m)) if np.ptp(opening[g : r + 1]) <= tolerance_m
-    ]
+        return pairs, False
+    steady = [(g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= tolerance_m]
     longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
     padded = np.pad(opening, 1, constant_values=np.inf)  # a hand may come with what it holds
-    return [(g, r) for g, r in longest if min(padded[g], padded[r + 2]) > opening[g : r + 1].mean()]
-
-
-def frame_pairs(frames: int) -> list[tuple[int, int]]:
-    """Return all pairs of frames at which something may have been grasped and released."""
-    return [(g, r) for g, r in combinations(range(frames), 2) if r - g >= MIN_HELD]
+    closed = [
+        (g, r) for g, r in longest if min(padded[g], padded[r + 2]) > opening[g : r + 1].mean()
+    ]
+    return closed or longest or pairs, bool(closed)
 
 
 def is_between(

@@ -24,7 +24,6 @@ from egosim_jax.perception.grasps import (
     TIPS,
     couplings,
     find_holds,
-    frame_pairs,
     hinge_motion,
     is_between,
 )
@@ -147,12 +146,11 @@ def _best(
     """Return the accepted candidate of one hand that explains most, after the change of its cost.
 
     The change is relative to the object at rest: an object of the color of the table costs little
-    wherever it is. It is 0 where the object cannot be seen, and lowered for what is in the grip. A
-    hand that seems to hold nothing may have moved something between any two frames.
+    wherever it is. It is 0 where the object cannot be seen, and lowered for what is in the grip.
     """
     best: tuple[float, ObjectMotion] | None = None
     palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
-    holds = find_holds(tips, config.opening_tolerance_m)
+    holds, sure = find_holds(tips, config.opening_tolerance_m)
     for number in _near_tips(joints_m, action.kind, state, config):
         model = object_model(number, state, config)
         name = state.names.get(number, "").lower()
@@ -160,9 +158,8 @@ def _best(
         still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
         rest = _cost(model, still, action.cameras, shown, hidden, config)
         least = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
-        for hold in holds or frame_pairs(len(tips)):
-            grip = config.grip_radius_m
-            gripped = hold in holds and is_between(model.points_m, tips[hold[0]], grip)
+        for hold in holds:
+            gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
             most = config.grip_evidence if gripped else -least
             for motion in _motions(palm, tips, model, hold):
                 cost = prior * _cost(model, motion.path, action.cameras, shown, hidden, config)
