@@ -85,6 +85,18 @@ def rotation_z(radians: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
+def hinge_rotation(
+    axis: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"], radians: float
+) -> Float[np.ndarray, "4 4"]:
+    """Return the rotation by an angle about a unit axis through a point (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = np.eye(4)
+    turn[:3, :3] += np.sin(radians) * cross + (1 - np.cos(radians)) * cross @ cross
+    turn[:3, 3] = point - turn[:3, :3] @ point
+    return turn
+
+
 def look_at(
     eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], *, up: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:

@@ -30,11 +30,11 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     if motion.hinged or released == last or not np.isfinite(offset):
         return motion
     first = motion.model.points_m
-    up = normal if first.mean(axis=0) @ normal + offset > 0 else -normal
+    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
+    up, floor = side * normal, float(-side * offset)
     end = transform(motion.path[released], first)
     if ((end - first) @ up).mean() < LIFTED_M:
         return motion
-    floor = -offset if up is normal else offset
     gap = _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
     seconds = np.maximum(np.arange(last + 1) - released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))

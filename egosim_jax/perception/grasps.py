@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.geometry import umeyama
+from egosim_jax.geometry import hinge_rotation, umeyama
 from egosim_jax.types import Kind
 
 TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
@@ -61,16 +61,24 @@ def is_between(
     return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
 
 
+def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:
+    """Return the rigid motion of the palm from the frame of a grasp to each frame."""
+    return np.stack([umeyama(palm_m[grasped], frame) for frame in palm_m])
+
+
 def couplings(
-    palm_m: Float[np.ndarray, "f j 3"], normal: Float[np.ndarray, " 3"], hold: tuple[int, int]
+    palm_m: Float[np.ndarray, "f j 3"],
+    rigid: Float[np.ndarray, "f 4 4"],
+    normal: Float[np.ndarray, " 3"],
+    hold: tuple[int, int],
 ) -> Iterator[Float[np.ndarray, "f 4 4"]]:
     """Yield the motions in the world of something loose that is held, by each coupling to the hand.
 
-    They are relative to the first frame, and constant before the grasp and after the release.
+    `rigid` is the `palm_motion` since the grasp. They are relative to the first frame, and constant
+    before the grasp and after the release.
     """
     grasped, released = hold
     when = np.clip(np.arange(len(palm_m)), grasped, released)
-    rigid = np.stack([umeyama(palm_m[grasped], frame) for frame in palm_m])
     center = palm_m.mean(axis=1)
     upright, sliding = rigid.copy(), rigid.copy()
     for frame, motion in enumerate(rigid):
@@ -89,8 +97,6 @@ def hinge_motion(
 
     It is constant before the grasp and after the release.
     """
-    import cv2
-
     grasped, released = hold
     path_m = (tips_m[:, 0] + tips_m[:, 1:].mean(axis=1))[grasped : released + 1] / 2
     middle = path_m.mean(axis=0)
@@ -107,10 +113,7 @@ def hinge_motion(
         return None
     axis = np.cross(across, along)
     center = middle + x * across + y * along
-    motion = np.repeat(np.eye(4)[None], len(path_m), axis=0)
-    for matrix, angle in zip(motion, angles - angles[0], strict=True):
-        matrix[:3, :3] = cv2.Rodrigues(angle * axis)[0]
-        matrix[:3, 3] = center - matrix[:3, :3] @ center
+    motion = np.stack([hinge_rotation(axis, center, float(a)) for a in angles - angles[0]])
     return motion[np.clip(np.arange(len(tips_m)), grasped, released) - grasped]
 
 

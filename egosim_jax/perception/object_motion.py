@@ -11,7 +11,7 @@ clearly shows it at rest. What was let go of falls (`falling`), and the end is r
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -26,6 +26,7 @@ from egosim_jax.perception.grasps import (
     find_holds,
     hinge_motion,
     is_between,
+    palm_motion,
 )
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
@@ -151,6 +152,8 @@ def _best(
     best: tuple[float, ObjectMotion] | None = None
     palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
     holds, sure = find_holds(tips, config.opening_tolerance_m)
+    rigid = {grasped: palm_motion(palm, grasped) for grasped in {hold[0] for hold in holds}}
+    hinges = {hold: hinge_motion(tips, hold) for hold in holds}
     for number in _near_tips(joints_m, action.kind, state, config):
         model = object_model(number, state, config)
         name = state.names.get(number, "").lower()
@@ -161,7 +164,8 @@ def _best(
         for hold in holds:
             gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
             most = config.grip_evidence if gripped else -least
-            for motion in _motions(palm, tips, model, hold):
+            loose = couplings(palm, rigid[hold[0]], model.plane[:3], hold)
+            for motion in _motions(model, hold, loose, hinges[hold]):
                 cost = prior * _cost(model, motion.path, action.cameras, shown, hidden, config)
                 known = np.isfinite(cost) and np.isfinite(rest)
                 change = (cost - rest if known else 0.0) - most
@@ -171,18 +175,17 @@ def _best(
 
 
 def _motions(
-    palm_m: Float[np.ndarray, "f j 3"],
-    tips_m: Float[np.ndarray, "f k 3"],
     model: ObjectModel,
     hold: tuple[int, int],
+    loose: Iterable[Float[np.ndarray, "f 4 4"]],
+    hinge: Float[np.ndarray, "f 4 4"] | None,
 ) -> Iterator[ObjectMotion]:
     """Yield the motions that an object may have had in a hand: loose, then on a hinge."""
     motion = partial(ObjectMotion, model=model, grasped=hold[0], released=hold[1])
-    for path in couplings(palm_m, model.plane[:3], hold):
+    for path in loose:
         yield motion(path=path)
-    turning = hinge_motion(tips_m, hold)
-    if turning is not None:
-        yield motion(path=turning, hinged=True)
+    if hinge is not None:
+        yield motion(path=hinge, hinged=True)
 
 
 def _near_tips(

@@ -19,6 +19,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, Int
 
+from egosim_jax.geometry import hinge_rotation
 from egosim_jax.io.untrusted import quote
 from egosim_jax.types import InputError
 
@@ -70,7 +71,9 @@ class HandModel:
             frame = wrist
             for hinge in range(HINGES):
                 number = HINGES * finger + hinge
-                frame = frame @ _hinge(self.axes[number], self.pivots_m[number], angles[number])
+                frame = frame @ hinge_rotation(
+                    self.axes[number], self.pivots_m[number], angles[number]
+                )
                 if hinge:
                     bones.append(frame)
         follow = np.stack(bones)[self.bones]
@@ -78,16 +81,6 @@ class HandModel:
         moved = ((moved + follow[..., :3, 3]) * self.weights[..., None]).sum(axis=1)
         base = wrist[:3, :3] @ self.pivots_m[0] + wrist[:3, 3]
         return np.concatenate([moved, base[None]])[list(ORDER)]
-
-
-def _hinge(axis: np.ndarray, pivot: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation by an angle about an axis through a point (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn = np.eye(4)
-    turn[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
-    return turn
 
 
 def _table(written: Any, name: str, rows: int, columns: int | None) -> np.ndarray:

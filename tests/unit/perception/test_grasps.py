@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from egosim_jax.geometry import transform
 from egosim_jax.perception.grasps import (
@@ -9,6 +10,7 @@ from egosim_jax.perception.grasps import (
     find_holds,
     hinge_motion,
     is_between,
+    palm_motion,
 )
 
 TOLERANCE_M = 0.01
@@ -87,7 +89,7 @@ def test_what_is_loose_moves_with_the_palm_while_it_is_held():
     motion = np.stack([turn(np.array([0, 0, 1.0]), np.zeros(3), a) for a in np.linspace(0, 1, 6)])
     motion[:, :3, 3] += np.linspace(0, 1, 6)[:, None] * [0.1, 0.2, 0.3]
     palm = np.stack([transform(m, np.eye(3) * 0.1 + 0.2) for m in motion])
-    sliding, upright, rigid = couplings(palm, np.array([0, 0, 1.0]), (1, 4))
+    sliding, upright, rigid = couplings(palm, palm_motion(palm, 1), np.array([0, 0, 1.0]), (1, 4))
     relative = motion[4] @ np.linalg.inv(motion[1])
     for path in (sliding, upright, rigid):
         np.testing.assert_array_equal(path[0], path[1])
@@ -108,10 +110,8 @@ def fingers(opening_cm):
 
 
 def turn(axis, point, angle):
-    """Return the rotation about an axis through a point, by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    """Return the rotation about an axis through a point, by SciPy."""
     motion = np.eye(4)
-    motion[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    motion[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
     motion[:3, 3] = point - motion[:3, :3] @ point
     return motion
