@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from egosim_jax import interrupts
+from egosim_jax.runtime import interrupts
 
 interrupts.expect()
 
@@ -12,8 +12,8 @@ from typing import Annotated
 
 import tyro
 
-from egosim_jax import command
 from egosim_jax.convert.commands import Inspect, Lora, ToTorch, Verify, Weights
+from egosim_jax.runtime import command
 
 Commands = (
     Annotated[Inspect, tyro.conf.subcommand("inspect")]

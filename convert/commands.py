@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from egosim_jax import command
 from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
 from egosim_jax.convert.outputs import apart, write_file, write_sharded
 from egosim_jax.convert.pipeline import pipeline_files
@@ -23,15 +22,16 @@ from egosim_jax.convert.widen import Widening, WidenMode, widening_of
 from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.mapped import OURS, Tensor
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
-from egosim_jax.progress import track
+from egosim_jax.runtime import command
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.models import NetworkConfig
     from egosim_jax.models.lora import Change
-    from egosim_jax.networks import ModelConfig
 
 Dtype = Literal["float32", "bfloat16", "float16"]
 """Floating dtypes that weights can be cast to."""
@@ -278,7 +278,7 @@ class Lora:
         trained_on: Mapping[str, str],
     ) -> int:
         """Write the folder of a checkpoint of DWM."""
-        from egosim_jax.convert.checkpoint import checkpoint
+        from egosim_jax.convert.dwm_checkpoint import checkpoint
         from egosim_jax.io.mapped import read_safetensors
 
         if self.merge is not None:

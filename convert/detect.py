@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import Table, tables_of
 from egosim_jax.io.mapped import Tensor
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 T5 = "spiece.model"
 """File of T5's tokenizers alone; Wan's releases also have that of CLIP's text encoder."""
@@ -29,7 +29,7 @@ BASE_LAYER, LORA = ".base_layer.", ".lora_"
 """Parts of the names of an adapted layer's tensors by PEFT: of its weights, and of the LoRA."""
 DEEPEST = 2
 """Levels of subfolders that are searched."""
-MOST_NETWORKS = 16
+MAX_NETWORKS = 16
 """Networks in a checkpoint."""
 
 
@@ -134,9 +134,9 @@ def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[Det
                         network=network, table=table, naming=naming, prefix=prefix, source=source
                     )
                     found.setdefault((network, prefix), detected)
-    if len(found) > MOST_NETWORKS:
+    if len(found) > MAX_NETWORKS:
         raise InputError(
-            f"{source.name} holds {len(found)} networks; the limit is {MOST_NETWORKS} per file. "
+            f"{source.name} holds {len(found)} networks; the limit is {MAX_NETWORKS} per file. "
             "Split it."
         )
     return list(found.values())

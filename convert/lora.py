@@ -31,10 +31,10 @@ from egosim_jax.convert.rules import Rule, shape_only
 from egosim_jax.convert.source import PTH, Source, sources
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
-from egosim_jax.io.untrusted import listing, quote_path, quote_text
+from egosim_jax.io.untrusted.bounded import listing, quote_path, quote_text
 from egosim_jax.models.lora import (
     BASE,
-    MOST_RANK,
+    MAX_RANK,
     Change,
     Delta,
     Value,
@@ -272,8 +272,8 @@ def _pair(
             raise RefusedError(f"has no {name}")
     down, up = found["down"], found["up"]
     rank = down.shape[0] if down.shape else 0
-    if not 1 <= rank <= MOST_RANK:
-        raise RefusedError(f"has rank {rank}; expected 1 to {MOST_RANK}")
+    if not 1 <= rank <= MAX_RANK:
+        raise RefusedError(f"has rank {rank}; expected 1 to {MAX_RANK}")
     wide, out = kernel
     if (down.shape, up.shape) != ((rank, wide), (out, rank)):
         raise RefusedError(

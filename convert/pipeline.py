@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from egosim_jax.convert.tables import table_of
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 
 def pipeline_files(config: ModelConfig, written: Collection[str]) -> Mapping[str, Any]:

@@ -19,9 +19,9 @@ from egosim_jax.io.weights import WeightsError, mismatches
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.models import NetworkConfig
     from egosim_jax.models.lora import Change
-    from egosim_jax.networks import ModelConfig
 
 
 def to_jax(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from egosim_jax.io.untrusted import quote_path, read_bytes
+from egosim_jax.io.untrusted.bounded import quote_path, read_bytes
 from egosim_jax.types import InputError
 
 TOKENIZER_FILES = (
     "tokenizer.json", "spiece.model", "tokenizer_config.json", "special_tokens_map.json",
 )  # fmt: skip
-MOST_TOKENIZER = 64 << 20
+MAX_TOKENIZER = 64 << 20
 """Bytes of a tokenizer file."""
 
 
@@ -25,4 +25,4 @@ def tokenizer_files(folder: Path, *, within: Path) -> dict[str, bytes]:
                 f"{quote_path(path)} is a symlink; those of a tokenizer are not followed. Copy the "
                 "checkpoint folder with `cp -rL` if you trust the targets of its links."
             )
-    return {file.name: read_bytes(file, limit=MOST_TOKENIZER) for file in files}
+    return {file.name: read_bytes(file, limit=MAX_TOKENIZER) for file in files}

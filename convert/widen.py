@@ -20,7 +20,7 @@ from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.conditioning.layout import ChannelLayout
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 WidenMode = Literal["copy", "polarity"]
 """Encoding of the base model's mask: the same as the model's, or that of the base's layout."""

@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     __version__: str
 
     from egosim_jax.conditioning.condition import Condition
-    from egosim_jax.conditions import write_conditions
     from egosim_jax.configs import get as get_config
+    from egosim_jax.configs.model import ModelConfig, Networks
     from egosim_jax.data.clips import load_triplet
     from egosim_jax.data.metadata import read_metadata
-    from egosim_jax.episode import Episode
-    from egosim_jax.generator import Generator
+    from egosim_jax.generation.export import write_conditions
+    from egosim_jax.generation.generator import Generator
     from egosim_jax.io.video import write_video
-    from egosim_jax.networks import ModelConfig, Networks
     from egosim_jax.perception.registry import get as get_perception
     from egosim_jax.perception.registry import register as register_perception
-    from egosim_jax.rollout import Rollout
-    from egosim_jax.simulator import Simulator, Step
+    from egosim_jax.simulation.episode import Episode
+    from egosim_jax.simulation.rollout import Rollout
+    from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.state.depth import state_from_depth
     from egosim_jax.state.snapshot import load as load_state
     from egosim_jax.state.snapshot import save as save_state

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.env.actions import ActionSpec
-from egosim_jax.env.backends import GeneratedWorld, tabletop_start
-from egosim_jax.env.batching import Batcher
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.backends import GeneratedWorld, tabletop_start
+from egosim_jax.interactive.env.batching import Batcher
 from egosim_jax.rendering import reference
 from egosim_jax.types import VideoSpec
 
@@ -81,10 +81,10 @@ def painted(perception=None, pause=0.0, batch=None):
 
 def main():
     """Serve the painted world with perception."""
-    from egosim_jax.serving.metrics import Metrics
-    from egosim_jax.serving.server import bind, serve
-    from egosim_jax.serving.service import Service
-    from egosim_jax.serving.store import Limits, Store
+    from egosim_jax.interactive.server.prometheus import Metrics
+    from egosim_jax.interactive.server.server import bind, serve
+    from egosim_jax.interactive.server.service import Service
+    from egosim_jax.interactive.server.store import Limits, Store
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)

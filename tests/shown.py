@@ -7,10 +7,10 @@ import numpy as np
 from einops import reduce, repeat
 from flax import nnx
 
+from egosim_jax.configs.model import Networks
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.windows import windows_of
-from egosim_jax.networks import Networks
 from egosim_jax.testing import random_triplet, tiny_model
 
 CELL, STRIDE = 8, 4
@@ -76,7 +76,7 @@ def show_hands(monkeypatch):
     """Replace the networks of batch jobs of `MODEL`: a clip ends as bright as its hands."""
     uncached(monkeypatch)
     made = networks(MODEL, "hands")
-    monkeypatch.setattr("egosim_jax.batch.Networks.random", lambda config, *, seed: made)
+    monkeypatch.setattr("egosim_jax.generation.batch.Networks.random", lambda config, *, seed: made)
 
 
 def windows_of_hands(folder, grays, **changes):
@@ -91,4 +91,6 @@ def windows_of_hands(folder, grays, **changes):
 
 def uncached(monkeypatch):
     """Compile without the cache, which knows networks by their configs alone."""
-    monkeypatch.setattr("egosim_jax.program.cached_compile", lambda key, args, compile: compile())
+    monkeypatch.setattr(
+        "egosim_jax.generation.compiled.cached_compile", lambda key, args, compile: compile()
+    )

@@ -78,7 +78,7 @@ PROSE = {
 RENAMED = {
     "usual_norm": "grad_norm_ema",
     "SETTLED": "guard_warmup",
-    "MOST_LEFT_OUT": "max_consecutive_skips",
+    "MAX_LEFT_OUT": "max_consecutive_skips",
     "patience": "hang_timeout_s",
     "gradient_norm": "grad_norm",
     "minutes_left": "eta_min",
@@ -97,7 +97,7 @@ RENAMED = {
     "widened": "dilate",
     "flesh": "hand_silhouette",
     "CHEST_M": "SHOULDER_OFFSET_M",
-    "LEAST_GAIN": "MIN_IMPROVEMENT",
+    "MIN_GAIN": "MIN_IMPROVEMENT",
     "seen_from": "estimate_cameras",
     "TELLTALES": "SIGNATURE_KEYS",
     "TooLarge": "OutOfMemory",

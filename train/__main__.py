@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from egosim_jax import interrupts
+from egosim_jax.runtime import interrupts
 
 interrupts.expect()
 
@@ -13,7 +13,7 @@ from typing import Annotated, Union
 
 import tyro
 
-from egosim_jax import command
+from egosim_jax.runtime import command
 from egosim_jax.train.recipes import RECIPES
 
 Commands = Union[  # noqa: UP007 - a tuple of members

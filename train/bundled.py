@@ -31,17 +31,17 @@ import numpy as np
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.command import CommandExit, ExitCode, run_with_exit_codes
 from egosim_jax.io import parts, weights
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.mapped import digest, read_safetensors
-from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted import quote_path, read_bytes, read_json
-from egosim_jax.metric_writers import JsonLines
+from egosim_jax.io.untrusted.bounded import quote_path, read_bytes, read_json
+from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.models.layers import init_sharded
+from egosim_jax.runtime.command import CommandExit, ExitCode, run_with_exit_codes
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
+from egosim_jax.train.metric_writers import JsonLines
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import (
     MAX_CONSECUTIVE_SKIPS,

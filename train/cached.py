@@ -18,10 +18,11 @@ import numpy as np
 
 from egosim_jax.conditioning.posterior import STD
 from egosim_jax.conditioning.video import to_model
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.clips import load_triplet
 from egosim_jax.data.metadata import ClipFiles
 from egosim_jax.data.moments import (
-    MOST_DIFFERENT_STD,
+    MAX_DIFFERENT_STD,
     cache_of,
     check_alike,
     read_moments,
@@ -30,11 +31,10 @@ from egosim_jax.data.moments import (
 )
 from egosim_jax.data.pack import clip_metadata
 from egosim_jax.data.shards import ShardWriter
-from egosim_jax.encoding import Inputs
-from egosim_jax.io.pth import write_pth
+from egosim_jax.generation.compiled import CompiledFn
+from egosim_jax.generation.encoding import Inputs
+from egosim_jax.io.untrusted.pth import write_pth
 from egosim_jax.io.weights import hashes
-from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.program import CompiledFn
 from egosim_jax.train.encode import Encoding, mask_of
 from egosim_jax.types import InputError
 
@@ -78,7 +78,7 @@ def shard_caches(
                     check_alike(_cache(files, name), arrays[name], first[name])
                 for name in VIDEOS:
                     deviations = (given[f"{name}{STD}"] for given in (arrays, first))
-                    check_alike(_cache(files, name), *deviations, most=MOST_DIFFERENT_STD)
+                    check_alike(_cache(files, name), *deviations, most=MAX_DIFFERENT_STD)
             writer.add(arrays, {**clip_metadata(files), "start": 0})
             yield files.video_id
 

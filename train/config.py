@@ -18,8 +18,8 @@ from flax import nnx
 from optax.contrib import MuonDimensionNumbers, muon
 
 from egosim_jax.io.executables import share_with_jax
-from egosim_jax.metric_writers import EXTRAS, check_installed
 from egosim_jax.sharding import MeshConfig
+from egosim_jax.train.metric_writers import EXTRAS, check_installed
 from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:

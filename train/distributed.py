@@ -25,7 +25,7 @@ import jax
 from jax._src import xla_bridge
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import CommandExit, ExitCode
+from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.types import InputError
 
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
+from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import Recipe, TrainConfig
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig, Networks
+    from egosim_jax.configs.model import ModelConfig, Networks
 
 
 @dataclass(frozen=True, kw_only=True)

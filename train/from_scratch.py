@@ -17,19 +17,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax import configs
-from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import Products
-from egosim_jax.progress import track
+from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.progress import track
 from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process, stop_if_preempted
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.data.metadata import ClipFiles
     from egosim_jax.models.wan.vae import WanVAE
-    from egosim_jax.networks import ModelConfig
 
 ENCODE_BATCH = 8
 """Clips that are encoded together."""
@@ -123,8 +123,8 @@ class FromScratch(Recipe):
             return given.train()
         (out,) = self.require("out")
         check_counts({"--stride": self.stride})
+        from egosim_jax.configs.model import Networks
         from egosim_jax.io.run import open_folder
-        from egosim_jax.networks import Networks
         from egosim_jax.train.loop import train
         from egosim_jax.train.monitor import Samples
 
@@ -391,7 +391,7 @@ class FromTabletop(FromScratch):
         return frames
 
     def _make(self, split: str, seeds: range, clips: int, out: Path) -> Path:
-        from egosim_jax.train.rollouts import OwnRollouts
+        from egosim_jax.train.rollout_states import OwnRollouts
         from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards, true_states
 
         model = configs.get(self.config)

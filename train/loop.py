@@ -24,20 +24,20 @@ import jax
 import numpy as np
 from flax import nnx
 
-from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes, place
-from egosim_jax.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.models.layers import LowRankParam, init_sharded
+from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
 from egosim_jax.train.distributed import is_preempted
+from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
-from egosim_jax.train.page import TIMES, write_page
+from egosim_jax.train.run_page import TIMES, write_page
 from egosim_jax.train.update import Programs, Task, TrainState, mean_metrics, mean_validation
 from egosim_jax.types import InputError
 

@@ -23,14 +23,14 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.conditioning.video import to_uint8
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.generator import denoise
-from egosim_jax.networks import ModelConfig, Networks
+from egosim_jax.generation.generator import denoise
 from egosim_jax.preflight.targets import peak
+from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.sharding import batch_sharding, parts
 from egosim_jax.train.tasks.denoising import condition_of
 from egosim_jax.train.update import MAX_CONSECUTIVE_SKIPS

@@ -17,10 +17,10 @@ from typing import Any
 
 import jax
 
-from egosim_jax.command import ExitCode
 from egosim_jax.preflight.report import OutOfMemory, Report, compile_for, plain, size, text
 from egosim_jax.preflight.targets import Target, find
-from egosim_jax.progress import track
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.progress import track
 from egosim_jax.sharding import batch_sharding, make_mesh, parts
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import Programs, Stage

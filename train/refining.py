@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax import configs
-from egosim_jax.command import ExitCode, HelpGroups
+from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.update import Stage

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.records import RecordError
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.transforms import decode_record, record_length
 from egosim_jax.io.decoding import Decoding
-from egosim_jax.networks import ModelConfig
 from egosim_jax.train.encoded_parts import Window
 from egosim_jax.types import InputError, Triplet
 

@@ -20,10 +20,10 @@ from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.conditioning.layout import ChannelLayout
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.convert.widen import Widening
     from egosim_jax.io.mapped import Tensor
     from egosim_jax.models import NetworkConfig
-    from egosim_jax.networks import ModelConfig
 
 Reader = Callable[[], np.ndarray]
 """Function that reads the values of one tensor."""
@@ -66,7 +66,7 @@ class Comparison:
 
     def output(self, *inputs: Any, call: Callable[..., Any] | None = None) -> np.ndarray:
         """Return the output of the network, or of `call(network, *inputs)`."""
-        from egosim_jax.program import CompiledFn
+        from egosim_jax.generation.compiled import CompiledFn
 
         return np.asarray(
             CompiledFn(call or (lambda network, *x: network(*x)), self.network)(*inputs)

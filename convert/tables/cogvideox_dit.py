@@ -24,8 +24,8 @@ from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.io.mapped import Tensor
-    from egosim_jax.networks import ModelConfig
 
 TEXT_TOKENS = 226
 """Text tokens of a reference forward."""

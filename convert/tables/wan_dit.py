@@ -27,7 +27,7 @@ from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 PATCH_KERNEL = "o c 1 i j -> c i j o"
 MODULATION = "1 k d -> k d"

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from egosim_jax.data.recording import Recording
-from egosim_jax.grid import WAN_GRID
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError, check_counts
+from egosim_jax.types.grid import WAN_GRID
 
 MAX_FPS = 60
 """Highest rate that is kept, in frames per second."""
@@ -31,7 +31,7 @@ MAX_CLIP_FRAMES, MIN_CLIP_FRAMES = 601, 9
 """Longest and shortest clip in frames."""
 LONGEST_PX = 832
 """Longer side of clips without a given size, at most, in pixels."""
-LEAST_KEPT = 0.6
+MIN_KEPT = 0.6
 """Smallest fraction of the picture that a crop may keep."""
 CHUNK = 300
 """Frames of a video that are decoded at a time."""
@@ -134,10 +134,10 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     height, width = sampling.size or _own_size(info)
     scale = max(height / info.height, width / info.width)
     kept = height * width / (info.height * info.width * scale**2)
-    if kept < LEAST_KEPT:
+    if kept < MIN_KEPT:
         raise InputError(
             f"{name} is {info.width}x{info.height}: {width}x{height} would keep {kept:.0%} of the "
-            f"picture, less than {LEAST_KEPT:.0%}. Choose a size of a similar shape, for instance "
+            f"picture, less than {MIN_KEPT:.0%}. Choose a size of a similar shape, for instance "
             f"{' '.join(map(str, _own_size(info)))}. (--size)"
         )
     rest = round(info.width * scale) - width, round(info.height * scale) - height

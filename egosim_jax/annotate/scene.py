@@ -23,8 +23,8 @@ from egosim_jax.annotate.stages import (
     undistort_clip,
     visible,
 )
+from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
-from egosim_jax.metrics.image import decibels
 from egosim_jax.perception.estimates import DepthEstimate, Rung
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from egosim_jax import interrupts
+from egosim_jax.runtime import interrupts
 
 interrupts.expect()
 
@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from egosim_jax import command
 from egosim_jax.cli.data import Data
 from egosim_jax.cli.doctor import Doctor
 from egosim_jax.cli.episode import Episode
@@ -31,6 +30,7 @@ from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.table import TableCommand
 from egosim_jax.cli.view import View
+from egosim_jax.runtime import command
 
 Commands = (
     Annotated[Generate, tyro.conf.subcommand("generate")]

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.perception.estimates import ChosenRung
-from egosim_jax.progress import track
 from egosim_jax.rendering import RendererName
+from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:

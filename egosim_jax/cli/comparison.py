@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from egosim_jax.command import HelpGroups
+from egosim_jax.runtime.command import HelpGroups
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ class Options:
     def measures(self, networks: Sequence[Network]) -> tuple[list[Measure], list[str]]:
         """Return the measures, and why others are unavailable."""
         from egosim_jax.evaluation.measures import DreamSimDistance, LpipsDistance, Pixels
-        from egosim_jax.metrics import lpips
-        from egosim_jax.metrics.dreamsim import DreamSim
+        from egosim_jax.evaluation.metrics import lpips
+        from egosim_jax.evaluation.metrics.dreamsim import DreamSim
 
         measures: list[Measure] = [Pixels()]
         unavailable: list[str] = []
@@ -115,7 +115,7 @@ class Options:
             yield Features(VideoMae(self.fvd, device=self.device))
 
     def _depth_network(self, folder: Path) -> DepthEstimator:
-        from egosim_jax.io.untrusted import read_json
+        from egosim_jax.io.untrusted.bounded import read_json
         from egosim_jax.perception.networks import DepthAnything, DepthAnything3
 
         config = folder / "config.json"
@@ -135,11 +135,11 @@ class Options:
         **result: Any,
     ) -> Evaluation:
         """Compare, print, and write all files of the table to a folder."""
-        from egosim_jax.evaluation import page
+        from egosim_jax.evaluation import pages
         from egosim_jax.evaluation.files import draw, write_files
+        from egosim_jax.evaluation.metrics.dreamsim import MISSING
         from egosim_jax.evaluation.result import Evaluation
         from egosim_jax.evaluation.scoring import CACHE, ScoreCache, Scoring
-        from egosim_jax.metrics.dreamsim import MISSING
 
         if self.page_clips < 0:
             raise InputError(
@@ -158,7 +158,7 @@ class Options:
         if "dreamsim" in result["shown"] and self.dreamsim is None:
             unavailable.append(f"dreamsim: {MISSING}")
         result["shown"] = (*result["shown"], *extra)
-        paged = self.page_clips > 0 and page.can_be_written()
+        paged = self.page_clips > 0 and pages.can_be_written()
         if self.page_clips and not paged:
             unavailable.append(f"{page.PAGE}: {page.MISSING}")
         evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
@@ -166,8 +166,8 @@ class Options:
         if self.page_clips:
             draw(evaluation, out / "scores.png")
         if paged:
-            path = out / page.PAGE
-            page.write_page(evaluation, methods, path, title=title, clips=self.page_clips)
+            path = out / pages.PAGE
+            pages.write_page(evaluation, methods, path, title=title, clips=self.page_clips)
         evaluation.print()
-        print(out / (page.PAGE if paged else "report.json"))
+        print(out / (pages.PAGE if paged else "report.json"))
         return evaluation

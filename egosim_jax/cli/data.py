@@ -14,11 +14,11 @@ from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
 from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
-from egosim_jax.command import ExitCode
 from egosim_jax.data.metadata import Prompts
-from egosim_jax.grid import WAN_GRID, VideoGrid
-from egosim_jax.progress import track
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, VideoSpec, check_counts
+from egosim_jax.types.grid import WAN_GRID, VideoGrid
 
 
 def _grid(name: str | None) -> VideoGrid:

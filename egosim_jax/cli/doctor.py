@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 LIBRARIES = (
     "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "open3d-cpu", "av",
@@ -141,7 +141,7 @@ def _bytes(config: ModelConfig) -> int:
     import jax.numpy as jnp
     from flax import nnx
 
-    from egosim_jax.networks import Networks
+    from egosim_jax.configs.model import Networks
 
     parts = Networks.abstract(config).parts()
     return sum(

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.command import ExitCode
 from egosim_jax.rendering import RendererName
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from egosim_jax import episode as episodes
+    from egosim_jax.simulation import episode as episodes
     from egosim_jax.types import Action, Cameras, SceneState
 
 PICTURES = 6
@@ -78,9 +78,9 @@ class MakeEpisode:
 
     def _own(self) -> episodes.Episode:
         from egosim_jax import configs
-        from egosim_jax.actions import read_action
         from egosim_jax.cli.simulate import check_fits
-        from egosim_jax.episode import Episode
+        from egosim_jax.simulation.actions import read_action
+        from egosim_jax.simulation.episode import Episode
 
         given = {"clips": self.clips, "seed": self.seed, "robot": self.robot or None}
         if names := [name for name, value in given.items() if value is not None]:
@@ -124,7 +124,7 @@ class MakeEpisode:
         """Return the state of the image and its depth, seen from the first camera."""
         import numpy as np
 
-        from egosim_jax.io.npz import read_arrays
+        from egosim_jax.io.untrusted.npz import read_arrays
         from egosim_jax.state.depth import state_from_depth
 
         depth_m = read_arrays(depth, {}, others=("depth_m",), packed=True)["depth_m"]
@@ -159,7 +159,7 @@ class FromAnnotation:
     def run(self) -> int:
         """Read the clip, make, check and write the episode."""
         from egosim_jax import configs
-        from egosim_jax.annotate.episode import episode_from
+        from egosim_jax.annotate.to_episode import episode_from
 
         check_counts({"--clips": self.clips})
         episode = episode_from(self.clip, configs.get(self.config).video, clips=self.clips)
@@ -193,7 +193,7 @@ class FromLeRobot:
     def run(self) -> int:
         """Read the dataset, make, check and write the episode."""
         from egosim_jax import configs
-        from egosim_jax.env.recorded import episode_from_lerobot
+        from egosim_jax.interactive.env.lerobot_episode import episode_from_lerobot
         from egosim_jax.state.snapshot import load, read_ply
 
         check_counts({"--clips": self.clips})
@@ -225,7 +225,7 @@ class CheckEpisode:
         """Load the episode, which checks all of it."""
         from egosim_jax import configs
         from egosim_jax.cli.simulate import check_fits
-        from egosim_jax.episode import Episode
+        from egosim_jax.simulation.episode import Episode
 
         episode = Episode.load(self.path)
         if self.config is not None:
@@ -252,7 +252,7 @@ class ShowEpisode:
     def run(self) -> int:
         """Render and write the contact sheet."""
         from egosim_jax.data.sheet import SheetClip, draw_sheet
-        from egosim_jax.episode import Episode
+        from egosim_jax.simulation.episode import Episode
 
         episode = Episode.load(self.path)
         last = episode.shape[0] - 1

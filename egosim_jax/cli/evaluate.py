@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from egosim_jax.cli.comparison import Options
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 
 
 @dataclass(frozen=True, kw_only=True)

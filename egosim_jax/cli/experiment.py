@@ -8,7 +8,6 @@ from typing import Annotated
 
 import tyro
 
-from egosim_jax.command import ExitCode
 from egosim_jax.experiments.config import (
     DWM,
     Continuous,
@@ -21,6 +20,7 @@ from egosim_jax.experiments.config import (
     Tabletop,
     Update,
 )
+from egosim_jax.runtime.command import ExitCode
 
 MODULES = {
     Tabletop: "tabletop",

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
 
@@ -43,20 +43,20 @@ class Export:
                 "'egosim-jax[viewer]'."
             )
         from egosim_jax import configs
-        from egosim_jax.data.lerobot import check_new
-        from egosim_jax.serving import export
+        from egosim_jax.data.lerobot_writer import check_new
+        from egosim_jax.interactive.server import dataset_export
 
         if self.to == "lerobot":
             check_new(self.out)
-        found, damaged = export.open_sessions(self.sessions, self.session)
+        found, damaged = dataset_export.open_sessions(self.sessions, self.session)
         for name, problem in damaged.items():
             print(f"skipped session {name}: {problem}", file=sys.stderr)
         if self.to == "lerobot":
-            export.to_lerobot(found, self.out)
+            dataset_export.to_lerobot(found, self.out)
         elif self.to == "shards":
-            export.to_shards(found, self.out, grid=configs.get(self.config).grid)
+            dataset_export.to_shards(found, self.out, grid=configs.get(self.config).grid)
         else:
             for session in found:
-                export.to_rerun(session, self.out / f"{session.id}.rrd")
+                dataset_export.to_rerun(session, self.out / f"{session.id}.rrd")
         print(self.out)
         return ExitCode.PARTIAL if damaged else ExitCode.DONE

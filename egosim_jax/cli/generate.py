@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.data.metadata import Prompts
+from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.data.windows import Window
-    from egosim_jax.networks import ModelConfig
 
 
 Solver = Literal["euler", "unipc", "wan", "ddim", "dpmpp_2m", "dpmpp_2m_sde"]
@@ -111,7 +111,7 @@ class Generate:
 
     def run(self) -> int:
         """Check everything, compile, generate."""
-        from egosim_jax.batch import BatchJob
+        from egosim_jax.generation.batch import BatchJob
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.worlds.tabletop.dataset import write_scenes
 

@@ -9,7 +9,6 @@ from typing import Annotated, cast
 
 import tyro
 
-from egosim_jax.command import ExitCode
 from egosim_jax.data.readers import Reader
 from egosim_jax.data.readers.agibot import AgiBot
 from egosim_jax.data.readers.colmap import Colmap
@@ -22,7 +21,8 @@ from egosim_jax.data.readers.nerfstudio import Nerfstudio
 from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.data.readers.trumans import Trumans
-from egosim_jax.progress import track
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.progress import track
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 
 if TYPE_CHECKING:
     from egosim_jax.io.hub import Listing, Release

@@ -12,14 +12,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:
-    from egosim_jax.env.actions import ActionSpec
-    from egosim_jax.env.backends import GeneratedWorld
-    from egosim_jax.env.start import Start
-    from egosim_jax.play.page import LocalServer
+    from egosim_jax.interactive.env.action_spec import ActionSpec
+    from egosim_jax.interactive.env.backends import GeneratedWorld
+    from egosim_jax.interactive.env.start import Start
+    from egosim_jax.interactive.play.viewer import LocalServer
 
 HOST = "127.0.0.1"
 """Address of the page: viser asks nobody for a password."""
@@ -63,14 +63,14 @@ class Play:
         check_seed(self.seed, name="--seed")
         self._check_port()
         from egosim_jax import configs
-        from egosim_jax.env.actions import ActionSpec
-        from egosim_jax.env.backends import GeneratedWorld
-        from egosim_jax.env.streaming import Streamer
-        from egosim_jax.generator import Generator
+        from egosim_jax.generation.generator import Generator
+        from egosim_jax.generation.stream import Streamer
+        from egosim_jax.interactive.env.action_spec import ActionSpec
+        from egosim_jax.interactive.env.backends import GeneratedWorld
+        from egosim_jax.interactive.play.played import Played
+        from egosim_jax.interactive.play.viewer import Page
         from egosim_jax.io.atomic import lock_folder
         from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.play.page import Page
-        from egosim_jax.play.played import Played
 
         share_with_jax()
         config = configs.get(self.config)
@@ -111,8 +111,8 @@ class Play:
                 ) from error
 
     def _start(self, world: GeneratedWorld, spec: ActionSpec) -> Start:
-        from egosim_jax.env.start import Start
-        from egosim_jax.episode import Episode
+        from egosim_jax.interactive.env.start import Start
+        from egosim_jax.simulation.episode import Episode
 
         if self.episode is None:
             return world.start(self.seed, spec)
@@ -121,7 +121,7 @@ class Play:
         return Start.of(episode, seed=int(seed) if seed.isdecimal() else self.seed)
 
     def _serve(self) -> LocalServer:
-        from egosim_jax.play.page import LocalServer
+        from egosim_jax.interactive.play.viewer import LocalServer
 
         with contextlib.redirect_stdout(sys.stderr):  # viser greets
             return LocalServer(HOST, self.port, verbose=False)

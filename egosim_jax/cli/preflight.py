@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 from math import prod
 from typing import TYPE_CHECKING, Any
 
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import MeshConfig, check_counts
 
 if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.preflight.report import OutOfMemory, Report
     from egosim_jax.preflight.targets import Target
 
@@ -81,8 +81,8 @@ def compile_generation(
     """Yield the report of each program of generation, with the weights of all networks resident."""
     from flax import nnx
 
-    from egosim_jax.generator import Generator
-    from egosim_jax.networks import Networks
+    from egosim_jax.configs.model import Networks
+    from egosim_jax.generation.generator import Generator
     from egosim_jax.preflight.report import compile_for
 
     networks = Networks.abstract(config)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, check_counts, check_seed
 
 
@@ -47,10 +47,11 @@ class Rank:
 
     def run(self) -> int:
         """Check the goal, generate every candidate, rank."""
-        from egosim_jax import configs, ranking
-        from egosim_jax.batch import BatchJob
+        from egosim_jax import configs
         from egosim_jax.data.metadata import read_metadata
         from egosim_jax.data.windows import windows_of
+        from egosim_jax.generation import rank
+        from egosim_jax.generation.batch import BatchJob
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.io.images import read_image
 
@@ -73,10 +74,10 @@ class Rank:
         if self.goal_image is not None:
             goal, measure = str(self.goal_image), "-LPIPS of the last frame to the goal"
             video = config.video
-            score = ranking.by_picture(read_image(self.goal_image), (video.height, video.width))
+            score = rank.by_picture(read_image(self.goal_image), (video.height, video.width))
         else:
             goal, measure = str(self.goal_text), "similarity of the video to the goal"
-            score = ranking.by_text(goal, self.xclip)
+            score = rank.by_text(goal, self.xclip)
         windows = windows_of(read_metadata(self.actions), (0,))
         if len(windows) < 2:
             raise InputError(
@@ -99,5 +100,5 @@ class Rank:
             )
             for seed in range(self.seed, self.seed + self.seeds)
         ]
-        ranking.report(ranking.rank(jobs, windows, score), self.out, goal=goal, measure=measure)
+        rank.report(rank.rank(jobs, windows, score), self.out, goal=goal, measure=measure)
         return ExitCode.DONE

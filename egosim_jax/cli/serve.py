@@ -8,11 +8,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from egosim_jax.command import ExitCode, HelpGroups
+from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
-    from egosim_jax.serving.service import Service
+    from egosim_jax.interactive.server.service import Service
 
 TOKEN = "EGOSIM_TOKEN"  # noqa: S105 - the name of the variable that has it
 NEEDS = ("fastapi", "uvicorn", "websockets", "msgpack", "prometheus_client")
@@ -75,7 +75,7 @@ class Serve:
         check_counts({"--batch": self.batch, "--steps": self.steps, "--threads": self.threads})
         if not 0 <= self.port < 1 << 16:
             raise InputError(f"--port must be from 0 to 65535, not {self.port}.")
-        from egosim_jax.serving.server import bind, serve
+        from egosim_jax.interactive.server.server import bind, serve
 
         token = os.environ.get(TOKEN, "").strip() or None
         with bind(self.host, self.port, token=token) as bound:
@@ -88,8 +88,8 @@ class Serve:
         return ExitCode.DONE
 
     def _service(self) -> Service:
-        from egosim_jax.serving.service import open_service
-        from egosim_jax.serving.store import Limits
+        from egosim_jax.interactive.server.service import open_service
+        from egosim_jax.interactive.server.store import Limits
 
         limits = Limits(
             sessions=self.sessions,

@@ -10,16 +10,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from egosim_jax.command import ExitCode, HelpGroups
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import up_of, write_portrait
-from egosim_jax.rendering.recording import RECORDING, Recording
+from egosim_jax.rendering.rerun_log import RECORDING, Recording
+from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.types import InputError, VideoSpec, check_counts, check_seed
 
 if TYPE_CHECKING:
-    from egosim_jax.episode import Episode
-    from egosim_jax.simulator import Simulator, Step
+    from egosim_jax.simulation.episode import Episode
+    from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.types import Action, GroundTruth, SceneState
 
 PICTURES = 6
@@ -73,17 +73,17 @@ class Simulate:
     def run(self) -> int:
         """Simulate; write videos, states and scores."""
         from egosim_jax import configs, rendering
-        from egosim_jax.generator import Generator
+        from egosim_jax.evaluation.metrics.loop import DEFINITIONS
+        from egosim_jax.generation.generator import Generator
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.io.fingerprint import fingerprint
         from egosim_jax.io.journal import Journal
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes
-        from egosim_jax.metrics.loop import DEFINITIONS
         from egosim_jax.perception import registry
         from egosim_jax.perception.recorded import RecordedConfig
-        from egosim_jax.rollout import OUTPUTS, Rollout
-        from egosim_jax.simulator import Simulator
+        from egosim_jax.simulation.rollout import OUTPUTS, Rollout
+        from egosim_jax.simulation.simulator import Simulator
 
         check_counts({"--clips": self.clips, "--steps": self.steps})
         check_seed(self.seed)
@@ -130,7 +130,7 @@ class Simulate:
 
     def _episode(self, video: VideoSpec) -> Episode:
         """Return the episode to simulate, with the chosen clips and first frame."""
-        from egosim_jax.episode import Episode
+        from egosim_jax.simulation.episode import Episode
 
         if self.episode is not None:
             if self.robot:
@@ -228,7 +228,7 @@ class _Outputs:
     def _score(self, step: Step, action: Action, truth: GroundTruth | None) -> dict[str, float]:
         if truth is None:
             return {}
-        from egosim_jax.metrics.loop import score_step
+        from egosim_jax.evaluation.metrics.loop import score_step
 
         return score_step(
             step.clip.frames,
@@ -269,8 +269,8 @@ class _Outputs:
 
 
 def _print(report: Sequence[Mapping[str, Any]]) -> None:
-    from egosim_jax.metrics.loop import MEASURES
-    from egosim_jax.metrics.report import print_table
+    from egosim_jax.evaluation.metrics.loop import MEASURES
+    from egosim_jax.evaluation.metrics.report import print_table
 
     scored = {name for line in report for name in line}
     shown = {name: measure for name, measure in MEASURES.items() if name in scored}

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from egosim_jax.cli.comparison import Options
-from egosim_jax.command import ExitCode
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
 Name = Literal[

@@ -8,13 +8,13 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.command import ExitCode
 from egosim_jax.data.metadata import Prompts
-from egosim_jax.progress import track
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.rendering.mesh import MovingMesh
 
 
@@ -58,10 +58,10 @@ class Static:
 
     def run(self) -> int:
         """Read, render and write."""
-        from egosim_jax.actions import read_action
-        from egosim_jax.conditions import repeated, static_of, static_triplet
         from egosim_jax.data.clips import write_clips
+        from egosim_jax.generation.export import repeated, static_of, static_triplet
         from egosim_jax.io.video import read_video
+        from egosim_jax.simulation.actions import read_action
 
         check_counts({"--fps": self.fps})
         action = read_action(self.action, height=self.height, width=self.width, prompt=self.prompt)
@@ -130,8 +130,8 @@ class Align:
         from rich.table import Column, Table
 
         from egosim_jax.data.metadata import read_metadata, select
+        from egosim_jax.evaluation.metrics.alignment import align_clip
         from egosim_jax.io.run import write_json
-        from egosim_jax.metrics.alignment import align_clip
 
         clips = select(read_metadata(self.metadata), where=self.where, limit=self.limit)
         table = Table(

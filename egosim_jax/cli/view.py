@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.command import ExitCode
 from egosim_jax.io.journal import NAME as JOURNAL
 from egosim_jax.rendering.portrait import Up, up_of, write_portrait
-from egosim_jax.rendering.recording import RECORDING
-from egosim_jax.train.page import PAGE, stages_of, write_page
+from egosim_jax.rendering.rerun_log import RECORDING
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.train.run_page import PAGE, stages_of, write_page
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

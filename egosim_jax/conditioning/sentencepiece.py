@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egosim_jax.io.untrusted import quote_path, read_bytes
+from egosim_jax.io.untrusted.bounded import quote_path, read_bytes
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
 
-MOST_BYTES, MOST_PIECES = 64 << 20, 1 << 20
+MAX_BYTES, MAX_PIECES = 64 << 20, 1 << 20
 """Largest file in bytes, and most pieces."""
 UNIGRAM, UNKNOWN, BYTE = 1, 2, 6
 """Number of the unigram model, and of the kinds of pieces for the unknown and for bytes."""
@@ -46,7 +46,7 @@ def read_spiece(path: Path) -> Tokenizer:
     pieces: list[tuple[str, float]] = []
     kind, unknown, characters, by_byte = UNIGRAM, None, b"", False
     try:
-        for number, value in fields(read_bytes(path, limit=MOST_BYTES)):
+        for number, value in fields(read_bytes(path, limit=MAX_BYTES)):
             if number == PIECES:
                 found = dict(fields(value))
                 pieces.append((found[TEXT].decode(), struct.unpack("<f", found[SCORE])[0]))
@@ -58,10 +58,10 @@ def read_spiece(path: Path) -> Tokenizer:
                 characters = dict(fields(value)).get(CHARACTERS, b"")
     except (ValueError, KeyError, AttributeError, TypeError, IndexError, struct.error) as error:
         raise InputError(f"{quote_path(path)} is damaged: {error}. Copy it again.") from error
-    if kind != UNIGRAM or unknown is None or len(pieces) > MOST_PIECES:
+    if kind != UNIGRAM or unknown is None or len(pieces) > MAX_PIECES:
         raise InputError(
             f"{quote_path(path)} cannot be read: it must be a unigram model with an unknown piece "
-            f"and at most {MOST_PIECES:,} pieces; it has {len(pieces)} pieces of a model of kind "
+            f"and at most {MAX_PIECES:,} pieces; it has {len(pieces)} pieces of a model of kind "
             f"{kind}. Give the spiece.model of T5."
         )
     pieces += [(f"<extra_id_{number}>", 0.0) for number in reversed(range(EXTRA_IDS))]

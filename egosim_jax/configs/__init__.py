@@ -16,7 +16,7 @@ from egosim_jax.io import hub
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 
 SHIPPED = Path(__file__).parents[1] / "weights"

@@ -10,6 +10,7 @@ from pathlib import Path
 from egosim_jax.conditioning.layout import DWM
 from egosim_jax.conditioning.posterior import EncodingNoise
 from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import VariancePreserving
@@ -17,7 +18,6 @@ from egosim_jax.diffusion.solver import DDIM
 from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
 from egosim_jax.models.cogvideox.t5 import T5Config
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
-from egosim_jax.networks import ModelConfig
 from egosim_jax.types import VideoSpec
 
 CONFIG = ModelConfig(

@@ -6,6 +6,7 @@ dwm_tabletop`. Clips of 17 frames of 160 x 96; 10 DDIM steps, guided by the empt
 
 from egosim_jax.conditioning.layout import DWM
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import VariancePreserving
@@ -13,7 +14,6 @@ from egosim_jax.diffusion.solver import DDIM
 from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
 from egosim_jax.models.cogvideox.t5 import T5Config
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
-from egosim_jax.networks import ModelConfig
 from egosim_jax.types import VideoSpec
 
 CONFIG = ModelConfig(

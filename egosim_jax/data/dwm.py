@@ -26,7 +26,7 @@ from egosim_jax.data.metadata import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, P
 from egosim_jax.data.readers import inside, make_id
 from egosim_jax.data.static import check_observed
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes
+from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError, Triplet
 

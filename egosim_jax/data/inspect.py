@@ -12,7 +12,7 @@ import numpy as np
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.sheet import SheetClip
 from egosim_jax.data.transforms import decode_record, record_length, video_shape
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, VideoSpec
 
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from egosim_jax.io.untrusted import quote, quote_path, quote_text, read_bytes, read_lines
+from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes, read_lines
 from egosim_jax.types import InputError, check_counts
 
 REQUIRED = ("ego_prior_video", "prompt")

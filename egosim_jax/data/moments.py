@@ -15,8 +15,8 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import Float32
 
-from egosim_jax.io.pth import read_pth, write_pth
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.untrusted.pth import read_pth, write_pth
 from egosim_jax.types import InputError
 
 FOLDERS = {
@@ -26,9 +26,9 @@ FOLDERS = {
     "text": "prompt_embeds_rewrite",
 }
 """Folder of the caches of each array of a record."""
-MOST_DIFFERENT = 0.05
+MAX_DIFFERENT = 0.05
 """Largest relative difference of cached latents, RMS: bfloat16 rounds by up to 0.004."""
-MOST_DIFFERENT_STD = 0.25
+MAX_DIFFERENT_STD = 0.25
 """The same of their deviations, as exp(logvar / 2) multiplies the errors of a network."""
 
 
@@ -71,7 +71,7 @@ def write_moments(
 
 
 def check_alike(
-    path: Path, cached: np.ndarray, encoded: np.ndarray, *, most: float = MOST_DIFFERENT
+    path: Path, cached: np.ndarray, encoded: np.ndarray, *, most: float = MAX_DIFFERENT
 ) -> None:
     """Raise `InputError` if cached values are not those that were encoded again."""
     difference = float(np.sqrt(np.square(cached - encoded).mean() / np.square(encoded).mean()))

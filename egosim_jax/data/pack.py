@@ -14,12 +14,12 @@ from egosim_jax.data.metadata import ClipFiles, check_presence
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import Resampling, decode_record, video_shape
-from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.decoding import Decoding
-from egosim_jax.io.untrusted import listing, read_bytes
+from egosim_jax.io.untrusted.bounded import listing, read_bytes
 from egosim_jax.io.video import probe_encoded
 from egosim_jax.types import InputError, Triplet, VideoSpec
+from egosim_jax.types.grid import WAN_GRID, VideoGrid
 
 MAX_FILE = 1 << 28
 """Maximum size of a source file that is packed, in bytes."""

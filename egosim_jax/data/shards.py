@@ -38,11 +38,11 @@ from egosim_jax.data.manifest import (
     write_manifest,
 )
 from egosim_jax.data.records import DTYPES, Record, RecordError, from_bytes, to_bytes
-from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.io.atomic import LOCK, atomic_folder
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted import listing, quote_text
+from egosim_jax.io.untrusted.bounded import listing, quote_text
 from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types.grid import WAN_GRID, VideoGrid
 
 _OPTIONS = "group_size:1,uncompressed"
 

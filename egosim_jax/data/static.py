@@ -10,7 +10,7 @@ from egosim_jax.types import InputError
 
 HALF_WHITE = 127
 """Highest gray level that is not above one half of 255."""
-MOST_UNOBSERVED = 0.01
+MAX_UNOBSERVED = 0.01
 """Largest share of unobserved pixels in a static video: pinholes between rendered points."""
 FIX = "Make others with `egosim data make tabletop --prior static --hands mesh`"
 
@@ -18,10 +18,10 @@ FIX = "Make others with `egosim data make tabletop --prior static --hands mesh`"
 def check_observed(mask: UInt8[np.ndarray, "f h w"]) -> None:
     """Raise `InputError` if a mask video (255 = not observed) has more than pinholes."""
     share = np.count_nonzero(mask > HALF_WHITE) / mask.size
-    if share > MOST_UNOBSERVED:
+    if share > MAX_UNOBSERVED:
         raise InputError(
             f"The mask says that {share:.1%} of the pixels were not observed: the static video of "
-            f"DWM must show all of the scene, but for {MOST_UNOBSERVED:.0%}, as it has no mask. "
+            f"DWM must show all of the scene, but for {MAX_UNOBSERVED:.0%}, as it has no mask. "
             f"{FIX}, or with `egosim data static` from a scene that fills the view."
         )
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from egosim_jax.data.metadata import ClipFiles, is_safe_id
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted import quote_path, read_lines
+from egosim_jax.io.untrusted.bounded import quote_path, read_lines
 from egosim_jax.types import InputError
 
 RESULTS = "results.jsonl"

@@ -17,11 +17,11 @@ from jaxtyping import Bool, UInt8
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
 from egosim_jax.evaluation.methods import Shape, read_at
+from egosim_jax.evaluation.metrics.depth import depth_error
+from egosim_jax.evaluation.metrics.hands import hand_iou, hand_recall, keypoint_errors
+from egosim_jax.evaluation.metrics.region import region_psnr
+from egosim_jax.evaluation.metrics.trajectory import path_errors
 from egosim_jax.io.digest import sha256
-from egosim_jax.metrics.depth import depth_error
-from egosim_jax.metrics.hands import hand_iou, hand_recall, keypoint_errors
-from egosim_jax.metrics.region import region_psnr
-from egosim_jax.metrics.trajectory import path_errors
 from egosim_jax.perception.estimates import (
     CameraEstimate,
     CameraEstimator,

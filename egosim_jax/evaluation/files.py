@@ -20,10 +20,10 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
+from egosim_jax.evaluation.metrics.report import cell_of
 from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_json, write_text
-from egosim_jax.metrics.report import cell_of
 
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",

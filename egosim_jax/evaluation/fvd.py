@@ -10,7 +10,7 @@ import numpy as np
 
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
-from egosim_jax.metrics.frechet import frechet_distance
+from egosim_jax.evaluation.metrics.frechet import frechet_distance
 from egosim_jax.perception.networks.video_mae import VideoMae
 
 COLUMN = Column("FVD (VideoMAE)", "{:.2f}", "lower")

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.data.windows import Window
-from egosim_jax.metrics import lpips
-from egosim_jax.metrics.dreamsim import DEFINITION, DreamSim
-from egosim_jax.metrics.image import clip_psnr, color_drift, psnr, ssim
-from egosim_jax.metrics.report import DEFINITIONS
+from egosim_jax.evaluation.metrics import lpips
+from egosim_jax.evaluation.metrics.dreamsim import DEFINITION, DreamSim
+from egosim_jax.evaluation.metrics.image import clip_psnr, color_drift, psnr, ssim
+from egosim_jax.evaluation.metrics.report import DEFINITIONS
 
 VERSION = 1
 """Version of all measures; another one makes cached scores invalid."""

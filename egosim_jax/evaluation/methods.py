@@ -18,9 +18,9 @@ from jaxtyping import UInt8
 from egosim_jax.data.metadata import is_safe_id
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
-from egosim_jax.io.untrusted import quote_path, quote_text
+from egosim_jax.evaluation.metrics.image import fit_colors
+from egosim_jax.io.untrusted.bounded import quote_path, quote_text
 from egosim_jax.io.video import read_video
-from egosim_jax.metrics.image import fit_colors
 from egosim_jax.types import InputError
 
 MAX_BORDER_PX = 8

@@ -9,9 +9,14 @@ from typing import Any
 from egosim_jax.evaluation.fvd import distance_of, is_feature
 from egosim_jax.evaluation.measures import Column, columns_of
 from egosim_jax.evaluation.methods import FIT
+from egosim_jax.evaluation.metrics import lpips
+from egosim_jax.evaluation.metrics.report import (
+    DEFINITIONS,
+    paired_difference,
+    print_table,
+    summarize,
+)
 from egosim_jax.evaluation.scoring import Protocol, Row, Scores, Scoring
-from egosim_jax.metrics import lpips
-from egosim_jax.metrics.report import DEFINITIONS, paired_difference, print_table, summarize
 
 KNOWN = {
     "depth_err": Column("Depth ERR of the paper", "{:.3f}", "lower"),

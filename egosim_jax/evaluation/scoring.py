@@ -24,9 +24,9 @@ from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.fingerprint import fingerprint
-from egosim_jax.io.untrusted import read_lines
+from egosim_jax.io.untrusted.bounded import read_lines
 from egosim_jax.io.video import probe_video
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 
 CACHE = "scores_cache.jsonl"

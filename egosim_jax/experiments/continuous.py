@@ -8,18 +8,18 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 
+from egosim_jax.evaluation.metrics.loop import DEFINITIONS, MEASURES, score_step
+from egosim_jax.evaluation.metrics.report import Summary, paired_differences, print_table, summarize
 from egosim_jax.experiments.config import Continuous
 from egosim_jax.experiments.model import open_experiment
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import read_json
-from egosim_jax.metrics.loop import DEFINITIONS, MEASURES, score_step
-from egosim_jax.metrics.report import Summary, paired_differences, print_table, summarize
+from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.perception import registry
-from egosim_jax.progress import track
-from egosim_jax.rollout import Rollout
-from egosim_jax.simulator import Simulator
+from egosim_jax.runtime.progress import track
+from egosim_jax.simulation.rollout import Rollout
+from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.types import check_counts
 from egosim_jax.worlds.tabletop import make_sequence, to_episode
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.sheet import draw_sheet
+from egosim_jax.evaluation.metrics.report import paired_differences, print_table
 from egosim_jax.experiments.config import DWM
 from egosim_jax.experiments.dwm_training import Training, changed
 from egosim_jax.experiments.dwm_variants import PAPER, VARIANTS, Camera, Hands
@@ -31,11 +32,10 @@ from egosim_jax.experiments.scenes import (
     reconstruct,
 )
 from egosim_jax.experiments.tabletop import over_seeds, summarize_runs
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder, write_json
-from egosim_jax.metrics.report import paired_differences, print_table
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, check_counts, check_seed
 
 CAMERAS: tuple[Camera, ...] = ("moving", "fixed")

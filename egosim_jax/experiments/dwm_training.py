@@ -20,6 +20,7 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.widen import Widening
 from egosim_jax.data.manifest import MANIFEST
 from egosim_jax.data.mixing import write_mixture
@@ -39,12 +40,11 @@ from egosim_jax.experiments.dwm_variants import (
     with_layout,
 )
 from egosim_jax.experiments.embodiment import train_config
-from egosim_jax.generator import batches
+from egosim_jax.generation.generator import batches
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_safetensors
-from egosim_jax.networks import ModelConfig, Networks
-from egosim_jax.progress import track
 from egosim_jax.rendering.mesh import hand_mask
+from egosim_jax.runtime.progress import track
 from egosim_jax.train import loop
 from egosim_jax.train.encode import Encoding
 from egosim_jax.train.fine_tuning import write_trained

@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 
 from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.sheet import draw_sheet
+from egosim_jax.evaluation.metrics.report import Summary, print_table, summarize
 from egosim_jax.experiments.config import Embodiment, Hyperparameters
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
@@ -28,14 +30,12 @@ from egosim_jax.experiments.scenes import (
     generate,
     reconstruct,
 )
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder, write_json
-from egosim_jax.io.untrusted import read_lines
+from egosim_jax.io.untrusted.bounded import read_lines
 from egosim_jax.io.weights import hashes
-from egosim_jax.metrics.report import Summary, print_table, summarize
-from egosim_jax.networks import ModelConfig
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.train import loop
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.encode import encode_shards

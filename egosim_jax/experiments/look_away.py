@@ -16,19 +16,19 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.evaluation.metrics import region
+from egosim_jax.evaluation.metrics.report import paired_differences, print_table, summarize
+from egosim_jax.evaluation.metrics.state_update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.experiments.config import LookAway
 from egosim_jax.experiments.continuous import METHODS
 from egosim_jax.experiments.model import open_experiment
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, transform
 from egosim_jax.io.run import write_json
-from egosim_jax.metrics import region
-from egosim_jax.metrics.report import paired_differences, print_table, summarize
-from egosim_jax.metrics.update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.perception import registry
-from egosim_jax.progress import track
-from egosim_jax.rollout import Rollout, load_clip
-from egosim_jax.simulator import Simulator
+from egosim_jax.runtime.progress import track
+from egosim_jax.simulation.rollout import Rollout, load_clip
+from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Clip, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import (

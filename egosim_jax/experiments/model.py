@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from egosim_jax import configs
 from egosim_jax.experiments.config import ModelExperiment
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes
 from egosim_jax.types import check_counts, check_seed

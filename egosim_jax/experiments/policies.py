@@ -14,17 +14,17 @@ from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.evaluation.metrics import rank_correlation, region
+from egosim_jax.evaluation.metrics.report import Summary, print_table
 from egosim_jax.experiments.config import Policies
 from egosim_jax.experiments.model import open_experiment
-from egosim_jax.generator import Generator, batches
+from egosim_jax.generation.generator import Generator, batches
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.npz import read_arrays
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import read_json
-from egosim_jax.metrics import ranking, region
-from egosim_jax.metrics.report import Summary, print_table
+from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import Perception, registry
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Cameras, Clip, SceneState, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Scene, Script, World, make_scripts
@@ -57,7 +57,7 @@ DEFINITIONS = {
     "depth, of that of the object at the goal; median over the last 3 frames in which the hand "
     "does not hide it; else no success",
     "state": "the same as true by the pose of the object in the state after the generated clip",
-    **ranking.DEFINITIONS,
+    **rank_correlation.DEFINITIONS,
 }
 
 
@@ -260,13 +260,15 @@ def _report(out: Path, found: Mapping[str, Sequence[Outcomes]], *, judges: Seque
         }
         for row, policy in enumerate(POLICIES)
     }
-    agreement = {judge: ranking.agreement(success[judge], success["true"]) for judge in judges}
+    agreement = {
+        judge: rank_correlation.agreement(success[judge], success["true"]) for judge in judges
+    }
     scenes = len(found["true"])
     report = {"definitions": DEFINITIONS, "scenes": scenes, "table": rows, "agreement": agreement}
     write_json(out / "report.json", report)
     print_table("policy", rows, MEASURES, title=f"success in {scenes} scenes")
     title = "agreement with true success, with its 95 % interval"
-    print_table("success read from", agreement, ranking.MEASURES, title=title)
+    print_table("success read from", agreement, rank_correlation.MEASURES, title=title)
     _plot(rows, out / "ranking.png", judges)
 
 

@@ -7,16 +7,16 @@ from itertools import islice
 
 import numpy as np
 
+from egosim_jax.evaluation.metrics.rank_correlation import spearman
+from egosim_jax.evaluation.metrics.report import paired_difference, print_table
 from egosim_jax.experiments.config import Rank
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import conditions_of
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
+from egosim_jax.generation.rank import by_picture
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import read_json
-from egosim_jax.metrics.ranking import spearman
-from egosim_jax.metrics.report import paired_difference, print_table
-from egosim_jax.progress import track
-from egosim_jax.ranking import by_picture
+from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 from egosim_jax.worlds.tabletop.twins import with_conditions
@@ -30,7 +30,7 @@ DEFINITIONS = {
     "spearman": "rank correlation of the scores of a goal's candidates with those of their true "
     "videos; mean over goals, 95 % interval of the bootstrap over goals",
 }
-MOST_TRIES = 200
+MAX_TRIES = 200
 """Actions of a scene that are tried, of which different ones are kept."""
 METHODS = {"generated": "generated videos", "autoencoder": "ground truth through the autoencoder"}
 
@@ -99,7 +99,7 @@ def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
 
     def different() -> Iterator[int]:
         seen: set[str] = set()
-        for action in range(MOST_TRIES):
+        for action in range(MAX_TRIES):
             caption = next(make_sequence(seed, spec=small, action=action)).caption
             if caption not in seen:
                 seen.add(caption)

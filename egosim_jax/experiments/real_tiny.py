@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax import configs
-from egosim_jax.batch import BatchJob
 from egosim_jax.data.metadata import ClipFiles, read_metadata
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import read_results, windows_of
 from egosim_jax.evaluation import evaluate
 from egosim_jax.experiments.config import RealTiny
+from egosim_jax.generation.batch import BatchJob
 from egosim_jax.io.run import write_json, write_text
 from egosim_jax.io.video import read_video
 from egosim_jax.train.recipes import REAL_TINY

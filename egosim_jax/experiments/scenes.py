@@ -9,11 +9,11 @@ from typing import Literal
 
 import numpy as np
 
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.sheet import SheetClip
-from egosim_jax.generator import Generator, batches
-from egosim_jax.metrics import lpips, region
-from egosim_jax.metrics.report import score
-from egosim_jax.networks import ModelConfig
+from egosim_jax.evaluation.metrics import lpips, region
+from egosim_jax.evaluation.metrics.report import score
+from egosim_jax.generation.generator import Generator, batches
 from egosim_jax.types import Kind, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND

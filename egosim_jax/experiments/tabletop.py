@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.sheet import draw_sheet
+from egosim_jax.evaluation.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.experiments.config import Tabletop
 from egosim_jax.experiments.failures import worst
 from egosim_jax.experiments.model import open_experiment
@@ -25,11 +27,9 @@ from egosim_jax.experiments.scenes import (
     generate,
     reconstruct,
 )
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.run import write_json
-from egosim_jax.metrics.report import paired_differences, print_table, summarize
-from egosim_jax.networks import ModelConfig
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import Kind, check_counts
 
 Table = dict[str, dict[str, dict[str, float]]]

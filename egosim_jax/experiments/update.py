@@ -8,16 +8,20 @@ from itertools import count, islice
 
 import numpy as np
 
+from egosim_jax.evaluation.metrics.report import print_table, summarize
+from egosim_jax.evaluation.metrics.state_update import (
+    ON_SURFACE_M,
+    object_accuracy,
+    symmetric_distance,
+)
 from egosim_jax.experiments.config import Update
 from egosim_jax.experiments.model import open_experiment
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.io.run import write_json
-from egosim_jax.metrics.report import print_table, summarize
-from egosim_jax.metrics.update import ON_SURFACE_M, object_accuracy, symmetric_distance
 from egosim_jax.perception import registry
-from egosim_jax.progress import track
 from egosim_jax.rendering.reference import render
+from egosim_jax.runtime.progress import track
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action, to_ground_truth

@@ -28,7 +28,7 @@ from av.video.stream import VideoStream
 
 from egosim_jax.io.boxes import check_boxes
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
-from egosim_jax.io.untrusted import open_regular, quote_path, refusing
+from egosim_jax.io.untrusted.bounded import open_regular, quote_path, refusing
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000

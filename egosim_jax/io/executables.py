@@ -25,14 +25,15 @@ from typing import Any
 
 import jax
 
-from egosim_jax.io.private import PrivateCache
+from egosim_jax.io.untrusted.private import PrivateCache
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
 VARIABLES = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
 TRACED = (
-    "conditioning", "diffusion", "models", "encoding.py", "env/streaming.py", "generator.py",
-    "grid.py", "networks.py", "program.py", "sharding.py", "types.py",
+    "conditioning", "configs/model.py", "diffusion", "generation/compiled.py",
+    "generation/encoding.py", "generation/generator.py", "generation/stream.py", "models",
+    "sharding.py", "types",
 )  # fmt: skip
 """Modules that run while a function is traced, and so determine what is compiled."""
 FOLDER, MAX_FILES = "executables", 64

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from egosim_jax.io.atomic import LOG, PART, lock_folder
-from egosim_jax.io.private import cache_folder
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted import open_regular, quote, quote_text, read_json
-from egosim_jax.progress import track_bytes
+from egosim_jax.io.untrusted.bounded import open_regular, quote, quote_text, read_json
+from egosim_jax.io.untrusted.private import cache_folder
+from egosim_jax.runtime.progress import track_bytes
 from egosim_jax.types import InputError
 
 T = TypeVar("T")

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import ml_dtypes
 import numpy as np
 
-from egosim_jax.io.untrusted import (
+from egosim_jax.io.untrusted.bounded import (
     MAX_JSON_BYTES,
     open_regular,
     parse_json,
@@ -46,7 +46,7 @@ CODES = {
     }.items()
 }  # fmt: skip
 """NumPy dtypes by their code in safetensors headers."""
-MOST_TENSORS, LONGEST_NAME, LARGEST, MOST_AXES = 1 << 17, 512, 1 << 48, 32
+MAX_TENSORS, LONGEST_NAME, LARGEST, MAX_AXES = 1 << 17, 512, 1 << 48, 32
 """Limits: tensors per file, characters per name, bytes and axes per tensor."""
 POINTER = b"version https://git-lfs.github.com/spec/"
 """First bytes of a Git LFS pointer file."""
@@ -203,8 +203,8 @@ def _parts(path: Path) -> tuple[dict[str, Any], memoryview]:
         raise RefusedError(f"its header has {length:,} bytes; the limit is {MAX_JSON_BYTES:,}")
     text = bytes(data[8 : 8 + length])
     header = parse_json(text, source=f"The header of {quote_path(path)}")
-    if not isinstance(header, dict) or len(header) > MOST_TENSORS:
-        raise RefusedError(f"its header is not a JSON object of at most {MOST_TENSORS:,} tensors")
+    if not isinstance(header, dict) or len(header) > MAX_TENSORS:
+        raise RefusedError(f"its header is not a JSON object of at most {MAX_TENSORS:,} tensors")
     metadata = header.get(METADATA, {})
     if not isinstance(metadata, dict) or not all(isinstance(v, str) for v in metadata.values()):
         raise RefusedError(f"its {METADATA} is not a JSON object of strings")
@@ -239,8 +239,8 @@ def _tensor(name: str, entry: Any, body: memoryview, checksums: str, path: Path)
     if code not in CODES:
         raise RefusedError(f"{quote(name)} has the unsupported dtype {quote_text(code)}")
     dtype = CODES[code]
-    if len(shape) > MOST_AXES:
-        raise RefusedError(f"{quote(name)} has {len(shape)} axes; the limit is {MOST_AXES}")
+    if len(shape) > MAX_AXES:
+        raise RefusedError(f"{quote(name)} has {len(shape)} axes; the limit is {MAX_AXES}")
     check_sizes(quote(name), (begin, end, *shape))
     strides = strides_of(quote(name), tuple(shape), dtype)
     if not begin <= end <= len(body) or end - begin != math.prod(shape) * dtype.itemsize:

@@ -30,7 +30,7 @@ from egosim_jax.io.decoding import (
     to_rgb,
     upright,
 )
-from egosim_jax.io.untrusted import quote_path, quote_text
+from egosim_jax.io.untrusted.bounded import quote_path, quote_text
 from egosim_jax.io.video import Video, VideoInfo
 from egosim_jax.types import InputError, check_counts
 

@@ -41,7 +41,7 @@ from egosim_jax.io.decoding import (
     to_rgb,
     upright,
 )
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError
 
 _SMPTE170M, _LIMITED_RANGE = 6, 1

@@ -27,7 +27,7 @@ from egosim_jax.io.mapped import (
     read_metadata,
     read_safetensors,
 )
-from egosim_jax.io.untrusted import listing, quote_path
+from egosim_jax.io.untrusted.bounded import listing, quote_path
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from egosim_jax.io.atomic import atomic_folder
-from egosim_jax.io.private import cache_folder
-from egosim_jax.io.untrusted import open_regular, quote_path, quote_text
+from egosim_jax.io.untrusted.bounded import open_regular, quote_path, quote_text
+from egosim_jax.io.untrusted.private import cache_folder
 from egosim_jax.types import InputError
 
 MAX_BYTES = 1 << 26

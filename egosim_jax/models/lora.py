@@ -23,7 +23,7 @@ from flax import nnx
 from jaxtyping import Float
 
 from egosim_jax.io.mapped import OURS
-from egosim_jax.io.untrusted import listing
+from egosim_jax.io.untrusted.bounded import listing
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError
@@ -55,7 +55,7 @@ class Value:
 
 Change = Delta | Value | np.ndarray
 """Low-rank change of the linear layer at a path, or value or difference of the weight at a path."""
-MOST_RANK = 2048
+MAX_RANK = 2048
 """Highest rank that is read; with the network's own widths it bounds the memory."""
 
 
@@ -240,8 +240,8 @@ def misfit(
         return "is not a linear layer"
     *stacked, wide, out = kernel
     rank = down[-1] if down else 0
-    if not 1 <= rank <= MOST_RANK:
-        return f"has rank {rank}; expected 1 to {MOST_RANK}"
+    if not 1 <= rank <= MAX_RANK:
+        return f"has rank {rank}; expected 1 to {MAX_RANK}"
     want = ((*stacked, wide, rank), (*stacked, rank, out))
     if (down, up) == want:
         return None

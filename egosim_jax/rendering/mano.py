@@ -20,9 +20,9 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int
 
-from egosim_jax.io.npz import read_arrays
-from egosim_jax.io.pickled_models import read_model
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.untrusted.pickled_models import read_model
 from egosim_jax.rendering.mesh import HAND_COLORS, MovingMesh, Side, join_meshes
 from egosim_jax.types import InputError
 

@@ -19,12 +19,12 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax import configs
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.metadata import MASK_NAME
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.video import write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.models.wan.config import WanDiTConfig
-from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.encode import example_shapes
 from egosim_jax.types import Triplet, VideoSpec
 

@@ -19,10 +19,10 @@ import numpy as np
 import tyro
 from jaxtyping import Bool
 
+from egosim_jax.evaluation.metrics import region
 from egosim_jax.experiments import scenes
 from egosim_jax.experiments.scenes import HeldOutClip
-from egosim_jax.generator import Generator
-from egosim_jax.metrics import region
+from egosim_jax.generation.generator import Generator
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 

@@ -32,12 +32,12 @@ import jax.numpy as jnp
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.encoding import Inputs
-from egosim_jax.generator import Generator
+from egosim_jax.configs.model import ModelConfig, Networks
+from egosim_jax.generation.encoding import Inputs
+from egosim_jax.generation.generator import Generator
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiT
-from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, compile_offline, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh

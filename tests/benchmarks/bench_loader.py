@@ -40,7 +40,7 @@ from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import DecodeWindow
 
 if TYPE_CHECKING:
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 BATCH = 8
 CLIPS, LATENTS = 16, 256

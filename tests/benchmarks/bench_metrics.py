@@ -4,7 +4,7 @@
 
 GENERATED and TARGET are video files. Ours: `psnr`, `ssim` and `frame_distances` with AlexNet.
 Theirs: torchmetrics' PSNR and SSIM if it is installed, else scikit-image's; and LPIPS computed
-eagerly in torch with the same weights (tests/unit/metrics/test_lpips.py). Each clip is measured by
+eagerly in torch with the same weights (tests/unit/evaluation/metrics/test_lpips.py). Each clip is measured by
 both in turn, after a warm-up of both on its first frame; printed are seconds a clip, the ratio of
 each pair and their median, and the largest differences of all frames' values. Both use all cores
 given to the process (taskset -c 0,1).
@@ -24,9 +24,9 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from egosim_jax.evaluation.methods import Shape, read_at
-from egosim_jax.metrics.image import psnr, ssim
-from egosim_jax.metrics.lpips import Lpips, frame_distances
-from tests.unit.metrics.test_lpips import torch_lpips
+from egosim_jax.evaluation.metrics.image import psnr, ssim
+from egosim_jax.evaluation.metrics.lpips import Lpips, frame_distances
+from tests.unit.evaluation.metrics.test_lpips import torch_lpips
 
 Values = dict[str, np.ndarray]
 """Values of all frames by measure."""

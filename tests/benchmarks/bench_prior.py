@@ -24,7 +24,7 @@ import tyro
 
 from egosim_jax import rendering
 from egosim_jax.data.sheet import SheetClip, draw_sheet
-from egosim_jax.metrics.image import decibels
+from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.perception.cameras import CameraLadder, undistort, undistort_pixels
 from egosim_jax.perception.depth import SweptDepth, points_per_pixel
 from egosim_jax.perception.hands import LandmarkHands, lift

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.serving.client import Client
+from egosim_jax.interactive.server.client import Client
 
 ROOT = Path(__file__).parents[2]
 

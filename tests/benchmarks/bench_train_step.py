@@ -33,7 +33,7 @@ from tests.benchmarks.bench_wan_dit import THREADS, interleave, interval
 if TYPE_CHECKING:
     import torch
 
-    from egosim_jax.networks import ModelConfig
+    from egosim_jax.configs.model import ModelConfig
 
 GOAL, BAR = 1.0, 1.25
 """Ratio of times, ours to theirs: what is aimed at, and what must not be exceeded."""
@@ -115,9 +115,9 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     import jax.numpy as jnp
     from flax import nnx
 
+    from egosim_jax.configs.model import Networks
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
     from egosim_jax.io.weights import fill
-    from egosim_jax.networks import Networks
     from egosim_jax.train.config import OptimizerConfig
     from egosim_jax.train.tasks.denoising import Denoising, condition_of
     from egosim_jax.train.update import TrainState, make_update

@@ -30,14 +30,14 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax import configs
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.diffusion.objective import Objective, sample_keys
 from egosim_jax.diffusion.process import Process
+from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.experiments import scenes
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.weights import place
-from egosim_jax.metrics import lpips
-from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train.loop import make_batches, validation_batches
 from egosim_jax.train.recipes import TABLETOP, TABLETOP_VAE

@@ -18,7 +18,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.video import to_model
-from egosim_jax.networks import Networks
+from egosim_jax.configs.model import Networks
 from egosim_jax.train.tasks.refining import Refining
 from egosim_jax.train.update import Batch, Metrics
 

@@ -28,6 +28,7 @@ from safetensors.numpy import save_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.configs.model import Networks
 from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.manifest import MANIFEST
@@ -39,9 +40,8 @@ from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted import read_lines
+from egosim_jax.io.untrusted.bounded import read_lines
 from egosim_jax.io.video import read_video, write_video
-from egosim_jax.networks import Networks
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.state import snapshot
 from egosim_jax.train import encode

@@ -20,7 +20,7 @@ from egosim_jax.convert.source import sources
 from egosim_jax.io import weights
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import CODES, Tensor, read_safetensors
-from egosim_jax.io.pickled_arrays import read_pickled_arrays
+from egosim_jax.io.untrusted.pickled_arrays import read_pickled_arrays
 from egosim_jax.models.lora import Delta
 from tests.fuzz.target import Mutate, Target
 

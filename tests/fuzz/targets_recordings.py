@@ -16,7 +16,7 @@ from egosim_jax.data.readers.colmap_model import read_model
 from egosim_jax.data.readers.lzfse import unpacked_size
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
-from egosim_jax.io import isolated
+from egosim_jax.io.untrusted import isolated
 from egosim_jax.types import InputError
 from tests.fuzz.target import Target
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.serving import wire
-from egosim_jax.serving.errors import RequestError
+from egosim_jax.interactive.server import wire
+from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.types import InputError
 from tests.fuzz.target import Target
 from tests.fuzz.targets_run import json_value
@@ -22,9 +22,9 @@ SESSION, WATCH = "fuzzed", "watched"
 @functools.cache
 def _service() -> Any:
     """Service of a painted world with a session that no message names."""
-    from egosim_jax.serving.metrics import Metrics
-    from egosim_jax.serving.service import Service
-    from egosim_jax.serving.store import Limits, Store
+    from egosim_jax.interactive.server.prometheus import Metrics
+    from egosim_jax.interactive.server.service import Service
+    from egosim_jax.interactive.server.store import Limits, Store
     from tests.painted import painted
 
     folder = Path(tempfile.mkdtemp())

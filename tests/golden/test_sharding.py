@@ -7,7 +7,7 @@ from flax import nnx
 from jax.sharding import AbstractMesh
 
 from egosim_jax import configs
-from egosim_jax.networks import Networks
+from egosim_jax.configs.model import Networks
 from egosim_jax.sharding import state_sharding
 
 GOLDEN = Path(__file__).with_name("sharding.txt")

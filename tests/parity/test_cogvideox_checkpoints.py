@@ -11,12 +11,12 @@ from safetensors.numpy import save_file
 from transformers import T5Config, T5EncoderModel
 
 from egosim_jax import configs
+from egosim_jax.configs.model import Networks
 from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.convert.lora import read_lora
 from egosim_jax.convert.tables import cogvideox_dit, cogvideox_vae, umt5
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.models.lora import apply
-from egosim_jax.networks import Networks
 from egosim_jax.types import InputError
 
 

@@ -18,16 +18,16 @@ from transformers import UMT5Config as TheirUMT5
 
 from egosim_jax import configs
 from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.encoding import Inputs, encode_condition
-from egosim_jax.generator import Generator, denoise
+from egosim_jax.generation.encoding import Inputs, encode_condition
+from egosim_jax.generation.generator import Generator, denoise
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.types import Triplet, VideoSpec
 from tests.translation import translate, translate_back
 

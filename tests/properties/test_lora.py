@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 from egosim_jax import configs
+from egosim_jax.configs.model import Networks
 from egosim_jax.convert.lora import exported, exported_metadata, read_lora
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.lora import Delta
-from egosim_jax.networks import Networks
 
 CONFIG = configs.get("debug").dit
 SHAPES = {

@@ -16,8 +16,8 @@ from PIL import Image
 from egosim_jax.cli import doctor
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
+from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.io.video import probe_video
-from egosim_jax.metrics import lpips
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
@@ -179,7 +179,7 @@ def test_bad_usage_is_one_message_before_anything_is_compiled(
     clips, tmp_path, capsys, monkeypatch, change, message
 ):
     monkeypatch.setattr(
-        "egosim_jax.generator.Generator.compile", lambda *_: pytest.fail("it compiled")
+        "egosim_jax.generation.generator.Generator.compile", lambda *_: pytest.fail("it compiled")
     )
     assert main(generate(clips, tmp_path / "out", *change)) == 2
     assert message in capsys.readouterr().err

@@ -8,9 +8,9 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.configs.model import Networks
 from egosim_jax.experiments.scenes import HeldOutClip
 from egosim_jax.io import weights
-from egosim_jax.networks import Networks
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ from safetensors.numpy import load_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
-from egosim_jax.networks import Networks
+from egosim_jax.configs.model import Networks
 
 MODELS = {"human", "full", "lora", "scratch"}
 ALIKE = {"steps": 2, "batch-size": 2, "warmup": 1, "learning-rate": 0.01}

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from egosim_jax.cli.__main__ import main
-from egosim_jax.episode import Episode
 from egosim_jax.io.video import probe_video
 from egosim_jax.rendering.skeleton import SKELETONS
+from egosim_jax.simulation.episode import Episode
 from egosim_jax.state.snapshot import save
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_episode

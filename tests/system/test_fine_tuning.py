@@ -12,9 +12,9 @@ import pytest
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.configs.model import Networks
 from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.io.mapped import read_metadata, read_safetensors
-from egosim_jax.networks import Networks
 from egosim_jax.train.__main__ import main as egosim_train
 from egosim_jax.train.distributed import free_local_address
 

@@ -10,7 +10,7 @@ from PIL import Image
 from egosim_jax import testing
 from egosim_jax.cli.table import TableCommand
 from egosim_jax.io.video import read_video, write_video
-from egosim_jax.train.page import write_page
+from egosim_jax.train.run_page import write_page
 from tests.training.finished import write_stage
 
 pytestmark = pytest.mark.slow

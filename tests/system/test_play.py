@@ -8,9 +8,9 @@ import pytest
 
 from egosim_jax import configs
 from egosim_jax.cli.play import Play
-from egosim_jax.episode import Episode
 from egosim_jax.geometry import invert, project, transform
-from egosim_jax.play.moves import first_goal
+from egosim_jax.interactive.play.moves import first_goal
+from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import opening
 from tests.browser import browse, playing
@@ -33,7 +33,7 @@ def test_the_denoising_steps_are_those_that_are_given(monkeypatch):
     def load(config, weights):
         raise InputError(f"{config.steps} steps")
 
-    monkeypatch.setattr("egosim_jax.generator.Generator.load", load)
+    monkeypatch.setattr("egosim_jax.generation.generator.Generator.load", load)
     for steps, loaded in ((2, 2), (None, configs.get("tabletop").steps)):
         with pytest.raises(InputError, match=f"^{loaded} steps"):
             Play(steps=steps, port=0).run()

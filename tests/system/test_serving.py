@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egosim_jax.serving.client import Client
+from egosim_jax.interactive.server.client import Client
 
 ROOT = Path(__file__).parents[2]
 STEPS = 4
@@ -32,7 +32,7 @@ NEEDS_OPENPI = pytest.mark.skipif(
 
 OURS = """
 import sys
-from egosim_jax.serving.client import Client
+from egosim_jax.interactive.server.client import Client
 def connect(port):
     client = Client(f"ws://127.0.0.1:{port}")
     return lambda name, **fields: client.request(name, **fields), client.server

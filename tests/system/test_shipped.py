@@ -13,10 +13,10 @@ from PIL import Image
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
-from egosim_jax.generator import Generator
+from egosim_jax.configs.model import Networks
+from egosim_jax.evaluation.metrics.report import score
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.digest import sha256
-from egosim_jax.metrics.report import score
-from egosim_jax.networks import Networks
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 EXPECTED, PICTURE = (Path(__file__).with_name(f"shipped.{end}") for end in ("json", "png"))

@@ -15,9 +15,10 @@ from safetensors.numpy import save_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main as egosim
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.__main__ import main as egosim_convert
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.models import (
     Denoiser,
@@ -28,7 +29,6 @@ from egosim_jax.models import (
     VideoCodecConfig,
 )
 from egosim_jax.models.lora import metadata
-from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.encode import check_encoders
 from egosim_jax.train.fine_tuning import FineTuning

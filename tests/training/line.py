@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
+from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.distributed import distributed_context

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.command import ExitCode
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.generator import Generator
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io import parts
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.testing import write_latents, write_weights
 from egosim_jax.train import bundle, bundled
 from egosim_jax.train.bundle import write_bundle

@@ -7,10 +7,10 @@ import pytest
 
 from egosim_jax import configs
 from egosim_jax.cli.triplets import FromCaches, ToDwm
+from egosim_jax.configs.model import Networks
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.pack import pack, triplet_record
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.networks import Networks
 from egosim_jax.train.cached import shard_caches
 from egosim_jax.train.encode import check_encoders, encode_shards
 from egosim_jax.types import InputError, Triplet, VideoSpec

@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.conditioning.layout import ChannelLayout
-from egosim_jax.networks import Networks
+from egosim_jax.configs.model import Networks
 from egosim_jax.train.tasks.denoising import Denoising, drawn, loss_weights, without_hands
 from egosim_jax.types import InputError
 from tests.training.run_tiny import MODEL

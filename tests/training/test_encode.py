@@ -19,6 +19,7 @@ from safetensors.numpy import load_file, save_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.configs.model import Networks
 from egosim_jax.data import manifest
 from egosim_jax.data.check import check
 from egosim_jax.data.loader import Loader
@@ -27,7 +28,6 @@ from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
-from egosim_jax.networks import Networks
 from egosim_jax.train import encode as encoding
 from egosim_jax.train.encode import check_encoders, encode_shards
 from egosim_jax.types import InputError, VideoSpec

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egosim_jax.command import ExitCode
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.distributed import free_local_address
 from tests import flags
 from tests.training.killing import logged

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from egosim_jax.command import CommandExit, ExitCode
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.loop import train

@@ -10,10 +10,10 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.command import ExitCode
+from egosim_jax.configs.model import Networks
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.mapped import read_safetensors
-from egosim_jax.networks import Networks
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.__main__ import main
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.refining import RefineVAE

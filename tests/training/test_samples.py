@@ -8,9 +8,9 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
+from egosim_jax.configs.model import Networks
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import read_video
-from egosim_jax.networks import Networks
 from egosim_jax.sharding import make_mesh
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.train.monitor import Samples

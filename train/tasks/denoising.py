@@ -20,10 +20,10 @@ from jaxtyping import Array, Float, Key
 from egosim_jax.conditioning import Condition
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.posterior import STD, draw
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.models import lora
-from egosim_jax.networks import ModelConfig, Networks
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError
 

@@ -1,6 +1,6 @@
 """Training a video VAE further, with a term that compares as eyes do and more weight on motion.
 
-To the loss of `autoencoding` comes LPIPS (`metrics/lpips.py`, AlexNet) between some frames of the
+To the loss of `autoencoding` comes LPIPS (`evaluation/metrics/lpips.py`, AlexNet) between some frames of the
 crop and of its reconstruction:
 
     perceptual_weight * mean over frames of LPIPS(y_t, x_t)
@@ -27,8 +27,8 @@ from flax import nnx
 from jaxtyping import Array, Float, Int, Key
 
 from egosim_jax.conditioning.video import to_model
-from egosim_jax.metrics.lpips import Lpips
-from egosim_jax.networks import Networks
+from egosim_jax.configs.model import Networks
+from egosim_jax.evaluation.metrics.lpips import Lpips
 from egosim_jax.train.tasks.autoencoding import Autoencoding
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError

@@ -40,8 +40,7 @@ from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.images import decode_image
-from egosim_jax.io.npz import DAMAGE
-from egosim_jax.io.untrusted import (
+from egosim_jax.io.untrusted.bounded import (
     open_regular,
     parse_json,
     quote,
@@ -49,6 +48,7 @@ from egosim_jax.io.untrusted import (
     quote_text,
     read_bytes,
 )
+from egosim_jax.io.untrusted.npz import DAMAGE
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 28

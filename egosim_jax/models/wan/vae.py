@@ -26,7 +26,6 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
-from egosim_jax.grid import VideoGrid
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.wan.vae_layers import (
     Cache,
@@ -44,6 +43,7 @@ from egosim_jax.models.wan.vae_layers import (
     norm,
 )
 from egosim_jax.types import InputError
+from egosim_jax.types.grid import VideoGrid
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from egosim_jax.io.npz import read_arrays
+from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception.cameras.flow import Background
 from egosim_jax.perception.cameras.gate import Reconstruction
 from egosim_jax.types import InputError, check_counts, check_seed

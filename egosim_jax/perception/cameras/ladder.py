@@ -35,7 +35,7 @@ from egosim_jax.perception.cameras.rotation import (
 )
 from egosim_jax.perception.cameras.static import still_share
 from egosim_jax.perception.estimates import CameraEstimate, Rung, Verdict
-from egosim_jax.progress import track
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import Cameras, InputError, check_video
 
 _LADDER: tuple[Rung, ...] = ("static", "incremental", "focal", "global", "rotation")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from egosim_jax.io.untrusted import quote_path
+from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError
 
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from egosim_jax.io.untrusted import quote_path, quote_text, read_bytes
+from egosim_jax.io.untrusted.bounded import quote_path, quote_text, read_bytes
 from egosim_jax.types import InputError
 
 MAX_BYTES = 1 << 26

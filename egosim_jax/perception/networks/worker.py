@@ -25,7 +25,7 @@ from typing import IO, Any, cast
 
 import numpy as np
 
-from egosim_jax.command import CommandExit, ExitCode
+from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.types import InputError
 
 TAIL_LINES, TAIL_BYTES = 12, 4096

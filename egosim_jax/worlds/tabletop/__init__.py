@@ -15,8 +15,7 @@ import numpy as np
 
 from egosim_jax.geometry import look_at
 from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec
-from egosim_jax.worlds.tabletop import actions
-from egosim_jax.worlds.tabletop.actions import Hand, Intent, Moment
+from egosim_jax.worlds.tabletop import hand_motion
 from egosim_jax.worlds.tabletop.clips import (
     TabletopClip,
     film,
@@ -29,6 +28,7 @@ from egosim_jax.worlds.tabletop.clips import (
     to_triplet,
 )
 from egosim_jax.worlds.tabletop.described import Object, make_scene, read_scene, write_scene
+from egosim_jax.worlds.tabletop.hand_motion import Hand, Intent, Moment
 from egosim_jax.worlds.tabletop.raycast import Picture
 from egosim_jax.worlds.tabletop.scene import Scene, sample_scene, with_cloths
 from egosim_jax.worlds.tabletop.world import World
@@ -120,7 +120,7 @@ def make_sequence(
     for number, script in enumerate(scripts):
         yield film(
             [moment.scene for moment in script.moments],
-            [[actions.hand_parts(hand, kind) for hand in m.hands] for m in script.moments],
+            [[hand_motion.hand_parts(hand, kind) for hand in m.hands] for m in script.moments],
             script.cameras,
             sides=tuple(hand.side for hand in script.moments[0].hands),
             kind=kind,
@@ -149,12 +149,12 @@ def make_scripts(
         rng = np.random.default_rng([seed, 0 if kind == "human" else 1, 2, action])
     hands: tuple[Hand, ...] = ()
     for number in range(clips):
-        intent = actions.choose(scene, rng, hand=hands[0] if hands else None)
+        intent = hand_motion.choose(scene, rng, hand=hands[0] if hands else None)
         if not hands:
-            hands = (actions.start_hand(scene, intent, kind, rng),)
+            hands = (hand_motion.start_hand(scene, intent, kind, rng),)
             if kind == "human" and rng.random() < 0.35:
-                hands = (*hands, actions.waiting_hand(hands[0].side, rng))
-        moments = actions.act(scene, hands, intent, kind, frames=spec.frames)
+                hands = (*hands, hand_motion.waiting_hand(hands[0].side, rng))
+        moments = hand_motion.act(scene, hands, intent, kind, frames=spec.frames)
         times = number + np.linspace(0, 1, spec.frames)
         cameras = _cameras(0 * times if fixed_camera else times, eye, sway, spec)
         who = f"The {hands[0].side} hand" if kind == "human" else "The gripper"

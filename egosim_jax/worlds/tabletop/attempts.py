@@ -14,8 +14,8 @@ import numpy as np
 from egosim_jax.geometry import rotation_z
 from egosim_jax.types import Action, Cameras, Kind, VideoSpec
 from egosim_jax.worlds.tabletop import Script, make_scripts, make_sequence
-from egosim_jax.worlds.tabletop.actions import smooth
 from egosim_jax.worlds.tabletop.clips import TabletopClip
+from egosim_jax.worlds.tabletop.hand_motion import smooth
 from egosim_jax.worlds.tabletop.policies import POLICIES
 from egosim_jax.worlds.tabletop.world import World
 

@@ -9,11 +9,11 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from egosim_jax.episode import Episode
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.reference import draw_hands, render
+from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import (
     JOINTS,
     Action,

@@ -52,7 +52,7 @@ LEAVE_M = (0.003, 0.010)
 """A joint that pressed a body has left it when it and the pinch point are this far, in meters."""
 STEP_M = 0.004
 """Longest motion of a joint in one step, in meters."""
-MOST_STEPS = 64
+MAX_STEPS = 64
 """Most steps between two frames."""
 FINGERS = [j for j in range(2, 21) if j % 4 != 1]
 """Keypoints of a human hand's fingers, which yield to what fits into the open hand."""
@@ -152,7 +152,7 @@ def advance(
     if not seen.any():
         return contact
     length = np.linalg.norm(after_m[seen] - before_m[seen], axis=-1).max()
-    steps = int(np.clip(np.ceil(length / STEP_M), 1, MOST_STEPS))
+    steps = int(np.clip(np.ceil(length / STEP_M), 1, MAX_STEPS))
     path = before_m + np.linspace(0, 1, steps + 1)[:, None, None, None] * (after_m - before_m)
     for last, here in pairwise(path):
         contact = _step(contact, last, here, np.flatnonzero(seen), kind)

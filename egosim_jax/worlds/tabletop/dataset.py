@@ -15,12 +15,12 @@ from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.records import from_bytes, to_bytes
 from egosim_jax.data.shards import ShardWriter, gather
-from egosim_jax.grid import WAN_GRID, VideoGrid
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted import quote_path
-from egosim_jax.processes import run_in_processes
+from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.runtime.processes import run_in_processes
 from egosim_jax.types import InputError, Kind, SceneState, VideoSpec, check_seed
+from egosim_jax.types.grid import WAN_GRID, VideoGrid
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions

@@ -24,7 +24,7 @@ import numpy as np
 
 from egosim_jax.geometry import rotation_z
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.untrusted import quote, quote_path, read_json
+from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.types import InputError, check_seed
 from egosim_jax.worlds.tabletop.bodies import (
     COLORS,
@@ -49,7 +49,7 @@ from egosim_jax.worlds.tabletop.support import (
 FORMAT, VERSION = "egosim_jax.scene", 1
 SIZE_M = (0.02, 0.20)
 """Smallest and largest width or height of a loose body in meters."""
-MOST_OBJECTS = 40
+MAX_OBJECTS = 40
 """Most bodies of a scene."""
 NAMES = {"drawer": "cabinet", "lidded box": "chest"}
 """Words for furniture in names."""
@@ -169,8 +169,8 @@ def make_scene(objects: Sequence[Object], *, room: int = 0) -> Scene:
     others can stand on.
     """
     check_seed(room, name="room")
-    if not 0 < len(objects) <= MOST_OBJECTS:
-        raise InputError(f"A scene of {len(objects)} objects: give 1 to {MOST_OBJECTS}.")
+    if not 0 < len(objects) <= MAX_OBJECTS:
+        raise InputError(f"A scene of {len(objects)} objects: give 1 to {MAX_OBJECTS}.")
     scene = Scene(bodies=(), room=make_room(np.random.default_rng(room)), openings={})
     for item in objects:
         if item.name in scene.openings or any(body.name == item.name for body in scene.bodies):

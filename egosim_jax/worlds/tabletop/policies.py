@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.worlds.tabletop import Script, actions
-from egosim_jax.worlds.tabletop.actions import Hand
+from egosim_jax.worlds.tabletop import Script, hand_motion
 from egosim_jax.worlds.tabletop.bodies import Body
+from egosim_jax.worlds.tabletop.hand_motion import Hand
 
 WITHIN_M = (0.03, 0.02)
 """Largest horizontal and vertical distance of a carried body from its goal, in meters."""
@@ -55,11 +55,11 @@ class Policy:
         goal = np.asarray(intent.goal_m, float) + [*(self.goal_m * errors[1]), 0.0]
         believed, intent = scene.with_pose(intent.name, pose), replace(intent, goal_m=goal)
         frames, kind = len(script.moments), script.kind
-        moments = actions.act(believed, (hand,), intent, kind, frames=frames)
-        begin, end = actions.holding(believed, hand, intent, kind)
-        begin -= actions.CLOSE_SHARE
+        moments = hand_motion.act(believed, (hand,), intent, kind, frames=frames)
+        begin, end = hand_motion.holding(believed, hand, intent, kind)
+        begin -= hand_motion.CLOSE_SHARE
         opens = begin if not self.grasps else begin + self.release * (end - begin)
-        times, wide = np.linspace(0, 1, frames), actions.opened(kind)
+        times, wide = np.linspace(0, 1, frames), hand_motion.opened(kind)
         hands = [
             _opened(moment.hands[0], wide) if time >= opens and opens < end else moment.hands[0]
             for moment, time in zip(moments, times, strict=True)

@@ -2,9 +2,9 @@
 
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.diffusion.solver import DDIM
-from egosim_jax.networks import ModelConfig
 from egosim_jax.types import VideoSpec
 from tests.toy_family.networks import ToyCodecConfig, ToyDenoiserConfig, ToyTextConfig
 

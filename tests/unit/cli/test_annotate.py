@@ -4,8 +4,8 @@ import pytest
 
 from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.cli.__main__ import main
-from egosim_jax.command import ExitCode
-from egosim_jax.episode import Episode
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.simulation.episode import Episode
 from tests.unit.annotate.stubs import config, textured_video, write
 
 OPTIONS = ["--renderer", "numpy", "--caption", "take the cup"]

@@ -12,12 +12,12 @@ from PIL import Image
 
 from egosim_jax import configs
 from egosim_jax.cli.data import Check, Look, Make, Pack, Stats
-from egosim_jax.command import ExitCode, run_with_exit_codes
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.grid import VideoGrid
 from egosim_jax.io.atomic import LOCK, hold_folder
 from egosim_jax.io.video import decode_video, read_video
+from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types.grid import VideoGrid
 
 
 @pytest.fixture
@@ -270,7 +270,7 @@ def test_a_second_process_on_the_same_folder_is_one_line(clips, out):
     hold_folder(out)
     program = (
         "import sys; from pathlib import Path; from egosim_jax.cli.data import Pack; "
-        "from egosim_jax.command import run_with_exit_codes; "
+        "from egosim_jax.runtime.command import run_with_exit_codes; "
         "sys.exit(run_with_exit_codes(Pack(metadata=Path(sys.argv[1]), out=Path(sys.argv[2])).run))"
     )
     command = [sys.executable, "-c", program, str(clips), str(out)]

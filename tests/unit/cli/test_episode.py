@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from egosim_jax.actions import read_action
 from egosim_jax.cli.episode import MakeEpisode
+from egosim_jax.simulation.actions import read_action
 from egosim_jax.types import InputError
 
 READ = {"height": 48, "width": 80, "prompt": None}

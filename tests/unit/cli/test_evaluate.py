@@ -9,10 +9,10 @@ import pytest
 from flax import nnx
 
 from egosim_jax.cli.evaluate import Evaluate
-from egosim_jax.command import ExitCode
+from egosim_jax.evaluation.metrics import lpips
+from egosim_jax.evaluation.metrics.image import psnr, ssim
 from egosim_jax.io.video import read_video, write_video
-from egosim_jax.metrics import lpips
-from egosim_jax.metrics.image import psnr, ssim
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
 

@@ -8,12 +8,12 @@ import pytest
 from safetensors.numpy import save_file
 
 from egosim_jax import configs
-from egosim_jax.batch import BatchJob
 from egosim_jax.cli.__main__ import main
-from egosim_jax.command import ExitCode
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.windows import windows_of
+from egosim_jax.generation.batch import BatchJob
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet

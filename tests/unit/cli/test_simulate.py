@@ -3,7 +3,7 @@
 import pytest
 
 from egosim_jax.cli import simulate
-from egosim_jax.metrics.loop import MEASURES
+from egosim_jax.evaluation.metrics.loop import MEASURES
 from egosim_jax.types import InputError
 
 

@@ -11,13 +11,13 @@ from flax import nnx
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.table import Name, TableCommand
-from egosim_jax.command import ExitCode
 from egosim_jax.evaluation import scoring
 from egosim_jax.evaluation.files import escape
+from egosim_jax.evaluation.metrics import lpips
+from egosim_jax.evaluation.metrics.image import psnr
 from egosim_jax.evaluation.tables import TABLES
 from egosim_jax.io.video import read_video, write_video
-from egosim_jax.metrics import lpips
-from egosim_jax.metrics.image import psnr
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.batch import BatchJob
 from egosim_jax.cli.generate import Generate
 from egosim_jax.conditioning.baselines import STRENGTH, with_hand_mask
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.diffusion import Guidance
-from egosim_jax.generator import Generator, denoise
+from egosim_jax.generation.batch import BatchJob
+from egosim_jax.generation.generator import Generator, denoise
 from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError, Triplet
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as DWM_TINY

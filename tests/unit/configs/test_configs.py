@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from egosim_jax import configs
+from egosim_jax.configs.model import Networks
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
-from egosim_jax.networks import Networks
 from egosim_jax.types import InputError
 
 

@@ -12,7 +12,7 @@ from safetensors.flax import save_file
 from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.checkpoint import checkpoint
+from egosim_jax.convert.dwm_checkpoint import checkpoint
 from egosim_jax.convert.lora import check_base, read_lora
 from egosim_jax.convert.plan import merged
 from egosim_jax.convert.tables import table_of, weight_shapes

@@ -24,6 +24,7 @@ from safetensors.torch import save_file
 
 from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
+from egosim_jax.configs.model import Networks
 from egosim_jax.convert import commands, outputs
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
@@ -31,7 +32,6 @@ from egosim_jax.convert.tables import table_of, wan_dit
 from egosim_jax.diffusion import DDIM, RectifiedFlow, VariancePreserving
 from egosim_jax.io.weights import flat_shapes, hashes, load
 from egosim_jax.models.wan.dit import WanDiT
-from egosim_jax.networks import Networks
 from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError
 from tests.translation import translate_back

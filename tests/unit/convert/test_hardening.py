@@ -18,9 +18,9 @@ from egosim_jax.convert.detect import detect
 from egosim_jax.convert.rules import Rule, assign
 from egosim_jax.convert.source import sources
 from egosim_jax.io import mapped, weights
-from egosim_jax.io import pickled as pickle_reader
 from egosim_jax.io.mapped import read_metadata, read_safetensors
-from egosim_jax.io.pth import read_pth
+from egosim_jax.io.untrusted import pickled as pickle_reader
+from egosim_jax.io.untrusted.pth import read_pth
 from egosim_jax.types import InputError
 
 SECONDS, MEBIBYTES, CHARACTERS = 10, 700, 2000
@@ -223,7 +223,7 @@ def test_a_bomb_in_a_pickle_is_refused_in_one_line(tmp_path, name):
 
 
 def test_a_long_pickle_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(pickle_reader, "MOST_STEPS", 1000)
+    monkeypatch.setattr(pickle_reader, "MAX_STEPS", 1000)
     path = pickled(tmp_path / "x.pth", b"\x80\x02]q\x00]" + MANY + b".")
     assert "more than 1,000 operations" in refused(read_pth, path)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from egosim_jax.io.pth import read_pth
+from egosim_jax.io.untrusted.pth import read_pth
 from egosim_jax.types import InputError
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from egosim_jax.data.moments import cache_of, check_alike, read_moments, read_tensor, write_moments
-from egosim_jax.io.pth import read_pth, write_pth
+from egosim_jax.io.untrusted.pth import read_pth, write_pth
 from egosim_jax.types import InputError
 
 SHAPE = (3, 4, 6, 16)

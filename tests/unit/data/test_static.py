@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.batch import BatchJob
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.dwm import write_folders
 from egosim_jax.data.metadata import read_metadata
@@ -14,6 +13,7 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.static import check_observed
 from egosim_jax.data.windows import windows_of
+from egosim_jax.generation.batch import BatchJob
 from egosim_jax.testing import random_triplet
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.types import InputError

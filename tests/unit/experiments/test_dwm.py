@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
+from egosim_jax.configs.model import Networks
 from egosim_jax.convert.widen import Widening
 from egosim_jax.experiments.config import DWM
 from egosim_jax.experiments.dwm import run
@@ -23,7 +24,6 @@ from egosim_jax.geometry import invert, transform
 from egosim_jax.io import weights
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models import abstract
-from egosim_jax.networks import Networks
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
 

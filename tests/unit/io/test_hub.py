@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.io import hub
-from egosim_jax.io.untrusted import read_json
+from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.types import InputError
 from tests.hub import COMMIT, Hub, serve
 

@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
 from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop import actions, make_sequence, state_after, to_triplet
+from egosim_jax.worlds.tabletop import hand_motion, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.bodies import box, make_loose, split_edges
 from egosim_jax.worlds.tabletop.hands import closure_for, joints_of, pinch
 from egosim_jax.worlds.tabletop.raycast import Placed, RayCaster
@@ -192,7 +192,7 @@ def test_black_bodies_are_never_chosen():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         scene = sample_scene(rng)
-        assert not scene.body(actions.choose(scene, rng).name).static
+        assert not scene.body(hand_motion.choose(scene, rng).name).static
 
 
 @pytest.mark.parametrize("kind", ["human", "robot"])
@@ -260,10 +260,10 @@ def act_on(verb, kind="human"):
     for seed in range(200):
         rng = np.random.default_rng(seed)
         scene = sample_scene(rng)
-        intent = actions.choose(scene, rng)
+        intent = hand_motion.choose(scene, rng)
         if intent.verb == verb:
-            hand = actions.start_hand(scene, intent, kind, rng)
-            return scene, intent, actions.act(scene, (hand,), intent, kind, frames=33)
+            hand = hand_motion.start_hand(scene, intent, kind, rng)
+            return scene, intent, hand_motion.act(scene, (hand,), intent, kind, frames=33)
     raise AssertionError(f"no scene in which to {verb}")
 
 
@@ -294,17 +294,17 @@ def test_a_body_under_another_is_neither_taken_nor_opened():
     for seed in range(60):
         rng = np.random.default_rng(seed)
         scene = sample_scene(rng)
-        intent = actions.choose(scene, rng)
+        intent = hand_motion.choose(scene, rng)
         if intent.verb != "stack":
             continue
-        hand = actions.start_hand(scene, intent, "human", rng)
-        after = actions.act(scene, (hand,), intent, "human", frames=9)[-1].scene
+        hand = hand_motion.start_hand(scene, intent, "human", rng)
+        after = hand_motion.act(scene, (hand,), intent, "human", frames=9)[-1].scene
         top = after.body(intent.name).world_from_body[:2, 3]
         below = min(
             (body for body in after.bodies if body.name != intent.name),
             key=lambda body: np.linalg.norm(body.world_from_body[:2, 3] - top),
         )
-        chosen = [actions.choose(after, np.random.default_rng(k)) for k in range(40)]
+        chosen = [hand_motion.choose(after, np.random.default_rng(k)) for k in range(40)]
         if below.shape != "drawer":
             assert below.name not in {choice.name for choice in chosen}
             checked += 1
@@ -314,8 +314,8 @@ def test_a_body_under_another_is_neither_taken_nor_opened():
 def test_an_opened_body_can_be_closed():
     scene, intent, moments = act_on("open")
     opened = moments[-1].scene
-    close = actions.Intent(verb="close", name=intent.name)
-    last = actions.act(opened, moments[-1].hands, close, "human", frames=9)[-1]
+    close = hand_motion.Intent(verb="close", name=intent.name)
+    last = hand_motion.act(opened, moments[-1].hands, close, "human", frames=9)[-1]
     assert last.scene.openings[intent.name] == pytest.approx(0)
     assert scene.openings[intent.name] == 0
 

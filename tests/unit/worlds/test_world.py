@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from egosim_jax.types import Action, InputError, Kind, VideoSpec
-from egosim_jax.worlds.tabletop import Object, World, actions, make_scene, make_sequence, to_action
-from egosim_jax.worlds.tabletop.actions import Grip
+from egosim_jax.worlds.tabletop import (
+    Object,
+    World,
+    hand_motion,
+    make_scene,
+    make_sequence,
+    to_action,
+)
+from egosim_jax.worlds.tabletop.hand_motion import Grip
 from egosim_jax.worlds.tabletop.hands import closure_for, frame_of, joints_of, side_of
 from egosim_jax.worlds.tabletop.scene import sample_scene
 
@@ -176,8 +183,8 @@ def test_a_lid_falls_shut_unless_it_is_beyond_the_vertical(cameras):
     hands = []
     for opening in (0.0, 0.25, 0.5, 0.95):
         scene = world.scene.with_opening("green chest", opening)
-        intent = actions.Intent(verb="open", name="green chest")
-        grip = actions.grip_on(scene, intent, "robot", "right")
+        intent = hand_motion.Intent(verb="open", name="green chest")
+        grip = hand_motion.grip_on(scene, intent, "robot", "right")
         hands.append((*grip.point_m, grip.closure, 0.0, grip.pitch))
     opened = (*hands[0][:3], OPENED, 0.0, hands[0][5])
     for last, expected in ((2, 0.0), (3, 1.0)):
@@ -267,9 +274,9 @@ def differences(seeds, kind: Kind, frames=17):
     for seed in seeds:
         rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
         scene = sample_scene(rng)
-        intent = actions.choose(scene, rng)
-        hands = (actions.start_hand(scene, intent, kind, rng),)
-        moments = actions.act(scene, hands, intent, kind, frames=frames)
+        intent = hand_motion.choose(scene, rng)
+        hands = (hand_motion.start_hand(scene, intent, kind, rng),)
+        moments = hand_motion.act(scene, hands, intent, kind, frames=frames)
         joints = np.array([[h.grip.pose(kind, h.side)[0] for h in m.hands] for m in moments])
         cameras = next(make_sequence(3, spec=replace(SPEC, height=2, width=2))).cameras
         scenes, _ = World(scene=scene).move(act(cameras, joints, kind))

@@ -11,11 +11,11 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.conditioning.layout import DWM
+from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion import Guidance
-from egosim_jax.encoding import Inputs, encode_condition
-from egosim_jax.generator import Generator
-from egosim_jax.networks import Networks
-from egosim_jax.program import CompiledFn
+from egosim_jax.generation.compiled import CompiledFn
+from egosim_jax.generation.encoding import Inputs, encode_condition
+from egosim_jax.generation.generator import Generator
 from egosim_jax.testing import random_triplet
 from egosim_jax.train.encode import Encoding, example_shapes
 from egosim_jax.train.tasks.denoising import Denoising, condition_of

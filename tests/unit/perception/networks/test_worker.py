@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import egosim_jax
-from egosim_jax.command import ExitCode
 from egosim_jax.perception.networks.worker import NetworkError, Worker, close_workers, worker_of
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
 PROGRAM = """

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from egosim_jax import ranking
+from egosim_jax.generation import rank
 from egosim_jax.perception.networks import close_workers
 from egosim_jax.perception.networks.xclip import XClip
 from egosim_jax.types import InputError
@@ -40,13 +40,13 @@ def test_the_similarity_is_the_cosine_of_what_transformers_embeds(folder, videos
 
 
 def test_candidates_are_ranked_by_a_text(folder, videos):
-    score = ranking.by_text(TEXTS[1], folder)
+    score = rank.by_text(TEXTS[1], folder)
     found = {name: [score(video)] for name, video in zip("ab", videos, strict=True)}
     assert found["a"] != found["b"]
-    best = ranking.order(found)[0].name
+    best = rank.order(found)[0].name
     assert best == max(found, key=lambda name: found[name])
 
 
 def test_other_checkpoints_are_refused(tmp_path):
     with pytest.raises(InputError, match="X-CLIP"):
-        ranking.by_text(TEXTS[0], tiny.depth_anything(tmp_path))
+        rank.by_text(TEXTS[0], tiny.depth_anything(tmp_path))

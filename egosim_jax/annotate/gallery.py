@@ -1,0 +1,66 @@
+"""A page of all annotated clips: prior, mask, hands and video, or why there is none."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.annotate.clip import SHEET
+from egosim_jax.io.run import write_text
+from egosim_jax.io.untrusted.bounded import read_bytes
+
+PAGE = "index.html"
+MAX_PICTURES = 500
+"""Clips whose pictures are on the page; the others are listed only."""
+MAX_SHEET_BYTES = 1 << 24
+_HEAD = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>Annotated clips</title>
+<style>
+body { font: 14px/1.4 sans-serif; margin: 24px; max-width: 1300px }
+section { border-top: 1px solid #bbb; padding: 12px 0 }
+img { max-width: 100%; display: block }
+pre { white-space: pre-wrap; font-size: 12px; color: #444 }
+.refused h2, .failed h2 { color: #a00 }
+h2 { font-size: 16px; margin: 4px 0 }
+</style>
+"""
+
+
+def write_page(out: Path, report: Mapping[str, Any]) -> None:
+    """Write the page: self-contained, without scripts; every text is escaped."""
+    counts = report["clips"]
+    parts = [
+        _HEAD,
+        f"<h1>{counts['done']} clips, {counts['refused']} refused, {counts['failed']} failed</h1>",
+        "<p>Pictures, from top to bottom: prior, mask (white: not observed), hands, video.</p>",
+    ]
+    for name, video in report["videos"].items():
+        if "problem" in video:
+            parts.append(_section("failed", name, video["problem"], None, {}))
+    for number, about in enumerate(report["annotations"]):
+        sheet = out / about["video_id"] / SHEET
+        picture = sheet if number < MAX_PICTURES and sheet.exists() else None
+        title = f"{about['video_id']}: {about['status']}"
+        text = about.get("reason") or about.get("row", {}).get("prompt", "")
+        shown = ("quality", "hands", "cameras", "depth", "scale", "plate", "prior", "caption")
+        figures = {name: about[name] for name in shown if name in about}
+        parts.append(_section(about["status"], title, text, picture, figures))
+    write_text(out / PAGE, "\n".join(parts) + "\n</html>\n")
+
+
+def _section(
+    status: str, title: str, text: str, picture: Path | None, figures: Mapping[str, Any]
+) -> str:
+    image = ""
+    if picture is not None:
+        data = base64.b64encode(read_bytes(picture, limit=MAX_SHEET_BYTES)).decode()
+        image = f'<img alt="{html.escape(title)}" src="data:image/jpeg;base64,{data}">'
+    table = "\n".join(f"{name}: {json.dumps(value)}" for name, value in figures.items())
+    return (
+        f'<section class="{html.escape(status)}"><h2>{html.escape(title)}</h2>'
+        f"<p>{html.escape(text)}</p>{image}<pre>{html.escape(table)}</pre></section>"
+    )

@@ -1,0 +1,95 @@
+"""Episodes of real scenes: the state of an annotated clip, and its hands and cameras as actions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from egosim_jax.annotate.clip import ANNOTATION
+from egosim_jax.data.transforms import resize_image, resize_video
+from egosim_jax.io.images import read_image
+from egosim_jax.io.untrusted.bounded import quote_path, read_json
+from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.video import read_video
+from egosim_jax.simulation.episode import Episode
+from egosim_jax.state import snapshot
+from egosim_jax.types import JOINTS, Action, Cameras, GroundTruth, InputError, Kind, VideoSpec
+
+
+def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) -> Episode:
+    """Return an episode of an annotated clip, at the length, size and rate of a model's clips.
+
+    The first action starts in the clip's first frame, each other one in the last frame of the one
+    before. Frames are the nearest in time, resized without keeping the aspect, as in training, and
+    are the ground truth. Raises `InputError` if the clip was refused, or is too short.
+    """
+    about = read_json(folder / ANNOTATION)
+    row = about.get("row") if isinstance(about, dict) else None
+    prompt = row.get("prompt") if isinstance(row, dict) else None
+    if not isinstance(prompt, str) or about.get("status") != "done":
+        raise InputError(
+            f"{quote_path(folder)} is not an accepted clip of `egosim data annotate`. Choose "
+            "another one of its metadata.csv."
+        )
+    arrays = read_arrays(
+        folder / "action.npz",
+        {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64"},
+    )
+    recorded = read_video(folder / "video.mp4")
+    moments = nearest_frames(len(recorded.frames), float(recorded.fps), float(video.fps))
+    step = video.frames - 1
+    possible = (len(moments) - 1) // step
+    count = possible if clips is None else clips
+    if not 0 < count <= possible:
+        raise InputError(
+            f"{quote_path(folder)} has {len(moments)} frames at {video.fps} fps, enough for "
+            f"{possible} clips of {video.frames} frames, not {count}. (--clips, --config)"
+        )
+    picked = [moments[number * step : number * step + video.frames] for number in range(count)]
+    frames = [resize_video(recorded.frames[k], video.height, video.width) for k in picked]
+    cameras = resized_intrinsics(arrays["intrinsics_px"], recorded.frames.shape[1:3], video)
+    kinds: dict[int, Kind] = {joints: kind for kind, joints in JOINTS.items()}
+    return Episode(
+        state=snapshot.load(folder / "state"),
+        actions=tuple(
+            Action(
+                cameras=Cameras(
+                    world_from_camera=arrays["world_from_camera"][k],
+                    intrinsics_px=cameras,
+                    height=video.height,
+                    width=video.width,
+                ),
+                joints_m=_reachable(arrays["joints_m"][k]),
+                kind=kinds[arrays["joints_m"].shape[2]],
+                prompt=prompt,
+            )
+            for k in picked
+        ),
+        fps=video.fps,
+        first_frame=resize_image(read_image(folder / "first_frame.png"), video.height, video.width),
+        ground_truth=tuple(GroundTruth(frames=target) for target in frames),
+    )
+
+
+def nearest_frames(count: int, have: float, want: float) -> np.ndarray:
+    """Return the frames nearest in time to those at another rate."""
+    times = np.arange(int((count - 1) * want / have + 1e-6) + 1) * have / want
+    return np.minimum(np.floor(times + 0.5).astype(int), count - 1)
+
+
+def resized_intrinsics(
+    intrinsics_px: np.ndarray, size: tuple[int, ...], video: VideoSpec
+) -> np.ndarray:
+    """Return intrinsics of pictures that were resized along each axis."""
+    scale = np.array([video.width / size[1], video.height / size[0]])
+    resized = intrinsics_px.copy()
+    resized[:2] *= scale[:, None]
+    resized[:2, 2] += (scale - 1) / 2
+    return resized
+
+
+def _reachable(joints_m: np.ndarray) -> np.ndarray:
+    """Return the hands of a clip; without any, one that is missing from all frames."""
+    present = np.isfinite(joints_m).all(axis=(2, 3)).any(axis=0)
+    return joints_m if present.any() else joints_m[:, :1]

@@ -1,0 +1,304 @@
+"""Configs of models, each a choice of networks, and containers of their networks."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import jax
+import numpy as np
+from flax import nnx
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from egosim_jax.conditioning.layout import ChannelLayout
+from egosim_jax.conditioning.posterior import EncodingNoise
+from egosim_jax.conditioning.text import PromptTokenizer
+from egosim_jax.diffusion.dpm import DPMSolver
+from egosim_jax.diffusion.guidance import Guidance
+from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
+from egosim_jax.diffusion.solver import DDIM, Euler
+from egosim_jax.diffusion.unipc import UniPC
+from egosim_jax.io import weights
+from egosim_jax.models import (
+    ChunkedCodecConfig,
+    Denoiser,
+    DenoiserConfig,
+    ImageEncoder,
+    ImageEncoderConfig,
+    NetworkConfig,
+    TextEncoder,
+    TextEncoderConfig,
+    VideoCodec,
+    VideoCodecConfig,
+)
+from egosim_jax.models.layers import init_sharded
+from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
+from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.models.wan.vae import WanVAEConfig
+from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
+from egosim_jax.types.grid import VideoGrid
+
+Name = Literal["dit", "vae", "text", "image"]
+"""Role of a network in a model, which is also the stem of its file of weights."""
+NAMES: tuple[Name, ...] = ("dit", "vae", "text", "image")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Config of a model: its networks, its conditioning and its sampling."""
+
+    numerics_only: ClassVar[tuple[str, ...]] = ("steps",)
+    """Fields that may change when a training is resumed: it draws no samples with them."""
+    name: str
+    """Name of the model on the command line."""
+    video: VideoSpec
+    """Length and size of its clips."""
+    dit: DenoiserConfig
+    """Config of the denoiser."""
+    vae: VideoCodecConfig = field(default_factory=WanVAEConfig)
+    """Config of the video autoencoder."""
+    text: TextEncoderConfig = field(default_factory=UMT5Config)
+    """Config of the text encoder."""
+    image: ImageEncoderConfig | None = field(default_factory=CLIPVisionConfig)
+    """Config of the image encoder; None for models without the image branch."""
+    zero_image_tokens: int | None = None
+    """Number of image tokens that the denoiser gets without an encoder: zeros (DWM on Wan).
+
+    So in training as at generation; a triplet may have others (`tokens`)."""
+    layout: ChannelLayout = field(default_factory=ChannelLayout)
+    """Input channels of the denoiser."""
+    tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
+    """Tokenizer of the prompts."""
+    encoders: Literal["frozen", "joint"] = "frozen"
+    """`frozen`: text and image encoder are given; `joint`: trained together with the denoiser."""
+    image_range: Literal["signed", "unit"] = "signed"
+    """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
+    posterior: Literal["sampled"] | None = None
+    """Latents of a training: drawn at each update (`sampled`, DWM), or the means (None)."""
+    encoding_noise: EncodingNoise | None = None
+    """Randomness in the encoding of conditions at generation; None: none."""
+    process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
+    """Path from data to noise, and the quantity that the denoiser predicts."""
+    solver: Euler | DDIM | UniPC | DPMSolver = field(default_factory=Euler)
+    """Sampler of the denoising steps."""
+    guidance: Guidance = field(default_factory=Guidance)
+    """Classifier-free guidance on the text."""
+    unconditional_prompt: str | None = None
+    """Prompt whose embeddings stand for no prompt; None: embeddings of zeros (EgoSim).
+
+    Guidance pushes away from it, and a prompt that is dropped in training is replaced by it.
+    """
+    strength: float | None = None
+    """Share of the steps that are taken, from the prior with that much noise (SDEdit).
+
+    The prior is then no condition. None: all steps, from noise alone."""
+    steps: int | tuple[int | float, ...] = 50
+    """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
+
+    def __post_init__(self) -> None:
+        """Check that networks, input channels and video fit each other."""
+        dit, layout, latents = self.dit, self.layout, self.vae.latent_channels
+        pairs = [
+            ("dit.text_dim", dit.text_dim, "text.dim", self.text.dim),
+            ("dit.out_channels", dit.out_channels, "vae.latent_channels", latents),
+            *self._image_sizes(),
+            ("dit.in_channels", dit.in_channels, "layout.channels", layout.channels),
+        ]
+        for part in ("noisy", "prior", "hands"):
+            if part in layout:
+                channels = layout.count(part)
+                pairs.append((f"layout {part}", channels, "vae.latent_channels", latents))
+        if "mask" in layout and layout.mask_packing == "time":
+            stride = self.vae.temporal_stride
+            pairs.append(("layout mask", layout.count("mask"), "vae.temporal_stride", stride))
+        for left, a, right, b in pairs:
+            if a != b:
+                raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
+        if "mask" in layout and layout.mask_packing == "space" and self.vae.spatial_stride % 2:
+            raise InputError(
+                f"{self.name}: the mask packing space takes 2 x 2 pixels of a latent cell, so that "
+                f"the codec's stride must be even, not {self.vae.spatial_stride}. Choose another "
+                "packing. (layout.mask_packing)"
+            )
+        if dit.patch[1] != dit.patch[2]:
+            raise InputError(
+                f"{self.name}: the tokens have {dit.patch[1]} rows and {dit.patch[2]} columns; "
+                "they must be square. (dit.patch)"
+            )
+        # Raises if the solver does not fit the process, or the steps.
+        self.solver.coefficients(self.process, self.process.times(self.visited))
+        if isinstance(self.vae, ChunkedCodecConfig):
+            self.vae.check_frames(self.video.frames)
+        self.grid.check(self.video)
+        frames, patch = self.latent_shape[0], dit.patch[0]
+        if frames % patch:
+            raise InputError(
+                f"{self.name}: {frames} latent frames do not divide into tokens of {patch}. Change "
+                "the number of frames. (video.frames, dit.patch)"
+            )
+
+    def _image_sizes(self) -> list[tuple[str, int | None, str, int | None]]:
+        """Return the widths of the image tokens, which must agree."""
+        given = None if self.image is None else self.image.dim
+        if self.zero_image_tokens is None:
+            return [("dit.image_dim", self.dit.image_dim, "image.dim", given)]
+        check_counts({"zero_image_tokens": self.zero_image_tokens})
+        if self.image is not None or self.dit.image_dim is None:
+            raise InputError(
+                f"{self.name}: image tokens of zeros are for a denoiser with an image branch in a "
+                f"model without an image encoder, not {self.zero_image_tokens} of them with "
+                f"image.dim {given} and dit.image_dim {self.dit.image_dim}. (zero_image_tokens)"
+            )
+        return []
+
+    @property
+    def visited(self) -> int | tuple[int | float, ...]:
+        """Number of denoising steps or, with a strength, the timesteps that are visited.
+
+        Raises `InputError` for a strength outside (0, 1] or of a model without a prior.
+        """
+        if self.strength is None:
+            return self.steps
+        if not 0 < self.strength <= 1 or "prior" not in self.layout:
+            raise InputError(
+                f"{self.name} cannot start from its prior with strength {self.strength}: that must "
+                "be above 0 and at most 1, and the model must have a prior. (--strength)"
+            )
+        levels = self.process.timesteps(self.process.times(self.steps)[:-1])
+        skipped = len(levels) - max(1, int(self.strength * len(levels)))
+        kind = int if isinstance(self.process, VariancePreserving) else float
+        return tuple(kind(level) for level in levels[skipped:])
+
+    @property
+    def image_tokens(self) -> int:
+        """Number of image tokens that the denoiser gets."""
+        return self.zero_image_tokens or (0 if self.image is None else self.image.tokens)
+
+    def given_image(self, triplets: Sequence[Triplet]) -> Float[np.ndarray, "b m e"] | None:
+        """Return the image tokens of clips in a model without an encoder; None for others."""
+        zeros = self.zero_image(len(triplets))
+        if zeros is None:
+            return None
+        for row, triplet in zip(zeros, triplets, strict=True):
+            if triplet.tokens is not None:
+                row[:] = triplet.tokens
+        return zeros
+
+    def zero_image(self, batch: int) -> Float[np.ndarray, "b m e"] | None:
+        """Return the image tokens of a model whose tokens are zeros; None for others."""
+        if self.zero_image_tokens is None:
+            return None
+        return np.zeros((batch, self.zero_image_tokens, self.dit.image_dim or 0), np.float32)
+
+    @property
+    def grid(self) -> VideoGrid:
+        """Latent grid of the model's videos."""
+        return VideoGrid(
+            temporal_stride=self.vae.temporal_stride,
+            spatial_stride=self.vae.spatial_stride,
+            patch=self.dit.patch[1],
+        )
+
+    @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Frames, rows and columns of a clip's latents."""
+        return self.grid.latent_shape(self.video)
+
+    @property
+    def networks(self) -> Mapping[Name, NetworkConfig]:
+        """Configs of the networks that the model has, by name."""
+        configs: dict[Name, NetworkConfig | None] = {name: getattr(self, name) for name in NAMES}
+        return {name: config for name, config in configs.items() if config is not None}
+
+    @property
+    def trained_networks(self) -> tuple[Name, ...]:
+        """Names of the networks that training the denoiser updates."""
+        trained = ("dit", "text", "image") if self.encoders == "joint" else ("dit",)
+        return tuple(name for name in self.networks if name in trained)
+
+    @property
+    def cached_networks(self) -> tuple[Name, ...]:
+        """Names of the networks whose outputs are cached for training the denoiser."""
+        return tuple(name for name in self.networks if name not in self.trained_networks)
+
+    def at(self, folder: Path) -> ModelConfig:
+        """Return this config with the tokenizer's files looked up in a weights folder."""
+        if self.tokenizer.kind == "byt5" or self.tokenizer.kind.is_relative_to(folder):
+            return self
+        files = replace(self.tokenizer, kind=folder / self.tokenizer.kind)
+        return replace(self, tokenizer=files)
+
+
+class Networks(nnx.Module):
+    """Networks of a model, all of them or some; an attribute is None where one is absent."""
+
+    dit: Denoiser
+    vae: VideoCodec
+    text: TextEncoder
+    image: ImageEncoder | None
+
+    def __init__(self, *, dit: Any = None, vae: Any = None, text: Any = None, image: Any = None):
+        self.dit, self.vae, self.text, self.image = dit, vae, text, image
+
+    @classmethod
+    def build(
+        cls, config: ModelConfig, *, only: Collection[str] | None = None, rngs: nnx.Rngs
+    ) -> Networks:
+        """Build the networks of a config, or `only` those of some names, with random weights."""
+        return cls(
+            **{
+                name: network.build(rngs=rngs)
+                for name, network in config.networks.items()
+                if only is None or name in only
+            }
+        )
+
+    @classmethod
+    def abstract(cls, config: ModelConfig, *, only: Collection[str] | None = None) -> Networks:
+        """Build the networks with shapes in place of weights."""
+        return nnx.eval_shape(lambda: cls.build(config, only=only, rngs=nnx.Rngs(0)))
+
+    @classmethod
+    def random(cls, config: ModelConfig, *, seed: int) -> Networks:
+        """Build untrained networks in one compiled program."""
+        graph = nnx.graphdef(cls.abstract(config))
+
+        def make(key: jax.Array) -> nnx.State:
+            return nnx.state(cls.build(config, rngs=nnx.Rngs(key)), nnx.Param)
+
+        params = init_sharded(make, jax.random.key(seed))
+        return nnx.merge(graph, params)
+
+    @classmethod
+    def load(
+        cls,
+        config: ModelConfig,
+        folder: Path | str,
+        *,
+        only: Collection[str] | None = None,
+        mesh: Mesh | None = None,
+    ) -> Networks:
+        """Load networks from a weights folder, which holds `<network>.safetensors` for each.
+
+        With a mesh each device reads its own part of the weights. Raises `InputError` with every
+        path that is missing, unknown or of another shape.
+        """
+        networks, folder = cls.abstract(config, only=only), Path(folder)
+        if not folder.is_dir():
+            raise InputError(f"{folder} is not a folder of weights. (--weights)")
+        for name, network in networks.parts().items():
+            weights.load(folder / f"{name}.safetensors", network, mesh=mesh)
+        return networks
+
+    def save(self, folder: Path, *, dtype: str | None = None) -> None:
+        """Write a weights folder; `dtype` casts, by default weights keep their own."""
+        for name, network in self.parts().items():
+            weights.save(folder / f"{name}.safetensors", network, dtype=dtype)
+
+    def parts(self) -> dict[str, nnx.Module]:
+        """Return the networks that are present, by name."""
+        named = {name: getattr(self, name) for name in NAMES}
+        return {name: network for name, network in named.items() if network is not None}

@@ -1,0 +1,319 @@
+"""LeRobot datasets, version 3.0, of episodes that were simulated.
+
+    meta/info.json meta/stats.json meta/tasks.parquet
+    meta/episodes/chunk-000/file-000.parquet   length, tasks and place of each episode
+    meta/egosim/episode_000000/                scene in which the episode begins
+    data/chunk-000/file-000.parquet            rows of episode 0; the next one is file-001
+
+A row has the frame as a PNG, which loses nothing (feature of dtype image), `observation.state`, the
+row of hands and camera at that frame, and `action`, that of the next frame; both are float32. The
+joints of the hands, the pose of the camera and its intrinsics are there as float64, too, in the
+names `HANDS`, `POSES` and `INTRINSICS`. The clips of an episode follow each other: the first frame
+of a clip takes the place of the last one of the clip before. Followed: `lerobot` 0.4.4,
+`datasets/lerobot_dataset.py`, `datasets/utils.py`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.types import Action, InputError
+
+IMAGE, STATE, ACTION = "observation.images.ego", "observation.state", "action"
+HANDS = "observation.hands.joints_m"
+"""Joints of all hands in the world, in meters, hand by hand; NaN where a hand is missing."""
+POSES = "observation.camera.world_from_camera"
+"""Rows of the camera's 4x4 pose in the world, in OpenCV axes."""
+INTRINSICS = "observation.camera.intrinsics_px"
+"""Rows of the camera's 3x3 matrix in pixels."""
+SCENE = "meta/egosim/episode_{:06d}"
+"""Folder of the scene in which an episode begins."""
+CHUNK = 1000
+"""Files in a folder."""
+PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class ClipRecord:
+    """Clip of an episode with its action."""
+
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """Frames of the clip."""
+    rows: Float[np.ndarray, "f d"]
+    """Row of hands and camera at each frame."""
+    action: Action
+    """Cameras, joints of the hands and caption of the clip."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRecord:
+    """Clips that follow each other, from a scene."""
+
+    clips: Iterable[ClipRecord]
+    """Clips of the episode, which are read one by one."""
+    save_scene: Callable[[Path], None]
+    """Write the scene in which the episode begins to a folder."""
+
+
+@dataclass
+class _Statistics:
+    """Running minimum, maximum, mean and standard deviation of a feature."""
+
+    shape: tuple[int, ...]
+    count: int = 0
+    low: Any = np.inf
+    high: Any = -np.inf
+    total: Any = 0.0
+    squares: Any = 0.0
+
+    def add(self, values: Float[np.ndarray, "n d"]) -> None:
+        self.count += len(values)
+        self.low = np.minimum(self.low, values.min(axis=0))
+        self.high = np.maximum(self.high, values.max(axis=0))
+        self.total = self.total + values.sum(axis=0)
+        self.squares = self.squares + np.square(values).sum(axis=0)
+
+    def result(self, frames: int) -> dict[str, Any]:
+        mean = self.total / self.count
+        deviation = np.sqrt(np.maximum(self.squares / self.count - mean**2, 0))
+        named = {"min": self.low, "max": self.high, "mean": mean, "std": deviation}
+        found = {name: np.reshape(value, self.shape).tolist() for name, value in named.items()}
+        return {**found, "count": [frames]}
+
+
+@dataclass
+class _Totals:
+    tasks: dict[str, int] = field(default_factory=dict)
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    frames: int = 0
+    sizes: set[tuple[int, ...]] = field(default_factory=set)
+    vectors: dict[str, int] = field(default_factory=dict)
+
+
+def check_new(folder: Path) -> None:
+    """Raise `InputError` unless nothing exists at a path, or an empty folder."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise InputError(
+            f"{quote_path(folder)} exists and is not empty: a dataset needs a new or an empty "
+            "folder. Choose another one, or remove it first. (--out)"
+        )
+
+
+def write_lerobot(
+    folder: Path,
+    episodes: Iterable[EpisodeRecord],
+    *,
+    names: Sequence[str],
+    fps: int,
+    robot_type: str,
+) -> None:
+    """Write a dataset, complete or absent; `names` are those of the numbers of a row.
+
+    One clip after the other is taken from `episodes` and written.
+    Raises `InputError` if there is nothing to write, if clips differ in size, if the folder holds
+    files, or without pyarrow.
+    """
+    check_new(folder)
+    if find_spec("pyarrow") is None:
+        raise InputError(
+            "A LeRobot dataset is written by pyarrow, which is not installed: pip install "
+            "'egosim-jax[video]'."
+        )
+    statistics = {IMAGE: _Statistics((3, 1, 1))}
+    totals = _Totals()
+    with atomic_folder(folder) as temporary:
+        for episode in episodes:
+            episode.save_scene(temporary / SCENE.format(len(totals.episodes)))
+            _write_episode(temporary, episode.clips, totals, statistics, fps)
+        if not totals.episodes:
+            raise InputError("There are no episodes: a dataset needs at least one. Record one.")
+        _write_meta(temporary, totals, statistics, fps=fps, robot_type=robot_type,
+                    names=names)  # fmt: skip
+
+
+def _steps(
+    clips: Iterable[ClipRecord], totals: _Totals
+) -> Iterator[tuple[np.ndarray, str, dict[str, np.ndarray]]]:
+    """Yield frame, prompt and numbers of each step; the last frame of all holds its row."""
+    last = None
+    for last in clips:
+        totals.sizes.add(last.frames.shape[1:3])
+        if len(totals.sizes) > 1:
+            raise InputError(
+                f"The episodes have clips of the sizes {sorted(totals.sizes)}: all must have one "
+                "size. Export them separately."
+            )
+        for number, frame in enumerate(last.frames[:-1]):
+            yield frame, last.action.prompt, _numbers(last, number)
+    if last is None:
+        raise InputError("An episode has no clip: it needs at least one. Remove it.")
+    yield last.frames[-1], last.action.prompt, _numbers(last, len(last.frames) - 1)
+
+
+def _numbers(clip: ClipRecord, frame: int) -> dict[str, np.ndarray]:
+    """Return the vectors of a frame by name."""
+    cameras, following = clip.action.cameras, min(frame + 1, len(clip.rows) - 1)
+    return {
+        STATE: clip.rows[frame].astype(np.float32),
+        ACTION: clip.rows[following].astype(np.float32),
+        HANDS: clip.action.joints_m[frame].astype(float).ravel(),
+        POSES: np.asarray(cameras.world_from_camera[frame], float).ravel(),
+        INTRINSICS: np.asarray(cameras.intrinsics_px, float).ravel(),
+    }
+
+
+def _write_episode(
+    folder: Path,
+    clips: Iterable[ClipRecord],
+    totals: _Totals,
+    statistics: dict[str, _Statistics],
+    fps: int,
+) -> None:
+    number, pictures, prompts, steps = len(totals.episodes), [], [], []
+    for frame, prompt, step in _steps(clips, totals):
+        statistics[IMAGE].add(frame.reshape(-1, 3) / 255)
+        pictures.append({"bytes": _png(frame), "path": None})
+        prompts.append(prompt)
+        totals.tasks.setdefault(prompt, len(totals.tasks))
+        steps.append(step)
+    vectors = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
+    for name, values in vectors.items():
+        totals.vectors[name] = size = values.shape[1]
+        statistics.setdefault(name, _Statistics((size,))).add(values.astype(float))
+    count, first = len(steps), totals.frames
+    columns = {
+        IMAGE: pictures,
+        **{name: list(values) for name, values in vectors.items()},
+        "timestamp": (np.arange(count) / fps).astype(np.float32),
+        "frame_index": np.arange(count),
+        "episode_index": np.full(count, number),
+        "index": np.arange(first, first + count),
+        "task_index": np.array([totals.tasks[prompt] for prompt in prompts]),
+    }
+    place = {"chunk_index": number // CHUNK, "file_index": number % CHUNK}
+    _write_table(folder / PATH.format(**place), columns)
+    totals.frames += count
+    totals.episodes.append(
+        {
+            "episode_index": number,
+            "tasks": list(dict.fromkeys(prompts)),
+            "length": count,
+            "dataset_from_index": first,
+            "dataset_to_index": first + count,
+            **{f"data/{name}": value for name, value in place.items()},
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+    )
+
+
+def _write_table(path: Path, columns: dict[str, Any]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    picture = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+    short, long = pa.list_(pa.float32()), pa.list_(pa.float64())
+    types = {IMAGE: picture, STATE: short, ACTION: short, "timestamp": pa.float32(),
+             HANDS: long, POSES: long, INTRINSICS: long}  # fmt: skip
+    arrays = {
+        name: pa.array(values, types.get(name, pa.int64() if name in COUNTERS else None))
+        for name, values in columns.items()
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(arrays), path)
+
+
+def _png(frame: np.ndarray) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(frame).save(data, "PNG")
+    return data.getvalue()
+
+
+def _write_meta(
+    folder: Path,
+    totals: _Totals,
+    statistics: dict[str, _Statistics],
+    *,
+    fps: int,
+    robot_type: str,
+    names: Sequence[str],
+) -> None:
+    """Write description, statistics, tasks and places of the episodes."""
+    rows = {key: [episode[key] for episode in totals.episodes] for key in totals.episodes[0]}
+    _write_table(folder / "meta/episodes/chunk-000/file-000.parquet", rows)
+    _write_tasks(folder / "meta/tasks.parquet", totals.tasks)
+    frames = totals.frames
+    stats = {key: found.result(frames) for key, found in statistics.items()}
+    write_json(folder / "meta/stats.json", stats)
+    (size,) = totals.sizes
+    vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+    exact = {
+        name: {"dtype": "float64", "shape": [totals.vectors[name]], "names": None}
+        for name in (HANDS, POSES, INTRINSICS)
+    }
+    picture = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
+    own = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
+    info = {
+        "codebase_version": "v3.0",
+        "robot_type": robot_type,
+        "total_episodes": len(totals.episodes),
+        "total_frames": frames,
+        "total_tasks": len(totals.tasks),
+        "chunks_size": CHUNK,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": f"0:{len(totals.episodes)}"},
+        "data_path": PATH,
+        "video_path": None,
+        "features": {
+            IMAGE: picture,
+            STATE: vector,
+            ACTION: vector,
+            **exact,
+            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+            **own,
+        },
+    }
+    write_json(folder / "meta/info.json", info)
+
+
+def _write_tasks(path: Path, tasks: dict[str, int]) -> None:
+    """Write the tasks as pandas does, with the texts as the index."""
+    import json
+
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.table(
+        {"task_index": pa.array(list(tasks.values()), pa.int64()), "__index_level_0__": list(tasks)}
+    )
+    about = {
+        "index_columns": ["__index_level_0__"],
+        "column_indexes": [],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64",
+             "numpy_type": "int64", "metadata": None},
+            {"name": None, "field_name": "__index_level_0__", "pandas_type": "unicode",
+             "numpy_type": "object", "metadata": None},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.0.0",
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), path)

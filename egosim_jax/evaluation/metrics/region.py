@@ -1,0 +1,124 @@
+"""Silhouettes and positions of hands and objects, segmented by color.
+
+An object of color c under light s has pixels of color s * c. Where the scene without hands and
+without the object that they move is known, each pixel gets the label whose color is nearest: that
+background under some light, {s * b : 0.45 <= s <= 1.15}, or one of the colors of hands and object.
+The same rule labels the ground truth and the generated video; on the ground truth, whose ids are
+known, its accuracy can be measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from egosim_jax.evaluation.metrics.image import decibels
+
+SHADES = (0.45, 1.15)
+"""Range of light on a surface."""
+MIN_VISIBLE_PX = 20
+"""Fewest visible pixels of an object in a frame in which it is searched."""
+CENTROID_RADIUS = 0.12
+"""Radius around an object's median pixel within which pixels count, as a fraction of the width."""
+
+
+def label(
+    video: UInt8[np.ndarray, "f h w 3"],
+    background: UInt8[np.ndarray, "f h w 3"],
+    paints: Mapping[int, tuple[int, int, int]],
+) -> Int[np.ndarray, "f h w"]:
+    """Return the label of each pixel: an id of `paints`, RGB by id, or 0 for the background."""
+    pixels = video.astype(np.float32)
+    numbers = np.array([0, *paints])
+    colors = [background, *(np.array(color) for color in paints.values())]
+    distances = [_distance(pixels, color.astype(np.float32)) for color in colors]
+    return numbers[np.argmin(distances, axis=0)]
+
+
+def find(
+    number: int,
+    video: UInt8[np.ndarray, "f h w 3"],
+    background: UInt8[np.ndarray, "f h w 3"],
+    paints: Mapping[int, tuple[int, int, int]],
+) -> Bool[np.ndarray, "f h w"]:
+    """Return the silhouette of one body of a video, opened.
+
+    A pixel belongs to it if its color is nearest to the body's, and not to that of the background,
+    a hand or any other body of `paints`, all of which may be misplaced in the video.
+    """
+    return open_mask(label(video, background, paints) == number)
+
+
+def _distance(
+    pixels: Float[np.ndarray, "f h w 3"], color: Float[np.ndarray, "*b 3"]
+) -> Float[np.ndarray, "f h w"]:
+    """Return the squared distance to a color under the light that minimizes it."""
+    strength = np.maximum(np.square(color).sum(axis=-1), 1e-6)
+    shade = np.clip((pixels * color).sum(axis=-1) / strength, *SHADES)
+    return np.square(pixels - shade[..., None] * color).sum(axis=-1)
+
+
+def open_mask(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """Return masks without lines and specks that no 3 x 3 square fits into (opening)."""
+    import cv2
+
+    square = np.ones((3, 3), np.uint8)
+    opened = [cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_OPEN, square) for m in mask]
+    return np.stack(opened) > 0
+
+
+def region_psnr(
+    video: UInt8[np.ndarray, "f h w 3"],
+    target: UInt8[np.ndarray, "f h w 3"],
+    region: Bool[np.ndarray, "f h w"],
+) -> float:
+    """Return the PSNR in dB over the pixels of a region in all frames; NaN if it is empty."""
+    if not region.any():
+        return float("nan")
+    return float(decibels(np.square(video[region].astype(np.float64) - target[region]).mean()))
+
+
+def silhouette_iou(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
+    """Return the IoU, averaged over the frames in which the target has pixels; else NaN."""
+    shown = target.any(axis=(1, 2))
+    both = (found & target).sum(axis=(1, 2))[shown]
+    either = (found | target).sum(axis=(1, 2))[shown]
+    return float((both / either).mean()) if shown.any() else float("nan")
+
+
+def centroid_errors(
+    found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]
+) -> Float[np.ndarray, " g"]:
+    """Return the distances in pixels between the centroids of two silhouettes.
+
+    One for each frame in which the target has enough pixels; an empty silhouette counts as an
+    image width away.
+    """
+    width = target.shape[2]
+    shown = _visible(target)
+    errors = []
+    for here, there in zip(found[shown], target[shown], strict=True):
+        gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
+        errors.append(np.hypot(*gap))
+    return np.array(errors)
+
+
+def lost_share(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
+    """Return the share of the frames that show a target in which nothing was found; else NaN."""
+    shown = _visible(target)
+    return float((~found[shown].any(axis=(1, 2))).mean()) if shown.any() else float("nan")
+
+
+def _visible(silhouettes: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, " f"]:
+    """Return the frames in which enough pixels are visible."""
+    return silhouettes.sum(axis=(1, 2)) >= MIN_VISIBLE_PX
+
+
+def _centroid(silhouette: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
+    """Return the centroid of the pixels near the median one; stray pixels do not count."""
+    pixels = np.argwhere(silhouette)
+    gaps = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
+    near = gaps <= max(CENTROID_RADIUS * silhouette.shape[1], gaps.min())
+    return pixels[near].mean(axis=0)

@@ -1,0 +1,148 @@
+"""A self-contained HTML page of an evaluation: tables, protocol, and clips of all methods.
+
+Each clip is one small video with the methods in equal columns, so that they cannot run apart. The
+page loads nothing: its content security policy allows inline data alone, and the template escapes
+every value.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Sequence
+from importlib import resources
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.data.transforms import resize_video
+from egosim_jax.data.windows import Window
+from egosim_jax.evaluation.files import ARROWS
+from egosim_jax.evaluation.methods import Method, Shape, read_at
+from egosim_jax.evaluation.metrics.report import cell_of
+from egosim_jax.evaluation.result import Evaluation
+from egosim_jax.io.run import write_text
+from egosim_jax.io.video import encode_video, probe_video
+from egosim_jax.runtime.progress import track
+from egosim_jax.types import InputError
+
+PAGE, TEMPLATE = "index.html", "page.html"
+PANEL_PX = 224
+"""Width of one video of a clip in pixels."""
+EVERY, CRF = 2, 30
+"""Shown are every second frame, at this quality of x264."""
+MISSING = (
+    "the page cannot be written: it needs jinja2, which is not installed. Install "
+    "egosim-jax[metrics]."
+)
+
+
+class ShownClip(NamedTuple):
+    """A clip on a page."""
+
+    title: str
+    prompt: str
+    names: list[str]
+    """Titles of the columns of its video."""
+    video: str
+    """Video as a data URI."""
+    scores: list[list[str]]
+    """Title and cells of each method."""
+
+
+def can_be_written() -> bool:
+    """Return whether jinja2, which a page needs, is installed."""
+    return find_spec("jinja2") is not None
+
+
+def write_page(
+    evaluation: Evaluation, methods: Sequence[Method], path: Path, *, title: str, clips: int
+) -> None:
+    """Write the page of an evaluation with its first clips, at most so many of each group."""
+    import jinja2
+
+    template = resources.files("egosim_jax.evaluation").joinpath(TEMPLATE).read_text("utf-8")
+    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    text = page.from_string(template).render(
+        title=title,
+        tables=list(_tables(evaluation)),
+        notes=evaluation.notes(),
+        skipped=list(evaluation.skipped),
+        clips=list(_clips(evaluation, methods, clips)),
+    )
+    write_text(path, text)
+
+
+def _tables(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
+    differences = evaluation.differences()
+    for group in evaluation.summaries():
+        columns = evaluation.headings(group)
+        yield {
+            "caption": evaluation.caption(group),
+            "heads": [f"{c.heading} {ARROWS[c.better]}" for c in columns.values()],
+            "rows": [
+                (
+                    title,
+                    title.endswith("(published)"),
+                    [cell_of(row.get(key, {}), c.form) for key, c in columns.items()],
+                )
+                for title, row in evaluation.table(group).items()
+            ],
+            "reference": next(iter(evaluation.titles.values())),
+            "differences": [
+                (
+                    evaluation.titles[method],
+                    [cell_of(values.get(key, {}), c.form) for key, c in columns.items()],
+                )
+                for method, values in differences.get(group, {}).items()
+            ],
+        }
+
+
+def _clips(evaluation: Evaluation, methods: Sequence[Method], count: int) -> Iterator[ShownClip]:
+    """Yield the first clips of each group."""
+    by_group: dict[str, dict[Window, list]] = {}
+    for row in evaluation.rows:
+        by_group.setdefault(evaluation.group_of(row), {}).setdefault(row.window, []).append(row)
+    chosen = [
+        (group, window, rows)
+        for group, windows in sorted(by_group.items())
+        for window, rows in islice(windows.items(), count)
+    ]
+    by_name = {method.name: method for method in methods}
+    for group, window, rows in track(chosen, "drawing", total=len(chosen)):
+        shown = [by_name[row.method] for row in rows]
+        frames, fps = _strip(window, shown, rows[0].shape)
+        columns = evaluation.headings(group)
+        data = base64.b64encode(encode_video(frames, fps, crf=CRF)).decode()
+        yield ShownClip(
+            title=f"{evaluation.groups.get(group, group)}: {window.output_id}",
+            prompt=window.files.prompt,
+            names=[*(method.title for method in shown), "ground truth"],
+            video=f"data:video/mp4;base64,{data}",
+            scores=[
+                [evaluation.titles[row.method]]
+                + [c.form.format(row.scores[k]) if k in row.scores else "" for k, c in
+                   columns.items()]
+                for row in rows
+            ],
+        )  # fmt: skip
+
+
+def _strip(
+    window: Window, methods: Sequence[Method], shape: Shape
+) -> tuple[UInt8[np.ndarray, "f h w 3"], float]:
+    """Return the small videos of a clip in columns, ground truth last, and their frame rate."""
+    target_path = window.files.target
+    if target_path is None:
+        raise InputError(f"{window.files.row} has no ground truth. (column video)")
+    target = read_at(target_path, shape, window.start)
+    height = round(PANEL_PX * shape.height / shape.width / 2) * 2
+    panels = [
+        resize_video(np.ascontiguousarray(video[::EVERY]), height, PANEL_PX)
+        for video in (*(m.video(window, shape, target) for m in methods), target)
+    ]
+    return np.concatenate(panels, axis=2), float(probe_video(target_path).fps) / EVERY

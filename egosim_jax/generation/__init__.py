@@ -1,0 +1,1 @@
+"""From triplets to clips: conditions, the sampler, decoding, and batches of them."""

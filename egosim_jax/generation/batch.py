@@ -1,0 +1,379 @@
+"""Batch generation: a clip for each window of the clips of a metadata file, in one folder.
+
+For each window the folder gets {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | ground truth)
+and, on request, {id}_vae.mp4, the ground truth through the autoencoder; and results.jsonl, of whose
+lines the last one of an id counts, and contact_sheet.png of the first clips. The noise of a clip
+depends on the seed and its id alone, so that a clip depends on neither order nor batch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.sharding import Mesh
+
+from egosim_jax.conditioning.baselines import DROPPED, Baseline, with_hand_mask
+from egosim_jax.configs.model import ModelConfig, Networks
+from egosim_jax.convert.lora import check_base
+from egosim_jax.data.clips import Policy, check_clip, load_triplet
+from egosim_jax.data.metadata import check_presence
+from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
+from egosim_jax.generation.generator import Generator, NonFiniteError, batches
+from egosim_jax.io.atomic import append_line
+from egosim_jax.io.decoding import Decoding
+from egosim_jax.io.digest import sha256_within
+from egosim_jax.io.run import open_folder
+from egosim_jax.io.untrusted.bounded import listing, quote
+from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.weights import hashes
+from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, parts
+from egosim_jax.types import Clip, InputError, Triplet
+
+SHEET_CLIPS = 6
+"""Maximum number of clips on the contact sheet."""
+SHEET_COLUMNS = 6
+"""Frames of each clip on the contact sheet."""
+SHEET_ROWS = ("prior", "hands", "generated", "ground truth")
+"""Rows of each clip on the contact sheet; the last one where it is known."""
+SHEET_WIDTH = 240
+"""Width of a frame on the contact sheet in pixels."""
+
+
+Failure = tuple[Window, str]
+"""A window and why it failed."""
+
+
+class Outcome(NamedTuple):
+    """Numbers of windows of a batch job by their outcome."""
+
+    existing: int
+    """Windows that were generated before."""
+    done: int
+    """Windows that were generated now."""
+    rejected: int
+    """Windows whose inputs are invalid."""
+    failed: int
+    """Windows whose generation failed."""
+
+
+def seed_of(seed: int, output_id: str) -> int:
+    """Return the seed of a clip's noise, given the seed of the job."""
+    return int.from_bytes(hashlib.sha256(f"{seed} {output_id}".encode()).digest()[:4], "big")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchJob:
+    """Settings of a batch generation into a folder; equal settings continue in the same folder."""
+
+    model: ModelConfig
+    """Config of the model."""
+    out: Path
+    """Folder of the generated clips and results.jsonl."""
+    weights: Path | None
+    """Folder of weights; None for random weights of `seed`."""
+    lora: Path | None = None
+    """LoRA of the denoiser: a file, or a folder with weights in full (DWM's)."""
+    lora_scale: float = 1.0
+    """Strength of the LoRA."""
+    seed: int = 0
+    """Seed from which each clip's noise is derived."""
+    batch_size: int | None = None
+    """Clips generated together, over all devices; None for one on each part of the mesh."""
+    mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
+    """Layout of the devices."""
+    policy: Policy = "strict"
+    """Treatment of invalid input (`data/clips.py`)."""
+    decoding: Decoding = "accurate"
+    """Color decoding of videos."""
+    skip_existing: bool = False
+    """Skip windows whose video is done; one of other inputs is refused."""
+    reconstruct: bool = False
+    """Also write the ground truth through the autoencoder."""
+    baseline: Baseline | None = None
+    """Baseline to generate instead of the model with all of its conditions."""
+
+    def open(self) -> None:
+        """Record the settings in the folder. Raises `InputError` if it is of another job."""
+        self._place()
+        digests = None if self.weights is None else hashes(self.weights)
+        if self.lora is not None and digests is not None:
+            check_base(self.lora, [digests["dit"]])
+        settings = {
+            "model": self.model,
+            "weights": digests,
+            "lora": None if self.lora is None else [sha256_within(self.lora), self.lora_scale],
+            "seed": self.seed,
+            "policy": self.policy,
+        }
+        if self.decoding != "accurate":
+            settings["decoding"] = self.decoding
+        if self.baseline is not None:
+            settings["baseline"] = self.baseline
+        open_folder(self.out, settings)
+        for name, digest in (digests or {}).items():
+            print(f"{self.model.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
+
+    def generate(
+        self, windows: Sequence[Window], *, load: Callable[[Mesh], Generator] | None = None
+    ) -> Outcome:
+        """Check all inputs, compile, generate and draw; print the path of each new clip.
+
+        `load` replaces `self.load`, for jobs that share a generator.
+        """
+        self._check_names(windows)
+        skipped = self._finished(windows) if self.skip_existing else set()
+        if skipped:
+            print(f"{len(skipped)} existing clips are skipped", file=sys.stderr)
+        todo = [window for window in windows if window.output_id not in skipped]
+        valid, rejected = self.check(todo)
+        for window, problem in rejected:
+            self._report(window, status="failed", error=problem)
+        failed: list[Failure] = []
+        if valid:
+            self._warn_of_long_prompts(valid)
+            failed = self._generate(valid, load or self.load)
+            self._draw(windows)
+        outcome = Outcome(len(skipped), len(valid) - len(failed), len(rejected), len(failed))
+        bad = outcome.rejected + outcome.failed
+        print(f"{outcome.done} done, {bad} failed: {self.out}", file=sys.stderr)
+        return outcome
+
+    def _place(self) -> tuple[Mesh, int]:
+        """Return the mesh and the number of clips generated together on it."""
+        mesh = make_mesh(self.mesh)
+        size = parts("batch", mesh) if self.batch_size is None else self.batch_size
+        check_batch(size, mesh)
+        return mesh, size
+
+    def _check_names(self, windows: Sequence[Window]) -> None:
+        """Raise `InputError` if two clips would write the same file."""
+        owners: dict[str, str] = {}
+        for window in windows:
+            for suffix in ("", "_cmp", "_vae"):
+                name = f"{window.output_id}{suffix}.mp4"
+                other = owners.setdefault(name, window.output_id)
+                if other != window.output_id:
+                    raise InputError(
+                        f"The clips {other} and {window.output_id} would both write {name}. Rename "
+                        "one of them. (column video_id)"
+                    )
+
+    def _finished(self, windows: Sequence[Window]) -> set[str]:
+        """Return the ids of the windows whose clips are there, and listed as done.
+
+        Raises `InputError` if one is of another window, prompt or other conditions, and would be
+        taken for this one. Lines of earlier versions do not say of which conditions.
+        """
+        results, finished = read_results(self.out) or {}, set()
+        for window in windows:
+            line = results.get(window.output_id, {})
+            files = [self._video(window)]
+            if self.reconstruct:
+                files.append(self._reconstruction(window))
+            if line.get("status") != "done" or not all(path.exists() for path in files):
+                continue
+            own = {"source_id": window.files.video_id, "start": window.start,
+                   "prompt": window.files.prompt,
+                   "conditions_sha256": conditions_sha256(window.files)}  # fmt: skip
+            if differing := [name for name in own if line.get(name, own[name]) != own[name]]:
+                raise InputError(
+                    f"{self._video(window)} exists and cannot be skipped, because it has another "
+                    f"{differing[0]}: {quote(line[differing[0]])}, not {quote(own[differing[0]])}. "
+                    "Choose another folder, or remove the clip. (--out)"
+                )
+            finished.add(window.output_id)
+        return finished
+
+    def check(self, windows: Sequence[Window]) -> tuple[list[Window], list[Failure]]:
+        """Return the windows whose inputs are valid, and the others with their problems."""
+        if windows:
+            check_presence([window.files for window in windows])
+        valid, rejected = [], []
+        for window in windows:
+            problems = check_clip(
+                window.files,
+                self.model.video,
+                start=window.start,
+                policy=self.policy,
+                grid=self.model.grid,
+            )
+            if problems:
+                rejected.append((window, listing(problems)))
+            else:
+                valid.append(window)
+        return valid, rejected
+
+    def _warn_of_long_prompts(self, windows: Sequence[Window]) -> None:
+        prompts = {window.files.video_id: window.files.prompt for window in windows}
+        tokens = self.model.tokenizer.tokenize(list(prompts.values()))
+        if tokens.cut:
+            limit = self.model.tokenizer.max_tokens
+            print(
+                f"warning: {tokens.cut} of {len(prompts)} prompts are longer than {limit} tokens "
+                f"(the longest has {max(tokens.lengths)}) and are cut",
+                file=sys.stderr,
+            )
+
+    def _generate(
+        self, windows: Sequence[Window], load: Callable[[Mesh], Generator]
+    ) -> list[Failure]:
+        """Generate batch after batch; return the failures."""
+        mesh, size = self._place()
+        unit = parts("batch", mesh)
+        size = min(size, -(-len(windows) // unit) * unit)  # a multiple of the mesh that suffices
+        then = time.monotonic()
+        generator = load(mesh)
+        loaded = time.monotonic()
+        generator.compile(size)
+        print(
+            f"weights in {loaded - then:.1f} s, programs in {time.monotonic() - loaded:.1f} s",
+            file=sys.stderr,
+        )
+        failed: list[Failure] = []
+        began, done = time.monotonic(), 0
+        for batch in batches(windows, size):
+            then = time.monotonic()
+            triplets, problems = self._load(batch)
+            failed += problems
+            if triplets:
+                failed += self._generate_batch(generator, triplets, size)
+            done += len(batch)
+            left = (time.monotonic() - began) / done * (len(windows) - done)
+            print(
+                f"{done}/{len(windows)} clips, {time.monotonic() - then:.1f} s, {left:.0f} s left",
+                file=sys.stderr,
+            )
+        return failed
+
+    def load(self, mesh: Mesh) -> Generator:
+        """Return the generator of the job's weights; random ones are those of its seed."""
+        if self.weights is None:
+            print(f"{self.model.name}: random weights of seed {self.seed}", file=sys.stderr)
+            return Generator(self.model, Networks.random(self.model, seed=self.seed), mesh)
+        return Generator.load(
+            self.model, self.weights, mesh=mesh, lora=self.lora, lora_scale=self.lora_scale
+        )
+
+    def _load(
+        self, windows: Sequence[Window]
+    ) -> tuple[list[tuple[Window, Triplet, str]], list[Failure]]:
+        """Decode the inputs of a batch; return them with their hashes, and the failures."""
+        loaded, failed = [], []
+        for window in windows:
+            try:
+                digest = conditions_sha256(window.files)
+                triplet = load_triplet(
+                    window.files,
+                    self.model.video,
+                    start=window.start,
+                    policy=self.policy,
+                    decoding=self.decoding,
+                    grid=self.model.grid,
+                )
+                self.model.layout.check_mask(triplet.mask)
+                loaded.append((window, triplet, digest))
+            except InputError as error:
+                failed.append((window, str(error)))
+                self._report(window, status="failed", error=str(error))
+        return loaded, failed
+
+    def _generate_batch(
+        self, generator: Generator, loaded: Sequence[tuple[Window, Triplet, str]], size: int
+    ) -> list[Failure]:
+        """Generate and write one batch, padded to `size` so that nothing is compiled again."""
+        windows, triplets, digests = zip(*loaded, strict=True)
+        fill = size - len(windows)
+        triplets = [*triplets, *[triplets[-1]] * fill]
+        seeds = [seed_of(self.seed, w.output_id) for w in (*windows, *[windows[-1]] * fill)]
+        then = time.monotonic()
+        try:
+            clips = self._clips(generator, triplets, seeds)
+        except NonFiniteError as error:
+            bad = {min(n, len(loaded) - 1) for n in error.places}  # the last one fills up
+            problem = "The latents of the clip are not finite (NaN or infinity)."
+            failed = [(windows[n], problem) for n in sorted(bad)]
+            for window, _ in failed:
+                self._report(window, status="failed", error=problem)
+            good = [item for n, item in enumerate(loaded) if n not in bad]
+            return failed + (self._generate_batch(generator, good, size) if good else [])
+        seconds = (time.monotonic() - then) / len(windows)
+        reconstructions = generator.reconstruct(triplets) if self.reconstruct else [None] * size
+        for window, digest, triplet, clip, reconstruction, seed in zip(
+            windows, digests, triplets, clips, reconstructions, seeds, strict=False
+        ):
+            self._write(window, triplet, clip, reconstruction)
+            self._report(window, status="done", seed=seed, seconds=round(seconds, 3),
+                         conditions_sha256=digest)  # fmt: skip
+            print(self._video(window))
+        return []
+
+    def _clips(
+        self, generator: Generator, triplets: Sequence[Triplet], seeds: Sequence[int]
+    ) -> list[Clip]:
+        if self.baseline == "hand_mask":
+            triplets = [with_hand_mask(triplet) for triplet in triplets]
+        return generator.generate(triplets, seeds, without=self.baseline and DROPPED[self.baseline])
+
+    def _write(
+        self, window: Window, triplet: Triplet, clip: Clip, reconstruction: Clip | None
+    ) -> None:
+        shown = [triplet.prior, triplet.hands, clip.frames]
+        if triplet.target is not None:
+            shown.append(triplet.target)
+        comparison = np.concatenate(shown, axis=2)
+        write_video(self.out / f"{window.output_id}_cmp.mp4", comparison, clip.fps)
+        if reconstruction is not None:
+            write_video(self._reconstruction(window), reconstruction.frames, clip.fps)
+        write_video(self._video(window), clip.frames, clip.fps)
+
+    def _report(self, window: Window, *, status: str, **values: Any) -> None:
+        """Append a line to results.jsonl."""
+        if status == "failed":
+            print(f"failed: {window.output_id}: {values['error']}", file=sys.stderr)
+        own = {
+            "video_id": window.output_id,
+            "source_id": window.files.video_id,
+            "start": window.start,
+            "status": status,
+            "output": f"{window.output_id}.mp4",
+            **values,
+            "prompt": window.files.prompt,
+        }
+        # A column of the metadata must not replace a field of the result.
+        reserved = {*own, "seed", "seconds", "conditions_sha256", "error"}
+        extra = window.files.extra.items()
+        line = own | {f"metadata_{k}" if k in reserved else k: text for k, text in extra}
+        append_line(self.out / RESULTS, line)
+
+    def _video(self, window: Window) -> Path:
+        return self.out / f"{window.output_id}.mp4"
+
+    def _reconstruction(self, window: Window) -> Path:
+        return self.out / f"{window.output_id}_vae.mp4"
+
+    def _draw(self, windows: Sequence[Window]) -> None:
+        """Draw the contact sheet of the first existing clips."""
+        clips = list(itertools.islice(self._sheet_clips(windows), SHEET_CLIPS))
+        if clips:
+            last = self.model.video.frames - 1
+            moments = np.linspace(0, last, SHEET_COLUMNS).round().astype(int)
+            sheet = self.out / "contact_sheet.png"
+            draw_sheet(clips, sheet, moments=moments.tolist(), width=SHEET_WIDTH)
+            print(sheet)
+
+    def _sheet_clips(self, windows: Sequence[Window]) -> Iterator[SheetClip]:
+        for window in windows:
+            if self._video(window).exists():
+                videos = read_video(self.out / f"{window.output_id}_cmp.mp4").frames
+                videos = np.split(videos, videos.shape[2] // self.model.video.width, axis=2)
+                rows = dict(zip(SHEET_ROWS, videos, strict=False))
+                yield SheetClip(f"{window.output_id}   {', '.join(rows)}", list(rows.values()))

@@ -1,0 +1,1 @@
+"""Worlds to step, serve and play in."""

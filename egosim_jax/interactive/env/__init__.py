@@ -1,0 +1,106 @@
+"""Worlds as Gymnasium environments: step a policy in a generated world or in the true one.
+
+    env = gymnasium.make("egosim_jax/Tabletop-v0")
+    envs = gymnasium.make_vec("egosim_jax/Tabletop-v0", num_envs=8)
+
+An action is a row of numbers (`actions.py`); `env.unwrapped.chunk_step` takes as many rows as a
+clip has frames. Needs the extra `env`.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.start import Start
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.interactive.env.backends import Backend
+    from egosim_jax.interactive.env.single import WorldEnv
+    from egosim_jax.interactive.env.vector import WorldVectorEnv
+
+__all__ = ["ActionSpec", "Start", "backend_of", "make", "make_vec", "register"]
+
+ID = "egosim_jax/Tabletop-v0"
+World = Literal["generated", "true"]
+
+
+def backend_of(
+    world: World = "generated",
+    *,
+    config: str = "tabletop",
+    weights: Path | str | None = None,
+    perception: str = "classical",
+    steps: int | None = None,
+    batch: int = 1,
+    compile: bool = True,
+) -> Backend:
+    """Return a world: a model's, of which `batch` clips are generated together, or the true one.
+
+    The model is compiled for its batch sizes now, over all devices, or with `compile` unset at the
+    first step.
+    """
+    from dataclasses import replace
+
+    from egosim_jax import configs
+    from egosim_jax.generation.generator import Generator
+    from egosim_jax.generation.stream import Streamer
+    from egosim_jax.interactive.env.backends import GeneratedWorld
+    from egosim_jax.interactive.env.batching import Batcher
+    from egosim_jax.interactive.env.true_world import TrueWorld
+    from egosim_jax.sharding import make_mesh, parts
+    from egosim_jax.types import MeshConfig
+
+    model = configs.get(config)
+    model = replace(model, steps=steps or model.steps)
+    if world == "true":
+        return TrueWorld(video=model.video)
+    if world != "generated":
+        raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
+    mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
+    folder = configs.weights_of(config, None if weights is None else Path(weights))
+    generator = Streamer(Generator.load(model, folder, mesh=mesh), mesh)
+    unit = parts("batch", mesh)
+    batcher = Batcher(generator, most=max(batch, unit), unit=unit)
+    for size in batcher.sizes if compile else ():
+        generator.compile(size)
+    return GeneratedWorld(generator=batcher, video=model.video, perception=perception)
+
+
+def make(*, backend: Backend | None = None, world: World = "generated", **options: Any) -> WorldEnv:
+    """Return an environment of a backend, or of a world by name (`WorldEnv`)."""
+    from egosim_jax.interactive.env.single import WorldEnv
+
+    return WorldEnv(backend or backend_of(world), **options)
+
+
+def make_vec(
+    *,
+    num_envs: int,
+    backend: Backend | None = None,
+    world: World = "generated",
+    **options: Any,
+) -> WorldVectorEnv:
+    """Return a vector environment of a backend, or of a world by name (`WorldVectorEnv`)."""
+    from egosim_jax.interactive.env.vector import WorldVectorEnv
+
+    return WorldVectorEnv(backend or backend_of(world, batch=num_envs), num_envs, **options)
+
+
+def register() -> None:
+    """Register the environment with Gymnasium; importing this package does."""
+    import gymnasium
+
+    if ID not in gymnasium.registry:
+        gymnasium.register(
+            ID,
+            entry_point="egosim_jax.interactive.env:make",
+            vector_entry_point="egosim_jax.interactive.env:make_vec",
+        )
+
+
+if find_spec("gymnasium"):
+    register()

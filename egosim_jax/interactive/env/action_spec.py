@@ -1,0 +1,214 @@
+"""Actions as rows of numbers: the coordinates in which a policy moves hands and camera.
+
+One row per frame. It has the numbers of each hand, then, with `camera`, six of the camera:
+
+    keypoints  63 a hand: 21 joints in the world, in meters, in the order of `episode.py`
+    wrist       7 a hand: position of the wrist in meters, rotation vector, closure from 0 to 1
+    gripper     7 a hand: the same of a gripper, whose fingers close
+    camera      6: translation in meters and rotation vector, from the first camera, in its axes
+
+All is in the world's frame. Without rotation the fingers point along y and the back of the hand
+along z (`worlds/tabletop/hands.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from egosim_jax.interactive.env.placed import with_places
+from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
+from egosim_jax.worlds.tabletop.hands import Side, joints_of
+
+Layout = Literal["keypoints", "wrist", "gripper"]
+LAYOUTS: tuple[Layout, ...] = ("keypoints", "wrist", "gripper")
+HAND_NAMES = ("x", "y", "z", "rx", "ry", "rz", "closure")
+CAMERA_NAMES = ("camera x", "camera y", "camera z", "camera rx", "camera ry", "camera rz")
+REST = (0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25)
+"""Row of a right hand at rest: position in meters, rotation vector in radians, closure."""
+
+
+def numbers(rows: object) -> Float[np.ndarray, ...]:
+    """Return rows as an array. Raises `InputError` for text and other values that are no numbers.
+
+    Rows of unequal lengths are none either, and whole numbers beyond 64 bits.
+    """
+    try:
+        found = np.asarray(rows)
+    except (TypeError, ValueError, OverflowError):
+        found = np.empty(0, object)
+    if found.dtype.kind not in "biuf":
+        raise InputError(f"The actions are {quote(rows)}: they must be rows of numbers.")
+    return found.astype(np.float64)
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class ActionSpec:
+    """Meaning and bounds of the rows of an action."""
+
+    layout: Layout = "wrist"
+    """Numbers of each hand."""
+    sides: tuple[Side, ...] = ("right",)
+    """Hands in their order in a row."""
+    camera: bool = False
+    """Append the pose of the camera, which otherwise rests."""
+    workspace_m: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+        (-0.35, 0.0, 0.0),
+        (0.35, 0.55, 0.40),
+    )
+    """Lowest and highest position of a wrist or joint in the world, in meters."""
+    camera_reach: tuple[float, float] = (0.15, 0.35)
+    """Largest translation of the camera in meters and rotation in radians, along each axis."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` for an unknown layout, no hands, or an empty workspace or reach."""
+        if self.layout not in LAYOUTS:  # which a client may have chosen
+            raise InputError(
+                f"There is no action layout {str(self.layout)[:40]!r}: it must be one of "
+                f"{', '.join(LAYOUTS)}."
+            )
+        if sorted(self.sides) not in (["left"], ["right"], ["left", "right"]):
+            raise InputError(
+                f"The hands are {self.sides!r:.60}: give 'left', 'right' or one of each."
+            )
+        low, high = np.array(self.workspace_m, float)
+        if not (np.isfinite([low, high]).all() and (low < high).all()):
+            raise InputError(
+                f"The workspace is {self.workspace_m!r:.120}: it must be the lowest and the "
+                "highest x, y and z in meters."
+            )
+        translation_m, turn = self.camera_reach
+        if not (0 < translation_m < np.inf and 0 < turn <= np.pi):
+            raise InputError(
+                f"The reach of the camera is {self.camera_reach!r:.60}: it must be a translation "
+                "above 0 in meters and a rotation above 0 and at most pi in radians."
+            )
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of hands that the rows move."""
+        return "robot" if self.layout == "gripper" else "human"
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Name of each number of a row."""
+        joints = [f"joint {joint} {axis}" for joint in range(JOINTS["human"]) for axis in "xyz"]
+        own = joints if self.layout == "keypoints" else HAND_NAMES
+        hands = [f"{side} {name}" for side in self.sides for name in own]
+        return (*hands, *(CAMERA_NAMES if self.camera else ()))
+
+    @cached_property
+    def bounds(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """Lowest and highest value of each number of a row."""
+        turn = (np.pi,) * 3
+        ends = []
+        for sign, place, closure in zip((-1, 1), self.workspace_m, (0.0, 1.0), strict=True):
+            hand = (
+                place * JOINTS["human"]
+                if self.layout == "keypoints"
+                else (*place, *(sign * angle for angle in turn), closure)
+            )
+            camera = [sign * reach for reach in self.camera_reach for _ in "xyz"]
+            ends.append([*hand * len(self.sides), *(camera if self.camera else ())])
+        return np.array(ends[0], float), np.array(ends[1], float)
+
+    @cached_property
+    def rest(self) -> Float[np.ndarray, " d"]:
+        """Row of hands at rest in front of the wearer, within the workspace."""
+        row: list[float] = []
+        low, high = np.array(self.workspace_m)
+        for side in self.sides:
+            mirror = np.array([-1, 1, 1, 1, -1, -1, 1]) if side == "left" else 1
+            hand = np.array(REST) * mirror
+            hand[:3] = np.clip(hand[:3], low, high)
+            row += self._placed(hand, side).ravel().tolist() if self._joints else hand.tolist()
+        return np.clip([*row, *([0.0] * 6 if self.camera else [])], *self.bounds)
+
+    @property
+    def _joints(self) -> bool:
+        return self.layout == "keypoints"
+
+    def check(self, rows: object, *, most: int) -> Float[np.ndarray, "k d"]:
+        """Return rows as an array. Raises `InputError` for a wrong shape, NaN or a value outside.
+
+        `most` is the largest number of rows of a chunk.
+        """
+        found = numbers(rows)
+        if found.ndim != 2 or not 1 <= len(found) <= most or found.shape[1] != len(self.names):
+            raise InputError(
+                f"The actions have shape {found.shape}: {self.layout} of {len(self.sides)} hands "
+                f"{'and the camera' if self.camera else 'without a camera'} must be (1 to {most}, "
+                f"{len(self.names)})."
+            )
+        finite = np.isfinite(found)
+        if not finite.all():
+            row, column = np.argwhere(~finite)[0].tolist()
+            raise InputError(
+                f"Row {row} of the actions has {found[row, column]} as {self.names[column]}: all "
+                "must be finite."
+            )
+        low, high = self.bounds
+        outside = (found < low - 1e-6) | (found > high + 1e-6)
+        if outside.any():
+            row, column = np.argwhere(outside)[0].tolist()
+            raise InputError(
+                f"Row {row} of the actions has {found[row, column]:.4g} as {self.names[column]}: "
+                f"it must be from {low[column]:.4g} to {high[column]:.4g}. Positions are in "
+                "meters in the world, rotations in radians."
+            )
+        return found
+
+    def to_action(
+        self,
+        rows: Float[np.ndarray, "k d"],
+        *,
+        camera: Cameras,
+        prompt: str,
+        hide: bool = False,
+    ) -> tuple[Action, Bool[np.ndarray, " n"]]:
+        """Return the action of a row per frame, and which hands are hidden.
+
+        `camera` is the first camera of the episode. A hand that never comes near the view is an
+        `InputError`, or with `hide` is given as missing, in an action that knows its place.
+        """
+        cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
+        joints = self.joints(rows)
+        lost = np.zeros(len(self.sides), bool)
+        if hide:
+            lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
+        seen = np.where(lost[None, :, None, None], np.nan, joints)
+        action = Action(cameras=cameras, joints_m=seen, kind=self.kind, prompt=prompt)
+        return with_places(action, joints) if lost.any() else action, lost
+
+    def joints(self, rows: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n j 3"]:
+        """Return the joints of each row's hands in the world, in meters."""
+        count = 63 if self._joints else len(HAND_NAMES)
+        hands = rows[:, : count * len(self.sides)].reshape(len(rows), len(self.sides), count)
+        if self._joints:
+            return hands.reshape(len(rows), len(self.sides), JOINTS["human"], 3)
+        return np.stack(
+            [
+                [self._placed(hand, side) for hand, side in zip(row, self.sides, strict=True)]
+                for row in hands
+            ]
+        )
+
+    def _placed(self, hand: np.ndarray, side: Side) -> Float[np.ndarray, "j 3"]:
+        rotation = cv2.Rodrigues(hand[3:6])[0]
+        return joints_of(self.kind, float(hand[6]), side) @ rotation.T + hand[:3]
+
+    def _cameras(self, rows: np.ndarray, camera: Cameras) -> Float[np.ndarray, "k 4 4"]:
+        poses = np.repeat(camera.world_from_camera[:1], len(rows), axis=0)
+        if not self.camera:
+            return poses
+        moves = np.repeat(np.eye(4)[None], len(rows), axis=0)
+        for move, row in zip(moves, rows[:, -6:], strict=True):
+            move[:3, :3], move[:3, 3] = cv2.Rodrigues(row[3:])[0], row[:3]
+        return poses @ moves

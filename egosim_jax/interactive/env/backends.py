@@ -1,0 +1,95 @@
+"""Worlds behind the same interface: a model's, and others such as the true tabletop world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Protocol, runtime_checkable
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.start import Start
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.perception import registry
+from egosim_jax.simulation.simulator import Simulator, VideoGenerator
+from egosim_jax.types import VideoSpec, check_seed
+from egosim_jax.worlds.tabletop import opening
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """World of which episodes are simulated."""
+
+    @property
+    def video(self) -> VideoSpec:
+        """Length, size and rate of its clips."""
+        ...
+
+    needs_past: ClassVar[bool]
+    """Simulators depend on the actions since the seed."""
+
+    def identity(self) -> dict[str, str]:
+        """Return what the clips depend on, by name; equal worlds continue each other's sessions."""
+        ...
+
+    def start(self, seed: int, spec: ActionSpec) -> Start:
+        """Return the start of a seed's episode."""
+        ...
+
+    def simulator(self, start: Start) -> Simulator:
+        """Return the simulator of the clip that follows a start."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneratedWorld:
+    """World whose clips a generator makes; its scenes are those of the tabletop world."""
+
+    generator: VideoGenerator
+    """Generator of the clips, shared by all episodes: a `Batcher` generates them together."""
+    video: VideoSpec
+    """Length, size and rate of the generator's clips."""
+    perception: str | None = "classical"
+    """Perception that updates the state, by name with its options; None keeps the first state."""
+
+    needs_past: ClassVar[bool] = False
+
+    def identity(self) -> dict[str, str]:
+        """Return the size of the clips, perception, and content hash of the generator."""
+        return {
+            "world": "generated",
+            "video": str(self.video),
+            "perception": str(self.perception),
+            "generator": fingerprint(self.generator),
+        }
+
+    def start(self, seed: int, spec: ActionSpec) -> Start:
+        """Return a scene of the tabletop world with its first camera."""
+        return tabletop_start(seed, spec, self.video)
+
+    def simulator(self, start: Start) -> Simulator:
+        """Return the simulator, which is the same for all clips."""
+        return self._simulator
+
+    @cached_property
+    def _simulator(self) -> Simulator:
+        pipeline = None if self.perception is None else registry.parse(self.perception)
+        return Simulator(
+            generator=self.generator,
+            perception=None if pipeline is None else pipeline.build(),
+            fps=self.video.fps,
+        )
+
+
+def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
+    """Return the start of a seed's scene in the tabletop world."""
+    check_seed(seed, name="seed")
+    _, camera, first, state = opening(seed, spec=video, kind=spec.kind)
+    name = next(iter(state.names.values()))
+    who = "The gripper" if spec.kind == "robot" else f"The {spec.sides[0]} hand"
+    return Start(
+        state=state,
+        camera=camera,
+        prompt=f"{who} picks up the {name} and puts it down to the left.",
+        seed=seed,
+        first_frame=first.colors,
+    )

@@ -1,0 +1,209 @@
+"""Clips of many callers, generated together by one program.
+
+Each caller runs in its thread and calls the batcher like the generator. A thread of the batcher
+takes what waits and runs the program of the largest batch size that it fills, so that nothing is
+padded but to the devices of a mesh. It waits for callers that have announced themselves, for a
+moment at most: while one batch runs, the next one gathers.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property
+from queue import SimpleQueue
+from typing import Protocol, no_type_check, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.rendering import Renderer
+from egosim_jax.simulation.simulator import VideoGenerator
+from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
+
+
+@runtime_checkable
+class BatchGenerator(VideoGenerator, Protocol):
+    """Generator of several clips in one program (`streaming.Streamer`)."""
+
+    renderer: Renderer
+
+    def condition(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
+    ) -> Triplet:
+        """Return the conditions of a clip."""
+        ...
+
+    def groups(
+        self, triplets: Sequence[Triplet], seeds: Sequence[int]
+    ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
+        """Yield the frames of a clip of each triplet in groups, as they are decoded."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Return the content hash of config and weights."""
+        ...
+
+
+@no_type_check
+@dataclass(eq=False, kw_only=True)
+class _Request:
+    """Clip that a caller waits for, and its frames as they come."""
+
+    triplet: Triplet
+    seed: int
+    since: float = field(default_factory=time.monotonic)
+    _groups: SimpleQueue = field(default_factory=SimpleQueue)
+    _sent: int = 0
+
+    def send(self, number: int, frames: UInt8[np.ndarray, "g h w 3"]) -> None:
+        """Pass a group on, unless the caller has it from an earlier run of its clip."""
+        if number == self._sent:
+            self._groups.put(frames)
+            self._sent += 1
+
+    def end(self, error: Exception | None = None) -> None:
+        """Let the caller continue after the last group, or raise an error there."""
+        self._groups.put(error)
+
+    def receive(self) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the groups, in the caller's thread."""
+        while (found := self._groups.get()) is not None:
+            if isinstance(found, Exception):
+                raise found
+            yield found
+
+
+class Batcher:
+    """Generator that gathers the clips of several threads (`simulator.StreamedGenerator`)."""
+
+    def __init__(
+        self, generator: BatchGenerator, *, most: int = 8, unit: int = 1, wait_s: float = 0.05
+    ):
+        """`unit` is the number of parts of a mesh that divides batches; `most` a multiple of it."""
+        check_counts({"batch size": most, "parts of the mesh": unit})
+        if most % unit:
+            raise InputError(
+                f"Batches of {most} clips cannot be divided over {unit} parts of the devices: give "
+                f"a multiple of {unit}. (--batch)"
+            )
+        self.renderer = generator.renderer
+        self._generator = generator
+        self.sizes = [unit]
+        while 2 * self.sizes[-1] <= most:
+            self.sizes.append(2 * self.sizes[-1])
+        if self.sizes[-1] < most:
+            self.sizes.append(most)
+        self._wait_s = wait_s
+        self._waiting: list[_Request] = []
+        self._coming = 0
+        self._changed = threading.Condition()
+        self._caller = threading.local()
+        self._closed = False
+        self.runs: dict[int, int] = dict.fromkeys(self.sizes, 0)
+        """Number of runs of the program of each batch size."""
+        self._thread = threading.Thread(target=self._work, name="batcher", daemon=True)
+        self._thread.start()
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        return self._generator.fingerprint()
+
+    def fingerprint(self) -> str:
+        """Return the generator's content hash: batching is no property of a clip."""
+        return self._fingerprint
+
+    @contextmanager
+    def announced(self) -> Iterator[None]:
+        """Announce a clip that this thread will ask for, unless it fails before."""
+        with self._changed:
+            self._coming += 1
+        self._caller.announced = True
+        try:
+            yield
+        finally:
+            self._arrive()
+
+    def _arrive(self) -> None:
+        if getattr(self._caller, "announced", False):
+            self._caller.announced = False
+            with self._changed:
+                self._coming -= 1
+                self._changed.notify_all()
+
+    def __call__(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        """Generate one clip together with those of other threads."""
+        return np.concatenate(list(self.stream(view, action, first_frame, seed)))
+
+    def stream(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the frames of one clip in groups, as the program of its batch decodes them."""
+        check_seed(seed, name="seed")
+        request = _Request(triplet=self._generator.condition(view, action, first_frame), seed=seed)
+        with self._changed:
+            if self._closed:
+                raise InputError("The generator is closed: it takes no more clips.")
+            self._waiting.append(request)
+            self._changed.notify_all()
+        self._arrive()
+        yield from request.receive()
+
+    def close(self) -> None:
+        """Generate what waits, then end."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while batch := self._next():
+            self._run(batch)
+
+    def _next(self) -> list[_Request]:
+        """Wait for requests; return those of the next run, none when closed."""
+        with self._changed:
+            while not self._waiting:
+                if self._closed:
+                    return []
+                self._changed.wait()
+            until = self._waiting[0].since + self._wait_s
+            while len(self._waiting) < self.sizes[-1] and self._coming:
+                left = until - time.monotonic()
+                if left <= 0:
+                    break
+                self._changed.wait(left)
+            count = max([n for n in self.sizes if n <= len(self._waiting)], default=self.sizes[0])
+            batch, self._waiting = self._waiting[:count], self._waiting[count:]
+        return batch
+
+    def _run(self, batch: list[_Request]) -> None:
+        size = min(n for n in self.sizes if n >= len(batch))
+        padded = [*batch, *[batch[-1]] * (size - len(batch))]
+        try:
+            groups = self._generator.groups(
+                [request.triplet for request in padded], [request.seed for request in padded]
+            )
+            for number, group in enumerate(groups):
+                for request, frames in zip(batch, group, strict=False):
+                    request.send(number, frames)
+        except Exception as error:
+            if len(batch) == 1:
+                batch[0].end(error)
+                return
+            for request in batch:  # so that one clip's failure is not the others'
+                self._run([request])
+            return
+        self.runs[size] += 1
+        for request in batch:
+            request.end()
+
+
+def announced(generator: VideoGenerator) -> AbstractContextManager[None]:
+    """Return the context in which a thread will ask a generator for a clip."""
+    return generator.announced() if isinstance(generator, Batcher) else nullcontext()

@@ -1,0 +1,152 @@
+"""Chunks: the actions of one clip, and what is said about its result.
+
+A chunk has a row for each frame but the first, which repeats the last row of the chunk before. The
+frames of a model are a fixed number, so a shorter chunk is padded by holding its last row.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any, no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.batching import announced
+from egosim_jax.interactive.env.start import Start
+from egosim_jax.rendering import Renderer
+from egosim_jax.simulation.simulator import Simulator, Step
+from egosim_jax.types import Action, Cameras, SceneState, View
+
+STEADY_LEVELS = 25
+"""Largest difference of a color, in gray levels of 255, of a pixel that agrees with the state."""
+HAND_MARGIN = 0.08
+"""Width, in widths of the picture, around a hand's skeleton in which pixels may change."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """Rows of a clip as an action."""
+
+    action: Action
+    """Cameras, joints and prompt."""
+    rows: Float[np.ndarray, "f d"]
+    """Row of each frame, of which the first is that of the chunk before."""
+    padded: int
+    """Frames at the end that hold the last row."""
+    hidden: Bool[np.ndarray, " n"]
+    """Hands that never come near the view and are given as missing."""
+
+    def info(self, spec: ActionSpec) -> dict[str, Any]:
+        """Return what a caller needs to know of its action."""
+        hidden = [side for side, lost in zip(spec.sides, self.hidden, strict=True) if lost]
+        return {"padded_frames": self.padded, "hidden_hands": hidden}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Seconds of the phases of a step; two equal steps are equal however long they took."""
+
+    render_s: float = field(compare=False)
+    """Rendering of the state along the camera path."""
+    generate_s: float = field(compare=False)
+    """Generation of the clip, with the wait for its batch."""
+    update_s: float = field(compare=False)
+    """Perception of the clip and its fusion into the state."""
+
+
+def make_chunk(
+    spec: ActionSpec,
+    rows: object,
+    *,
+    start: Start,
+    frames: int,
+    prompt: str | None = None,
+    hide: bool = False,
+) -> Chunk:
+    """Return the chunk of 1 to `frames` - 1 rows that follow a start.
+
+    Raises `InputError` for invalid rows; with `hide` a hand out of view is no error.
+    """
+    given = spec.check(rows, most=frames - 1)
+    padded = frames - 1 - len(given)
+    before = spec.rest if start.row is None else start.row
+    path = np.concatenate([before[None], given, np.repeat(given[-1:], padded, axis=0)])
+    action, hidden = spec.to_action(
+        path, camera=start.camera, prompt=prompt or start.prompt, hide=hide
+    )
+    return Chunk(action=action, rows=path, padded=padded, hidden=hidden)
+
+
+def last_camera(action: Action) -> Cameras:
+    """Return the camera of an action's last frame."""
+    return replace(action.cameras, world_from_camera=action.cameras.world_from_camera[-1:])
+
+
+def straight(
+    before: Float[np.ndarray, " d"], target: Float[np.ndarray, " d"], frames: int
+) -> Float[np.ndarray, "k d"]:
+    """Return the rows of a straight path to a target in a whole chunk."""
+    shares = np.linspace(0, 1, frames)[1:, None]
+    return before + shares * (target - before)
+
+
+def timed_step(
+    simulator: Simulator,
+    state: SceneState,
+    action: Action,
+    *,
+    seed: int,
+    first_frame: np.ndarray | None,
+) -> tuple[Step, Timing]:
+    """Run one step of a simulator; return it with the seconds of its phases.
+
+    The caller is announced to a generator that gathers batches.
+    """
+    then = time.monotonic()
+    with announced(simulator.generator):
+        view = simulator.render(state, action)
+        rendered = time.monotonic()
+        clip = simulator.generate(view, action, seed=seed, first_frame=first_frame)
+    generated = time.monotonic()
+    after = simulator.update(state, clip, action)
+    timing = Timing(
+        render_s=rendered - then,
+        generate_s=generated - rendered,
+        update_s=time.monotonic() - generated,
+    )
+    return Step(view=view, clip=clip, state=after), timing
+
+
+def view_of(simulator: Simulator, state: SceneState, cameras: Cameras) -> View:
+    """Return the view of a state along a camera path, as the simulator renders it."""
+    return simulator.renderer.render(state, cameras, point_px=simulator.point_px)
+
+
+def validity(step: Step, action: Action, renderer: Renderer) -> float:
+    """Return the share of pixels that agree with the state where nothing should move, from 0 to 1.
+
+    These are pixels of the background that the state has observed, away from hands and objects; nan
+    if there are none.
+    """
+    hands = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
+    steady = steady_pixels(step.view, np.isfinite(hands))
+    if not steady.any():
+        return float("nan")
+    gaps = np.abs(step.clip.frames.astype(np.int16) - step.view.frames).max(axis=-1)
+    return float((gaps[steady] <= STEADY_LEVELS).mean())
+
+
+def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """Return the pixels of a view in which nothing should move."""
+    reach = 2 * round(HAND_MARGIN * view.mask.shape[2]) + 1
+    near = np.ones((reach, reach), np.uint8)
+    moving = [
+        cv2.dilate(((ids != 0) | hand).astype(np.uint8), near)
+        for ids, hand in zip(view.object_ids, hands, strict=True)
+    ]
+    return (view.mask == 0) & (np.stack(moving) == 0)

@@ -1,0 +1,145 @@
+"""Episodes of LeRobot datasets, version 3.0, that have hands and cameras.
+
+A row of each frame has the vectors that `data/lerobot_writer.py` names: joints of the hands in the world,
+pose and intrinsics of the camera. Datasets with videos only are annotated first (docs/video.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.annotate.to_episode import nearest_frames, resized_intrinsics
+from egosim_jax.data.lerobot_writer import HANDS, INTRINSICS, POSES, SCENE
+from egosim_jax.data.readers.lerobot import read_info, read_rows, read_tasks
+from egosim_jax.data.transforms import resize_image
+from egosim_jax.interactive.env.start import Start
+from egosim_jax.io.untrusted.bounded import quote, quote_path
+from egosim_jax.simulation.episode import Episode
+from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState, VideoSpec
+
+MAX_HANDS = 2
+"""Most hands of a dataset."""
+
+
+def episode_from_lerobot(
+    root: Path,
+    number: int,
+    video: VideoSpec,
+    *,
+    state: SceneState | None = None,
+    clips: int | None = None,
+) -> Episode:
+    """Return an episode of a dataset, at the length, size and rate of a model's clips.
+
+    The first clip starts in the first frame, each other one in the last frame of the one before;
+    frames are the nearest in time. The scene is the `state`, or that which `egosim data export`
+    has written. Raises `InputError` for a dataset without hands, cameras or scene, and if the
+    episode is too short.
+    """
+    info = read_info(root, ["v3.0"])
+    if missing := [name for name in (HANDS, POSES, INTRINSICS) if name not in info["features"]]:
+        raise InputError(
+            f"{quote_path(root)} has no feature {', '.join(missing)}: an episode needs hands and "
+            "cameras in the world. Import its video by `egosim data import lerobot` and annotate "
+            "it, then use `egosim episode from-annotation`."
+        )
+    rows = read_rows(root, info, number, [HANDS, POSES, INTRINSICS, "task_index"])
+    state, image = _scene(root / SCENE.format(number), state)
+    joints, poses = _joints(rows[HANDS]), _numbers(rows[POSES], (4, 4), POSES)
+    lens = _numbers(rows[INTRINSICS], (3, 3), INTRINSICS)
+    if not (lens == lens[0]).all():
+        raise InputError(
+            f"Episode {number} of {quote_path(root)} changes its {INTRINSICS}: an episode has one "
+            "lens. Choose another episode. (--episode)"
+        )
+    size = _size(info["features"], video)
+    moments = nearest_frames(len(poses), float(info["fps"]), float(video.fps))
+    step = video.frames - 1
+    possible = (len(moments) - 1) // step
+    if not 0 < (count := possible if clips is None else clips) <= possible:
+        raise InputError(
+            f"Episode {number} of {quote_path(root)} has {len(moments)} frames at {video.fps} fps, "
+            f"enough for {possible} clips of {video.frames} frames, not {count}. (--clips, "
+            "--config)"
+        )
+    texts = read_tasks(root)
+    picked = [moments[n * step : n * step + video.frames] for n in range(count)]
+    return Episode(
+        state=state,
+        actions=tuple(
+            Action(
+                cameras=Cameras(
+                    world_from_camera=poses[k],
+                    intrinsics_px=resized_intrinsics(lens[0], size, video),
+                    height=video.height,
+                    width=video.width,
+                ),
+                joints_m=joints[k],
+                kind=_kind(joints.shape[2]),
+                prompt=texts.get(rows["task_index"][k[0]], ""),
+            )
+            for k in picked
+        ),
+        fps=video.fps,
+        first_frame=None if image is None else resize_image(image, video.height, video.width),
+    )
+
+
+def _scene(folder: Path, state: SceneState | None) -> tuple[SceneState, np.ndarray | None]:
+    if state is not None:
+        return state, None
+    if not folder.is_dir():
+        raise InputError(
+            f"{quote_path(folder)} is not there: the dataset has no scene of this episode. Give a "
+            "folder of a state or a .ply of colored points. (--state)"
+        )
+    start = Start.load(folder)
+    return start.state, start.first_frame
+
+
+def _size(features: dict[str, Any], video: VideoSpec) -> tuple[int, int]:
+    """Return height and width of the dataset's pictures, to which its intrinsics belong."""
+    shapes = [
+        tuple(feature["shape"])
+        for feature in features.values()
+        if isinstance(feature, dict) and feature.get("dtype") in ("image", "video")
+    ]
+    sizes = {shape[:2] if shape[-1] in (1, 3) else shape[-2:] for shape in shapes}
+    if len(sizes) > 1:
+        raise InputError(
+            f"The dataset has pictures of the sizes {sorted(sizes)}: {INTRINSICS} must belong to "
+            "one. Remove the other cameras."
+        )
+    return next(iter(sizes), (video.height, video.width))
+
+
+def _kind(joints: int) -> Kind:
+    return next(kind for kind, count in JOINTS.items() if count == joints)
+
+
+def _joints(rows: Sequence[Any]) -> Float[np.ndarray, "f n j 3"]:
+    """Return the joints of one or two hands, of the kind that the length of a row gives."""
+    length = len(rows[0]) if isinstance(rows[0], list) else 0
+    for count in JOINTS.values():
+        hands = length // (3 * count)
+        if length == 3 * count * hands and 1 <= hands <= MAX_HANDS:
+            return _numbers(rows, (hands, count, 3), HANDS)
+    raise InputError(
+        f"{HANDS} has {length} numbers: it must have 63 for each human hand, or 9 for each "
+        f"gripper, and at most {MAX_HANDS} of them."
+    )
+
+
+def _numbers(rows: Sequence[Any], shape: tuple[int, ...], name: str) -> Float[np.ndarray, "f ..."]:
+    try:
+        return np.array(rows, float).reshape(len(rows), *shape)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{name} is {quote(rows[0])} in the first frame: it must have {np.prod(shape)} numbers "
+            "in every frame."
+        ) from None

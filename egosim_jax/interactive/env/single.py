@@ -1,0 +1,272 @@
+"""Gymnasium environment of one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Float, UInt8
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.env.chunks import (
+    Chunk,
+    last_camera,
+    make_chunk,
+    straight,
+    timed_step,
+    validity,
+    view_of,
+)
+from egosim_jax.interactive.env.rewards import Outcome, RewardFn, no_reward
+from egosim_jax.interactive.env.start import Start, check_size
+from egosim_jax.simulation.actions import check_action
+from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.simulator import Step
+from egosim_jax.state import snapshot
+from egosim_jax.types import InputError, SceneState, VideoSpec, View, check_seed
+
+OBSERVATIONS = ("frames", "depth", "keypoints", "state")
+STATE_POINTS = 2048
+"""Points of a state's observation."""
+FAR_M = 100.0
+"""Depth where nothing is seen, and bound of positions in observations, in meters."""
+OPTIONS = ("start", "episode", "state", "prompt")
+
+
+def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
+    """Return the space of the observations: the row, and what is asked for."""
+    if unknown := [name for name in observe if name not in OBSERVATIONS]:
+        raise InputError(
+            f"There is no observation {unknown[0]!r:.40}: choose from {', '.join(OBSERVATIONS)}."
+        )
+    size = (video.height, video.width)
+    low, high = spec.bounds
+    keypoints = (len(spec.sides), 21 if spec.kind == "human" else 3, 3)
+    known = {
+        "frames": spaces.Box(0, 255, (video.frames, *size, 3), np.uint8),
+        "depth": spaces.Box(0, FAR_M, size, np.float32),
+        "keypoints": spaces.Box(-FAR_M, FAR_M, keypoints, np.float64),
+        "state": spaces.Dict(
+            {
+                "points_m": spaces.Box(-FAR_M, FAR_M, (STATE_POINTS, 3), np.float32),
+                "colors": spaces.Box(0, 255, (STATE_POINTS, 3), np.uint8),
+                "object_ids": spaces.Box(-(2**31), 2**31 - 1, (STATE_POINTS,), np.int32),
+            }
+        ),
+    }
+    row = spaces.Box(low, high, dtype=np.float64)
+    return spaces.Dict({"row": row, **{name: known[name] for name in observe}})
+
+
+def start_of(
+    backend: Backend, spec: ActionSpec, *, seed: int, options: Mapping[str, Any] | None
+) -> Start:
+    """Return the start that a reset asks for: a seed's scene, or that of an option.
+
+    `start` is a `Start`, `episode` an `Episode` or its path, `state` a `SceneState` or its folder,
+    seen by the camera of the seed. `prompt` replaces the prompt.
+    """
+    given = dict(options or {})
+    if unknown := sorted(given.keys() - set(OPTIONS)):
+        raise InputError(
+            f"There is no reset option {unknown[0]!r:.40}: choose from {', '.join(OPTIONS)}."
+        )
+    prompt = given.pop("prompt", None)
+    if len(given) > 1:
+        raise InputError(f"The options {', '.join(sorted(given))} exclude each other: give one.")
+    if (start := given.get("start")) is None:
+        if (episode := given.get("episode")) is not None:
+            episode = episode if isinstance(episode, Episode) else Episode.load(Path(episode))
+            start = Start.of(episode, seed=seed)
+        else:
+            start = backend.start(seed, spec)
+            if (state := given.get("state")) is not None:
+                state = state if isinstance(state, SceneState) else snapshot.load(Path(state))
+                start = replace(start, state=state, first_frame=None)
+    check_size(start, backend.video)
+    if start.row is not None:
+        _check_row(start.row, spec)
+    return start if prompt is None else replace(start, prompt=str(prompt))
+
+
+def _check_row(row: np.ndarray, spec: ActionSpec) -> None:
+    try:
+        spec.check(np.asarray(row)[None], most=1)
+    except InputError as error:
+        raise InputError(
+            f"The row of the start is none of this environment: {error} Make the start with the "
+            "same ActionSpec, or without a row. (start)"
+        ) from error
+
+
+class Running:
+    """Episode in progress: where it is, and its last step."""
+
+    def __init__(self, backend: Backend, actions: ActionSpec, start: Start):
+        self.backend, self.actions, self.start, self.now = backend, actions, start, start
+        self.camera = start.camera
+        self.last: Step | None = None
+
+    @property
+    def row(self) -> Float[np.ndarray, " d"]:
+        """Last row of hands and camera."""
+        return self.actions.rest if self.now.row is None else self.now.row
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks since the reset."""
+        return self.now.steps - self.start.steps
+
+    def chunk(self, rows: object, *, prompt: str | None = None) -> Chunk:
+        """Return the next chunk; a hand out of view is given as missing.
+
+        Raises `InputError` for rows that the state does not allow.
+        """
+        video = self.backend.video
+        chunk = make_chunk(
+            self.actions, rows, start=self.now, frames=video.frames, prompt=prompt, hide=True
+        )
+        check_action(chunk.action, state=self.now.state, fps=video.fps, continued=True)
+        return chunk
+
+    def simulate(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
+        """Return the step of a chunk and what is known of it; the episode is not changed."""
+        now, action = self.now, chunk.action
+        simulator = self.backend.simulator(now)
+        step, timing = timed_step(
+            simulator,
+            now.state,
+            action,
+            seed=now.seed + now.steps + 1,
+            first_frame=now.first_frame,
+        )
+        return step, {
+            **chunk.info(self.actions),
+            "validity": validity(step, action, simulator.renderer),
+            "timing": timing,
+        }
+
+    def advance(self, chunk: Chunk, step: Step) -> dict[str, Any]:
+        """Continue the episode after the step of a chunk; return where it is."""
+        kept = chunk.action if self.backend.needs_past else None
+        self.last, self.now = step, self.now.after(step.state, chunk.rows[-1], kept)
+        self.camera = last_camera(chunk.action)
+        return self.info()
+
+    def info(self) -> dict[str, Any]:
+        """Return number of the chunk that took effect last, hash of the state, and names."""
+        state = self.now.state
+        return {
+            "chunk": self.chunks,
+            "state_sha256": snapshot.fingerprint(state),
+            "objects": dict(state.names),
+        }
+
+    def frames(self) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return the frames of the last chunk; before the first, its first frame repeated."""
+        if self.last is not None:
+            return self.last.clip.frames
+        first = self.start.first_frame
+        if first is None:
+            first = self._view().frames[0]
+        return np.repeat(first[None], self.backend.video.frames, axis=0)
+
+    def _view(self) -> View:
+        return view_of(self.backend.simulator(self.now), self.now.state, self.camera)
+
+    def observation(self, observe: tuple[str, ...]) -> dict[str, Any]:
+        """Return the observation of what is asked for."""
+        found: dict[str, Any] = {"row": self.row.copy()}
+        if "frames" in observe:
+            found["frames"] = self.frames().copy()
+        if "depth" in observe:
+            found["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
+        if "keypoints" in observe:
+            found["keypoints"] = self.actions.joints(self.row[None])[0].copy()
+        if "state" in observe:
+            state, names = self.now.state, ("points_m", "colors", "object_ids")
+            chosen = np.linspace(0, len(state.points_m) - 1, STATE_POINTS).astype(int)
+            found["state"] = {name: getattr(state, name)[chosen] for name in names}
+        return found
+
+
+class WorldEnv(gymnasium.Env):
+    """World of one episode, stepped by chunks of actions."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012
+
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        actions: ActionSpec | None = None,
+        observe: tuple[str, ...] = ("frames",),
+        reward: RewardFn = no_reward,
+        max_chunks: int = 10,
+        render_mode: str | None = None,
+    ):
+        self.backend, self.actions = backend, actions or ActionSpec()
+        self.metadata = {**self.metadata, "render_fps": backend.video.fps}
+        self.render_mode = render_mode
+        self._observe, self._reward, self._max_chunks = tuple(observe), reward, max_chunks
+        low, high = self.actions.bounds
+        self.action_space = spaces.Box(low, high, dtype=np.float64)
+        self.observation_space = observation_space(backend.video, self.actions, self._observe)
+        self._running: Running | None = None
+
+    @property
+    def chunk(self) -> int:
+        """Most rows of a chunk."""
+        return self.backend.video.frames - 1
+
+    @property
+    def running(self) -> Running:
+        """Episode in progress. Raises `InputError` before the first reset."""
+        if self._running is None:
+            raise InputError("The environment has no episode: call reset first.")
+        return self._running
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode of a seed, or of the options `start`, `episode`, `state`, `prompt`."""
+        super().reset(seed=seed)
+        chosen = int(self.np_random.integers(2**31)) if seed is None else seed
+        check_seed(chosen, name="seed")
+        start = start_of(self.backend, self.actions, seed=chosen, options=options)
+        self._running = Running(self.backend, self.actions, start)
+        return self.running.observation(self._observe), self.running.info()
+
+    def step(
+        self, action: Float[np.ndarray, " d"]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Move to a row in a straight line, over a whole chunk."""
+        (target,) = self.actions.check(np.asarray(action)[None], most=1)
+        return self.chunk_step(straight(self.running.row, target, self.chunk + 1))
+
+    def chunk_step(
+        self, actions: Float[np.ndarray, "k d"], *, prompt: str | None = None
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Simulate 1 to `chunk` rows, one per frame; the last one is held until the chunk ends.
+
+        `info` has the number of the chunk in which the action took effect, padded frames, hidden
+        hands, hash of the state, seconds of each phase, `validity` and `success`.
+        """
+        running = self.running
+        chunk = running.chunk(actions, prompt=prompt)
+        step, known = running.simulate(chunk)
+        result = self._reward(Outcome(first=running.start.state, step=step))
+        info = {**running.advance(chunk, step), **known, "success": result.success}
+        truncated = running.chunks >= self._max_chunks and not result.terminated
+        observation = running.observation(self._observe)
+        return observation, result.reward, result.terminated, truncated, info
+
+    def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        """Return the last frame."""
+        return self.running.frames()[-1] if self.render_mode == "rgb_array" else None

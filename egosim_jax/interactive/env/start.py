@@ -1,0 +1,157 @@
+"""The start of a clip: scene, camera, hands and prompt, as a folder.
+
+state/          scene (state/snapshot.py)
+start.json      camera, row, prompt, seed, clips since the seed, kinds of past actions
+first_frame.png first frame without hands, if it is known
+past/1.npz ...  actions that led here from the seed, which the true world repeats; one with a hand
+                out of view has that hand's joints in 1_hands.npz
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from egosim_jax.interactive.env.placed import load_placed, save_placed
+from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.images import read_image
+from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
+from egosim_jax.simulation.episode import MAX_CLIPS, Episode
+from egosim_jax.state import snapshot
+from egosim_jax.types import Action, Cameras, InputError, SceneState, VideoSpec
+
+DESCRIPTION, FIRST_FRAME = "start.json", "first_frame.png"
+FIELDS = {"world_from_camera": list, "intrinsics_px": list, "height": int, "width": int,
+          "row": list, "prompt": str, "seed": int, "steps": int, "past": list}  # fmt: skip
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Scene, camera and hands before an action."""
+
+    state: SceneState
+    """Scene before the first clip."""
+    camera: Cameras
+    """First camera of the episode, to which the camera of an action is relative."""
+    prompt: str
+    """Prompt of clips whose action has none."""
+    seed: int
+    """Seed of the scene; clip N draws its noise from this seed plus N."""
+    steps: int = 0
+    """Clips since the seed, which the noise of the next one depends on."""
+    row: Float[np.ndarray, " d"] | None = None
+    """Row of the hands and camera (`actions.py`); None at rest."""
+    first_frame: UInt8[np.ndarray, "h w 3"] | None = None
+    """First frame of the first clip, without hands; None if it is not known."""
+    past: tuple[Action, ...] = ()
+    """Actions since the seed, which the true world executes first."""
+
+    @classmethod
+    def of(cls, episode: Episode, *, seed: int = 0) -> Start:
+        """Return the start of an episode: its scene, first camera and first prompt."""
+        first = episode.actions[0]
+        cameras = first.cameras
+        return cls(
+            state=episode.state,
+            camera=_one(cameras.world_from_camera[:1], cameras),
+            prompt=first.prompt,
+            seed=seed,
+            first_frame=episode.first_frame,
+        )
+
+    def after(
+        self, state: SceneState, row: Float[np.ndarray, " d"], action: Action | None
+    ) -> Start:
+        """Return the start of what follows a clip; the `action` is kept if it is given."""
+        past = self.past if action is None else (*self.past, action)
+        return replace(
+            self, state=state, row=row, steps=self.steps + 1, first_frame=None, past=past
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the folder, complete or absent. Raises `InputError` for a past too long to read."""
+        if len(self.past) > MAX_CLIPS:
+            raise InputError(
+                f"The start has {len(self.past)} past actions: at most {MAX_CLIPS} are read again. "
+                "Save one after fewer steps, or reset before."
+            )
+        with atomic_folder(folder) as temporary:
+            snapshot.save(temporary / "state", self.state)
+            if self.first_frame is not None:
+                Image.fromarray(self.first_frame).save(temporary / FIRST_FRAME)
+            for number, action in enumerate(self.past, start=1):
+                save_placed(temporary / "past", str(number), action)
+            write_json(
+                temporary / DESCRIPTION,
+                {
+                    "world_from_camera": self.camera.world_from_camera[0].tolist(),
+                    "intrinsics_px": np.asarray(self.camera.intrinsics_px, float).tolist(),
+                    "height": int(self.camera.height),
+                    "width": int(self.camera.width),
+                    "row": [] if self.row is None else self.row.tolist(),
+                    "prompt": self.prompt,
+                    "seed": int(self.seed),
+                    "steps": int(self.steps),
+                    "past": [[action.kind, action.prompt] for action in self.past],
+                },
+            )
+
+    @classmethod
+    def load(cls, folder: Path) -> Start:
+        """Read the folder. Raises `InputError` for what is damaged."""
+        written = read_json(folder / DESCRIPTION)
+        for name, kind in FIELDS.items():
+            value = written.get(name) if isinstance(written, dict) else None
+            if type(value) is not kind:
+                raise InputError(
+                    f"{quote_path(folder / DESCRIPTION)}: {name} is {quote(value)}, not a "
+                    f"{kind.__name__}. Restore it."
+                )
+        size = written["height"], written["width"]
+        if len(written["past"]) > MAX_CLIPS:
+            raise InputError(f"{quote_path(folder)}: more than {MAX_CLIPS} past actions.")
+        image = folder / FIRST_FRAME
+        return cls(
+            state=snapshot.load(folder / "state"),
+            camera=Cameras(
+                world_from_camera=np.array(written["world_from_camera"], float)[None],
+                intrinsics_px=np.array(written["intrinsics_px"], float),
+                height=size[0],
+                width=size[1],
+            ),
+            prompt=written["prompt"],
+            seed=written["seed"],
+            steps=written["steps"],
+            row=np.array(written["row"], float) if written["row"] else None,
+            first_frame=read_image(image) if image.exists() else None,
+            past=tuple(
+                load_placed(folder / "past", str(number), kind=kind, size=size, prompt=prompt)
+                for number, (kind, prompt) in enumerate(written["past"], start=1)
+            ),
+        )
+
+
+def _one(pose: np.ndarray, cameras: Cameras) -> Cameras:
+    return Cameras(
+        world_from_camera=np.asarray(pose, float),
+        intrinsics_px=cameras.intrinsics_px,
+        height=cameras.height,
+        width=cameras.width,
+    )
+
+
+def check_size(start: Start, video: VideoSpec) -> None:
+    """Raise `InputError` unless the pictures of a start are as large as the world's."""
+    have, want = (start.camera.height, start.camera.width), (video.height, video.width)
+    if have != want:
+        raise InputError(
+            f"The episode has pictures of {have[1]}x{have[0]}, this world makes {want[1]}x"
+            f"{want[0]}: they must be equal. Make the episode for this world's model."
+        )

@@ -1,0 +1,150 @@
+"""The true tabletop world behind the interface of a generated one: every clip is exact."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.backends import tabletop_start
+from egosim_jax.interactive.env.placed import places_of
+from egosim_jax.interactive.env.start import Start
+from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.perception.oracle import OracleConfig
+from egosim_jax.rendering import jitted
+from egosim_jax.simulation.simulator import Simulator
+from egosim_jax.types import (
+    Action,
+    Clip,
+    InputError,
+    Kind,
+    Perceived,
+    SceneState,
+    VideoSpec,
+    View,
+)
+from egosim_jax.worlds.tabletop import TabletopClip, World, opening, to_ground_truth
+
+REMEMBERED = 256
+"""Last used worlds that are kept, so that an episode is not executed from its start each time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueWorld:
+    """Tabletop world that executes actions and reads its state from the ground truth."""
+
+    needs_past: ClassVar[bool] = True
+    video: VideoSpec
+    """Length, size and rate of the clips."""
+    _changing: threading.Lock = field(
+        default_factory=threading.Lock, init=False, repr=False, compare=False
+    )
+    _worlds: OrderedDict[str, World] = field(
+        default_factory=OrderedDict, init=False, repr=False, compare=False
+    )
+
+    def identity(self) -> dict[str, str]:
+        """Return the size of the clips: all else is fixed."""
+        return {"world": "true", "video": str(self.video)}
+
+    def start(self, seed: int, spec: ActionSpec) -> Start:
+        """Return the scene of a seed with its first camera."""
+        return tabletop_start(seed, spec, self.video)
+
+    def simulator(self, start: Start) -> Simulator:
+        """Return the simulator of the clip that follows a start.
+
+        Raises `InputError` unless the start is of a seed's scene and the actions since then.
+        """
+        origin = start.state.provenance
+        own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
+        if not own or start.state.step != len(start.past):
+            raise InputError(
+                "The true world has the scenes of its seeds and what actions made of them: it "
+                f"cannot begin from a state of {dict(origin)} at step {start.state.step} with "
+                f"{len(start.past)} known actions. Reset it by a seed."
+            )
+        truth = _Execution(world=self, start=start)
+        return Simulator(generator=_Film(truth=truth), perception=_Look(truth=truth),
+                         fps=self.video.fps)  # fmt: skip
+
+    def after(self, start: Start, kind: Kind) -> World:
+        """Return the world after the actions that led to a start."""
+        key = f"{start.seed} {kind}"
+        keys = [key]
+        for action in start.past:
+            key = hashlib.sha256(f"{key} {fingerprint(action)}".encode()).hexdigest()
+            keys.append(key)
+        known, world = self._last_known(keys)
+        if world is None:
+            scene = opening(start.seed, spec=self.video, kind=kind)[0]
+            world = World(scene=scene, seed=start.seed)
+        for action in start.past[known:]:
+            world = world.move(action, joints_m=places_of(action))[1]
+        with self._changing:
+            self._worlds[keys[-1]] = world
+            self._worlds.move_to_end(keys[-1])
+            while len(self._worlds) > REMEMBERED:
+                self._worlds.popitem(last=False)
+        return world
+
+    def _last_known(self, keys: Sequence[str]) -> tuple[int, World | None]:
+        """Return how many actions led to the last world that is kept, and that world."""
+        with self._changing:
+            for known in reversed(range(len(keys))):
+                if (world := self._worlds.get(keys[known])) is not None:
+                    return known, world
+        return 0, None
+
+
+@dataclass(kw_only=True)
+class _Execution:
+    """Execution of one action, which film and look share."""
+
+    world: TrueWorld
+    start: Start
+    _made: tuple[Action, TabletopClip] | None = None
+
+    def clip(self, action: Action) -> TabletopClip:
+        """Return the clip of an action."""
+        if self._made is None or self._made[0] is not action:
+            world = self.world.after(self.start, action.kind)
+            clip, _ = world.execute(action, joints_m=places_of(action))
+            self._made = action, clip
+        return self._made[1]
+
+    def fingerprint(self) -> str:
+        """Return the content hash of the scene and the actions before."""
+        return fingerprint(("tabletop", self.start.seed, self.start.past))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Film:
+    """Generator that returns the true frames (`simulator.VideoGenerator`)."""
+
+    truth: _Execution
+    renderer: ModuleType = jitted
+
+    def __call__(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        return self.truth.clip(action).frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Look:
+    """Perception that returns the ground truth (`perception.Perception`)."""
+
+    truth: _Execution
+
+    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
+        observation = to_ground_truth(self.truth.clip(action))
+        return OracleConfig().build({state.step: observation})(clip, action, state)

@@ -1,0 +1,195 @@
+"""Gymnasium vector environment: several episodes whose clips one program generates."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any, SupportsIndex
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from jaxtyping import Bool, Float
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.env.chunks import straight
+from egosim_jax.interactive.env.rewards import Outcome, RewardFn, no_reward
+from egosim_jax.interactive.env.single import Running, observation_space, start_of
+from egosim_jax.types import InputError, check_counts, check_seed
+
+Result = tuple[
+    dict[str, Any],
+    Float[np.ndarray, " n"],
+    Bool[np.ndarray, " n"],
+    Bool[np.ndarray, " n"],
+    dict[str, Any],
+]
+
+
+class WorldVectorEnv(VectorEnv):
+    """Episodes of a world that are stepped together; an ended one waits until it is reset.
+
+    Each step runs in its own thread, so that perception overlaps, and a backend with a
+    `Batcher` generates all clips in one program. Episodes are reset with the option `reset_mask`
+    (`AutoresetMode.DISABLED`).
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.DISABLED,
+    }
+
+    def __init__(
+        self,
+        backend: Backend,
+        num_envs: int,
+        *,
+        actions: ActionSpec | None = None,
+        observe: tuple[str, ...] = ("frames",),
+        reward: RewardFn | Sequence[RewardFn] = no_reward,
+        max_chunks: int = 10,
+    ):
+        check_counts({"num_envs": num_envs})
+        self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
+        self._observe, self._max_chunks = tuple(observe), max_chunks
+        self._rewards = list(reward) if isinstance(reward, Sequence) else [reward] * num_envs
+        if len(self._rewards) != num_envs:
+            raise InputError(
+                f"{len(self._rewards)} rewards for {num_envs} episodes: give one, or one for each."
+            )
+        low, high = self.actions.bounds
+        self.single_action_space = spaces.Box(low, high, dtype=np.float64)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        space = observation_space(backend.video, self.actions, self._observe)
+        self.single_observation_space = space
+        self.observation_space = batch_space(space, num_envs)
+        self._running: list[Running | None] = [None] * num_envs
+        self._ended = np.zeros(num_envs, bool)
+        self._threads = ThreadPoolExecutor(num_envs, thread_name_prefix="episode")
+
+    @property
+    def chunk(self) -> int:
+        """Most rows of a chunk."""
+        return self.backend.video.frames - 1
+
+    @property
+    def running(self) -> list[Running]:
+        """Episodes in progress. Raises `InputError` before the first reset."""
+        found = [running for running in self._running if running is not None]
+        if len(found) < self.num_envs:
+            raise InputError("The environment has no episodes: call reset first.")
+        return found
+
+    def reset(
+        self,
+        *,
+        seed: SupportsIndex | Sequence[SupportsIndex | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin episodes: those of `reset_mask`, or all; none if one of them cannot begin.
+
+        A single seed is that of the first episode, of which the others have the following ones.
+        Other options are those of `WorldEnv.reset`; `starts` has them for each episode.
+        """
+        given = dict(options or {})
+        mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
+        starts = given.pop("starts", [given] * self.num_envs)
+        seeds = self._seeds(seed)
+        if mask.shape != (self.num_envs,) or {len(starts), len(seeds)} != {self.num_envs}:
+            raise InputError(
+                f"reset_mask has shape {mask.shape}, starts {len(starts)} and seed {len(seeds)} "
+                f"entries: all must have one for each of {self.num_envs} episodes."
+            )
+        chosen = np.flatnonzero(mask).tolist()
+        begun = [
+            start_of(self.backend, self.actions, seed=seeds[number], options=starts[number])
+            for number in chosen
+        ]
+        for number, start in zip(chosen, begun, strict=True):
+            self._running[number] = Running(self.backend, self.actions, start)
+        self._ended[mask] = False
+        return self._observations(), self._infos([running.info() for running in self.running])
+
+    def _seeds(self, seed: SupportsIndex | Sequence[SupportsIndex | None] | None) -> list[int]:
+        """Return the seed of each episode; those that are not given follow from the last given."""
+        several = isinstance(seed, Sequence)
+        given = [None if n is None else operator.index(n) for n in (seed if several else [seed])]
+        known = [number for number in given if number is not None]
+        for number in known:
+            check_seed(number, name="seed")
+        super().reset(seed=known[0] if known else None)
+        seeds = [int(self.np_random.integers(2**31)) if n is None else n for n in given]
+        return seeds if several else [seeds[0] + number for number in range(self.num_envs)]
+
+    def step(self, actions: Float[np.ndarray, "n d"]) -> Result:
+        """Move each episode to a row in a straight line, over a whole chunk."""
+        frames = self.chunk + 1
+        targets = [self.actions.check(np.asarray(row)[None], most=1)[0] for row in actions]
+        rows = [
+            straight(r.row, target, frames) for r, target in zip(self.running, targets, strict=True)
+        ]
+        return self.chunk_step(np.stack(rows))
+
+    def chunk_step(
+        self, actions: Float[np.ndarray, "n k d"], *, prompts: Sequence[str] | None = None
+    ) -> Result:
+        """Simulate k rows in each episode as one batch (`WorldEnv.chunk_step`).
+
+        If an action is refused or a step fails, no episode is changed. An ended episode must be
+        reset first.
+        """
+        if len(actions) != self.num_envs:
+            raise InputError(
+                f"There are {len(actions)} actions for {self.num_envs} episodes: give one for each."
+            )
+        if self._ended.any():
+            raise InputError(
+                f"Episode {int(np.argmax(self._ended))} has ended: reset it with the option "
+                "reset_mask before the next step."
+            )
+        texts = prompts or [None] * self.num_envs
+        chunks = [
+            running.chunk(rows, prompt=prompt)
+            for running, rows, prompt in zip(self.running, actions, texts, strict=True)
+        ]
+        made = [
+            self._threads.submit(running.simulate, chunk)
+            for running, chunk in zip(self.running, chunks, strict=True)
+        ]
+        wait(made)
+        steps, known = zip(*(future.result() for future in made), strict=True)
+        results = [
+            reward(Outcome(first=running.start.state, step=step))
+            for running, reward, step in zip(self.running, self._rewards, steps, strict=True)
+        ]
+        infos = [
+            {**running.advance(chunk, step), **facts, "success": result.success}
+            for running, chunk, step, facts, result in zip(
+                self.running, chunks, steps, known, results, strict=True
+            )
+        ]
+        rewards = np.array([result.reward for result in results])
+        terminated = np.array([result.terminated for result in results])
+        chunks_done = np.array([running.chunks for running in self.running])
+        truncated = (chunks_done >= self._max_chunks) & ~terminated
+        self._ended = terminated | truncated
+        return self._observations(), rewards, terminated, truncated, self._infos(infos)
+
+    def _observations(self) -> dict[str, Any]:
+        found = [running.observation(self._observe) for running in self.running]
+        empty = create_empty_array(self.single_observation_space, self.num_envs)
+        batch: Any = concatenate(self.single_observation_space, found, empty)
+        return batch
+
+    def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for number, info in enumerate(infos):
+            found = self._add_info(found, info, number)
+        return found
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the threads."""
+        self._threads.shutdown()

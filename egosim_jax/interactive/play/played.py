@@ -1,0 +1,238 @@
+"""Episode that a person plays: a session, the true world next to it, and all earlier moments.
+
+The session (`interactive/server/session.py`) is the engine and the record: every clip is in its folder. The
+true world executes the same actions, if the scene is one of a seed.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.backends import GeneratedWorld
+from egosim_jax.interactive.env.chunks import view_of
+from egosim_jax.interactive.env.start import Start, check_size
+from egosim_jax.interactive.play.moves import Pose, first_goal, ready, remembered
+from egosim_jax.interactive.server.session import Session
+from egosim_jax.simulation.episode import Episode
+from egosim_jax.types import Action, Cameras, InputError, SceneState
+from egosim_jax.worlds.tabletop import Scene, World, opening
+from egosim_jax.worlds.tabletop.clips import film_scenes
+from egosim_jax.worlds.tabletop.hands import Side
+from egosim_jax.worlds.tabletop.world import arms_of, sides_of
+
+Frames = UInt8[np.ndarray, "f h w 3"]
+Filmed = tuple[World, Frames]
+"""True world after a clip, and the clip's ground truth."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """State of an episode after one of its clips, to which one can return."""
+
+    start: Start
+    """Scene, camera and hand, from which the session continues."""
+    caption: str
+    """Event before it, in words."""
+    frames: Frames
+    """Generated clip that led here; the first moment has one frame."""
+    camera: Cameras
+    """Camera of the last frame."""
+    action: Action | None = None
+    """Action that led here; None at first."""
+    truth: Future[Filmed] | None = None
+    """Ground truth of the clip, when it is filmed; None if the scene is of no seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Seconds from the request of a clip to three events."""
+
+    first_s: float
+    """First frames shown."""
+    last_s: float
+    """Last frames shown."""
+    total_s: float
+    """Clip perceived, and state updated."""
+
+
+class Played:
+    """Episode in progress; one thread at a time may change it."""
+
+    def __init__(self, world: GeneratedWorld, folder: Path, start: Start, side: Side):
+        """Begin an episode, recorded in a new session of a folder."""
+        check_size(start, world.video)
+        self.world = world
+        self.side: Side = side
+        self.scene = _true_scene(start, world)
+        self.goal = None if self.scene is None else first_goal(self.scene, side)
+        """Object and place that are suggested for a first clip."""
+        name = f"play-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+        actions = ActionSpec(sides=(side,), camera=True)
+        if self.scene is not None and self.goal is not None and start.row is None:
+            row = ready(self.scene, self.goal[0], side).row(side, np.zeros(6))
+            start = replace(start, row=np.clip(row, *actions.bounds))
+        self.session = Session.create(folder / name, world, actions, start)
+        self._filming = ThreadPoolExecutor(1, thread_name_prefix="truth")
+        first = self.session.result.frames
+        truth: Future[Filmed] | None = None
+        if self.scene is not None:
+            truth = Future()
+            truth.set_result((World(scene=self.scene, seed=start.seed), first))
+        self.moments = [
+            Moment(
+                start=self.session.now,
+                caption="The beginning",
+                frames=first,
+                camera=start.camera,
+                truth=truth,
+            )
+        ]
+        self.at = 0
+
+    def close(self) -> None:
+        """End the thread that films the true world, once it has filmed what was asked of it."""
+        self._filming.shutdown(wait=False)
+
+    @property
+    def now(self) -> Moment:
+        """Moment from which the next clip continues."""
+        return self.moments[self.at]
+
+    @property
+    def row(self) -> Float[np.ndarray, " d"]:
+        """Row of hand and camera."""
+        row = self.now.start.row
+        return self.session.actions.rest if row is None else row
+
+    @property
+    def hand(self) -> Pose:
+        """Pose of the hand."""
+        return Pose.of_row(self.row, self.side)
+
+    @property
+    def state(self) -> SceneState:
+        """State of the present moment."""
+        return self.now.start.state
+
+    def believed(self) -> Scene | None:
+        """Return the scene as the state remembers it; None if the true world does not know it."""
+        return None if self.scene is None else remembered(self.scene, self.state)
+
+    def step(
+        self,
+        poses: Sequence[Pose],
+        camera: Float[np.ndarray, " 6"],
+        caption: str,
+        show: Callable[[Frames, bool], None],
+    ) -> Timing:
+        """Make the clip in which the hand takes these poses and the camera ends there.
+
+        Later moments than the present one are forgotten. `show` is called with each group of frames
+        and whether it is the last one: the clip is perceived afterwards. Raises `InputError` for a
+        hand out of view.
+        """
+        then, times, count = time.monotonic(), [], 0
+        number, before = self.session.committed + 1, self.now
+        rows = self._rows(poses, camera)
+        truth: Future[Filmed] | None = None
+
+        def shown(frames: Frames) -> None:
+            nonlocal count, truth
+            count += len(frames)
+            last = count == self.world.video.frames
+            if last and before.truth is not None:
+                action = self.session.action(number)
+                truth = self._filming.submit(partial(_film, before.truth, action))
+            show(frames, last)
+            times.append(time.monotonic() - then)
+
+        result = self.session.step(number, rows, caption, shown)
+        self.moments[self.at + 1 :] = [
+            Moment(
+                start=self.session.now,
+                caption=caption,
+                frames=result.frames,
+                camera=result.camera,
+                action=self.session.action(number),
+                truth=truth,
+            )
+        ]
+        self.at += 1
+        return Timing(first_s=times[0], last_s=times[-1], total_s=time.monotonic() - then)
+
+    def _rows(
+        self, poses: Sequence[Pose], camera: Float[np.ndarray, " 6"]
+    ) -> Float[np.ndarray, "k d"]:
+        before = self.row[-6:]
+        shares = np.linspace(0, 1, len(poses) + 1)[1:, None]
+        cameras = before + shares * (camera - before)
+        rows = [pose.row(self.side, own) for pose, own in zip(poses, cameras, strict=True)]
+        return np.clip(rows, *self.session.actions.bounds)
+
+    def go_to(self, number: int) -> None:
+        """Return to a moment; the next clip continues from there."""
+        if not 0 <= number < len(self.moments):
+            raise InputError(
+                f"There is no moment {number}: choose one from 0 to {len(self.moments) - 1}."
+            )
+        self.session.restart(self.moments[number].start)
+        self.at = number
+
+    def episode(self) -> Episode:
+        """Return the actions that led to the present moment, as an episode to simulate."""
+        made = self.moments[: self.at + 1]
+        first = made[0].start
+        return Episode(
+            state=first.state,
+            actions=tuple(moment.action for moment in made if moment.action is not None),
+            fps=self.world.video.fps,
+            first_frame=first.first_frame,
+        )
+
+    def preview(self, hand: Pose, camera: Float[np.ndarray, " 6"]) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the state as the wearer would see it, with the hand's skeleton in it."""
+        action = self._posed(hand, camera)
+        simulator = self.world.simulator(self.now.start)
+        view = view_of(simulator, self.state, action.cameras)
+        drawn, depth = simulator.renderer.draw_hands(
+            action.joints_m, action.cameras, kind=action.kind
+        )
+        return np.where(np.isfinite(depth)[..., None], drawn, view.frames)[0]
+
+    def camera(self, moved: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
+        """Return the pose `world_from_camera` of the wearer's camera, moved from the first one."""
+        return self._posed(self.hand, moved).cameras.world_from_camera[0]
+
+    def _posed(self, hand: Pose, camera: Float[np.ndarray, " 6"]) -> Action:
+        spec = self.session.actions
+        row = np.clip(hand.row(self.side, camera), *spec.bounds)
+        return spec.to_action(row[None], camera=self.now.start.camera, prompt="", hide=True)[0]
+
+
+def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
+    """Return the true world's scene of a start; None if it is of no seed."""
+    origin = start.state.provenance
+    own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
+    if not own or start.state.step:
+        return None
+    return opening(start.seed, spec=world.video)[0]
+
+
+def _film(before: Future[Filmed], action: Action) -> Filmed:
+    """Execute an action in the true world, and film it."""
+    scenes, world = before.result()[0].move(action)
+    arms = arms_of(action.joints_m, action.kind, sides_of(action.joints_m, action.kind))
+    pictures = film_scenes(scenes, action.cameras, arms=arms)
+    return world, np.stack([picture.colors for picture in pictures])

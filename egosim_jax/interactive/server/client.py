@@ -1,0 +1,174 @@
+"""Client of a server of sessions, over its websocket. Needs no jax.
+
+with Client("ws://127.0.0.1:8000") as client:
+    session = client.create(seed=3)
+    reply = session.step(rows)          # {"frames": ..., "row": ..., "info": ...}
+    reply = session.step(rows, show=lambda frames: ...)     # in groups, as they are decoded
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from egosim_jax.interactive.server import wire
+from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.types import InputError
+
+Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
+"""Function that gets the frames of a step in groups, as they are decoded."""
+REPEATABLE = ("step", "reset", "save", "load", "status")
+"""Requests that have the same effect when they are sent again after a timeout."""
+
+
+class Client:
+    """Connection to a server, for one thread."""
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        token: str | None = None,
+        timeout_s: float = 600.0,
+        patience_s: float = 600.0,
+    ):
+        """Connect to an address such as ws://127.0.0.1:8000.
+
+        A request waits `timeout_s` for its reply, and is sent again for `patience_s` while the
+        server is full or the session busy.
+        """
+        import websockets.sync.client
+
+        self._timeout_s, self._patience_s = timeout_s, patience_s
+        headers = {"Authorization": f"Bearer {token}"} if token else None
+        self._connection = websockets.sync.client.connect(
+            address.replace("http", "ws", 1) if address.startswith("http") else address,
+            compression=None,
+            max_size=None,
+            additional_headers=headers,
+            ping_timeout=None,
+        )
+        self._socket = self._connection.__enter__()
+        self.server: dict[str, Any] = wire.unpack(self._received())
+        """Description of the server: world, size and rate of clips, limits."""
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; the sessions stay."""
+        self._connection.__exit__(None, None, None)
+
+    def _received(self) -> bytes:
+        reply = self._socket.recv(timeout=self._timeout_s)
+        if isinstance(reply, bytes):
+            return reply
+        error = json.loads(reply)
+        raise RequestError(
+            error["status"],
+            error["code"],
+            error["message"],
+            retry_after_s=error.get("retry_after_s"),
+        )
+
+    def request(self, kind: str, /, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
+        """Return the reply to a request. Raises `RequestError` with the server's message.
+
+        `show` gets the frames of a step that is streamed, before its reply.
+        If it is interrupted, or waits too long, the connection is closed: connect and attach again.
+        """
+        message = wire.pack({"request": kind, **fields})
+        until = time.monotonic() + self._patience_s
+        while True:
+            try:
+                return self._ask(message, show)
+            except RequestError as error:
+                wait = error.retry_after_s
+                late = error.code in ("timeout", "part_restarts") and kind in REPEATABLE
+                again = error.status in (409, 429) or late
+                if wait is None or not again or time.monotonic() + wait > until:
+                    raise
+            time.sleep(wait)
+
+    def _ask(self, message: bytes, show: Show | None) -> dict[str, Any]:
+        try:
+            self._socket.send(message)
+            reply = wire.unpack(self._received())
+            while show is not None and "first_frame" in reply:
+                show(reply["frames"])
+                reply = wire.unpack(self._received())
+        except RequestError:
+            raise
+        except BaseException:  # a late reply would be taken for that to the next request
+            self.close()
+            raise
+        return reply
+
+    def create(self, **fields: Any) -> RemoteSession:
+        """Create a session of a `seed` or `episode`."""
+        return RemoteSession(self, self.request("create", **fields))
+
+    def attach(self, session: str) -> RemoteSession:
+        """Continue a session by its id, from any client."""
+        status = self.request("status", session=session)
+        return RemoteSession(self, {**status, "step_id": status["committed_step_id"]})
+
+
+class RemoteSession:
+    """Session on a server."""
+
+    def __init__(self, client: Client, reply: dict[str, Any]):
+        self._client, self.id = client, reply["session"]
+        self.reply = reply
+        """Reply to the request that created or attached it."""
+        self.step_id: int = reply["step_id"]
+        """Last committed step."""
+
+    def step(self, rows: np.ndarray, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
+        """Make the next step.
+
+        `show` gets its frames in groups as they are decoded, before the step is perceived and
+        committed; a step that the server has made already, or makes already, is not shown.
+        """
+        fields = {"actions": np.asarray(rows, float), **fields}
+        if show is not None:
+            fields["stream"] = True
+        reply = self._client.request(
+            "step", show=show, session=self.id, step_id=self.step_id + 1, **fields
+        )
+        if (reply["session"], reply["step_id"]) != (self.id, self.step_id + 1):
+            raise InputError(
+                f"The reply is step {reply['step_id']} of session {reply['session']}, not step "
+                f"{self.step_id + 1} of {self.id}: a client is for one thread. Give each "
+                "thread its own."
+            )
+        self.step_id = reply["step_id"]
+        return reply
+
+    def reset(self, **fields: Any) -> dict[str, Any]:
+        """Continue from a `seed` or `episode`; without one from the first start."""
+        return self._client.request("reset", session=self.id, **fields)
+
+    def save(self, name: str) -> None:
+        """Save where the session is under a name."""
+        self._client.request("save", session=self.id, name=name)
+
+    def load(self, name: str) -> dict[str, Any]:
+        """Continue from what was saved under a name."""
+        return self._client.request("load", session=self.id, name=name)
+
+    def status(self) -> dict[str, Any]:
+        """Return committed step, hash of the state and saved names."""
+        return self._client.request("status", session=self.id)
+
+    def close(self, *, keep: bool = False) -> None:
+        """End the session and remove its files on the server, unless `keep` is set."""
+        self._client.request("close", session=self.id, keep=keep)

@@ -1,0 +1,166 @@
+"""Recorded sessions as data: LeRobot datasets, training shards, and recordings for Rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
+from egosim_jax.data.pack import triplet_record
+from egosim_jax.data.shards import ShardWriter
+from egosim_jax.interactive.env.backends import GeneratedWorld
+from egosim_jax.interactive.env.chunks import view_of
+from egosim_jax.interactive.server.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
+from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.rendering import get
+from egosim_jax.rendering.portrait import up_of
+from egosim_jax.rendering.rerun_log import Recording
+from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoSpec, View
+from egosim_jax.types.grid import VideoGrid
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Unavailable:
+    """Generator of a world that is only read."""
+
+    renderer: Any
+    """Renderer of the views."""
+
+    def __call__(self, view: View, action: Action, first_frame: Any, seed: int) -> Any:
+        raise InputError("A recorded session cannot be continued here: use egosim serve.")
+
+
+def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session], dict[str, str]]:
+    """Return the sessions of a server's folder with at least one step, and what is damaged.
+
+    These are the open ones and those that were closed and kept. A damaged one does not keep the
+    others from being read. Raises `InputError` if no session is left, for an id of `names` that is
+    not there, and if a session that is named is damaged.
+    """
+    paths = sorted({p.parent for name in (SETTINGS, CLOSED) for p in folder.glob(f"[!.]*/{name}")})
+    known = {path.name: path for path in paths}
+    if missing := sorted(set(names) - set(known)):
+        raise InputError(
+            f"{quote_path(folder)} has no session {missing[0][:40]!r}; it has {len(known)}: "
+            f"{', '.join(list(known)[:10]) or 'none'}. (--session)"
+        )
+    found, damaged = [], {}
+    for path in [known[name] for name in dict.fromkeys(names)] or paths:
+        try:
+            session = Session(path, _recorded(path))
+            session.check()
+        except DAMAGE as error:
+            if names:
+                raise InputError(
+                    f"Session {path.name} cannot be exported: {error} Export others. (--session)"
+                ) from error
+            damaged[path.name] = str(error)
+        else:
+            found += [session] if session.committed else []
+    if not found:
+        raise InputError(
+            f"{quote_path(folder)} has no readable session with a committed step"
+            f"{f', and {len(damaged)} damaged ones' if damaged else ''}: name the folder of egosim "
+            "serve. (SESSIONS)"
+        )
+    return found, damaged
+
+
+def _recorded(path: Path) -> GeneratedWorld:
+    """Return the world of a recorded session, which renders and does not generate."""
+    fields = settings_of(path).get("video")
+    names = ("frames", "height", "width", "fps")
+    if not isinstance(fields, dict) or not all(type(fields.get(n)) is int for n in names):
+        raise InputError(f"{quote_path(path)} does not describe a session's clips. Restore it.")
+    video = VideoSpec(**{name: fields[name] for name in names})
+    return GeneratedWorld(generator=_Unavailable(renderer=get("jax")), video=video, perception=None)
+
+
+def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
+    """Write a LeRobot dataset with an episode for each stretch between resets."""
+    names = {(session.actions.kind, session.actions.names) for session in sessions}
+    videos = {session.backend.video for session in sessions}
+    if len(names) > 1 or len(videos) > 1:
+        raise InputError(
+            f"The sessions have {len(names)} kinds of actions and clips of {len(videos)} sizes or "
+            "rates: a dataset has one. Export them separately. (--session)"
+        )
+    episodes = (
+        EpisodeRecord(clips=_clips(session, steps), save_scene=start.save)
+        for session in sessions
+        for start, steps in session.runs()
+    )
+    kind = "gripper" if sessions[0].actions.kind == "robot" else "human_hands"
+    write_lerobot(
+        folder, episodes, names=sessions[0].actions.names, fps=videos.pop().fps, robot_type=kind
+    )
+
+
+def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
+    for number in steps:
+        yield ClipRecord(
+            frames=session.repeat(number).frames,
+            rows=session.rows(number),
+            action=session.action(number),
+        )
+
+
+def _steps(session: Session) -> Iterator[tuple[int, SceneState, View, Any]]:
+    """Yield number, state before, its view and first frame of each committed step."""
+    for start, steps in session.runs():
+        state, image = start.state, start.first_frame
+        simulator = session.backend.simulator(start)
+        for number in steps:
+            view = view_of(simulator, state, session.action(number).cameras)
+            yield number, state, view, view.frames[0] if image is None else image
+            state, image = session.repeat(number).state, None
+
+
+def to_shards(sessions: Sequence[Session], folder: Path, *, grid: VideoGrid) -> None:
+    """Write the steps as clips for training: prior, mask, hands, and the clip as the target."""
+    specs = {session.backend.video for session in sessions}
+    if len(specs) > 1:
+        raise InputError(
+            f"The sessions have clips of {len(specs)} sizes or rates: shards have one. Export them "
+            "separately. (--session)"
+        )
+    provenance = {"sessions": [session.id for session in sessions]}
+    (spec,) = specs
+    grid.check(spec)
+    renderer = get("jax")
+    with ShardWriter(folder, kind="frames", spec=spec, grid=grid, provenance=provenance) as writer:
+        for session in sessions:
+            for number, _, view, image in _steps(session):
+                action = session.action(number)
+                hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)
+                triplet = Triplet(
+                    video_id=f"{session.id}_{number}",
+                    prompt=action.prompt,
+                    prior=view.frames,
+                    mask=view.mask,
+                    hands=hands,
+                    first_frame=image,
+                    target=session.repeat(number).frames,
+                    extra={"kind": action.kind, "session": session.id},
+                )
+                record = triplet_record(triplet)
+                writer.add(record.arrays, record.metadata)
+
+
+def to_rerun(session: Session, path: Path) -> None:
+    """Write a recording of a session for the Rerun viewer (`egosim view`)."""
+    first = next(session.runs())[0].state
+    recording, state = Recording(path, session.id, up=up_of(first)), first
+    for number, before, view, _ in _steps(session):
+        result = session.repeat(number)
+        recording.add(
+            before,
+            session.action(number),
+            view=view.frames,
+            frames=result.frames,
+            ground_truth=None,
+        )
+        state = result.state
+    recording.close(state)

@@ -1,0 +1,146 @@
+"""Checks before a request is read: token, origin and host, size and time of its body."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import ipaddress
+import time
+from urllib.parse import SplitResult, urlsplit
+
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from egosim_jax.interactive.server import wire
+from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.io.untrusted.bounded import quote
+
+OPEN_PATHS = ("/healthz", "/readyz")
+"""Paths that need no token."""
+BODY_S = 60.0
+"""Longest time in which the body of a request must arrive."""
+
+
+class Guard:
+    """ASGI middleware that checks token, origin and size before a request is read."""
+
+    def __init__(self, app: ASGIApp, *, token: str | None, limit: int = wire.MAX_BYTES):
+        self._app, self._token, self._limit = app, token, limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it."""
+        if scope["type"] not in ("http", "websocket"):
+            return await self._app(scope, receive, send)
+        try:
+            self._check(HTTPConnection(scope))
+        except RequestError as error:
+            return await _refuse(error, scope, receive, send)
+        if scope["type"] == "websocket":
+            return await self._app(scope, receive, send)
+        await self._app(scope, self._bounded(receive), send)
+
+    def _check(self, connection: HTTPConnection) -> None:
+        headers, path = connection.headers, connection.scope["path"]  # url contains the Host header
+        host, origin = headers.get("host", ""), headers.get("origin")
+        if origin is not None and _address(origin).netloc != host:
+            raise RequestError(
+                403,
+                "wrong_origin",
+                "The request comes from a page of another origin, which may not use this server. "
+                "Use a client of your own.",
+            )
+        if self._token is None and not is_loopback(_address(f"//{host}").hostname or ""):
+            raise RequestError(
+                403,
+                "wrong_host",
+                "The host of the request is not this machine: without a token, the server is used "
+                "as localhost or 127.0.0.1 only.",
+            )
+        if self._token is not None and path not in OPEN_PATHS:
+            scheme, _, given = headers.get("authorization", "").partition(" ")
+            valid = hmac.compare_digest(given.strip().encode(), self._token.encode())
+            if scheme.lower() not in ("bearer", "api-key") or not valid:
+                raise RequestError(
+                    401,
+                    "wrong_token",
+                    "The token is missing or wrong: send the header Authorization: Bearer TOKEN, "
+                    "or give openpi-client the token as api_key.",
+                )
+        size = headers.get("content-length", "0")
+        if not size.isdecimal() or int(size) > self._limit:
+            raise too_large(self._limit)
+
+    def _bounded(self, receive: Receive) -> Receive:
+        total, complete = 0, False
+        until = time.monotonic() + BODY_S
+
+        async def bounded() -> Message:
+            nonlocal total, complete
+            left = None if complete else max(until - time.monotonic(), 0)
+            try:
+                message = await asyncio.wait_for(receive(), left)
+            except TimeoutError:
+                raise HTTPException(408) from None
+            complete = not message.get("more_body", False)
+            total += len(message.get("body", b""))
+            if total > self._limit:
+                raise HTTPException(413)
+            return message
+
+        return bounded
+
+
+def _address(url: str) -> SplitResult:
+    try:
+        return urlsplit(url)
+    except ValueError:
+        raise RequestError(
+            400, "invalid", f"{quote(url)} in Host or Origin is not a valid address. Send one."
+        ) from None
+
+
+def too_large(limit: int) -> RequestError:
+    """Return the error of a message of too many bytes."""
+    return RequestError(
+        413,
+        "too_large",
+        f"The message is larger than {limit:,} bytes, the most that is read. Send fewer rows or a "
+        "smaller episode.",
+    )
+
+
+def too_slow() -> RequestError:
+    """Return the error of a body that comes too slowly."""
+    return RequestError(
+        408,
+        "too_slow",
+        f"The body has not arrived within {BODY_S:g} s, the longest that is waited. Send it again.",
+    )
+
+
+async def _refuse(error: RequestError, scope: Scope, receive: Receive, send: Send) -> None:
+    if scope["type"] == "websocket" and "websocket.http.response" not in scope.get(
+        "extensions", {}
+    ):
+        await receive()
+        await send({"type": "websocket.close", "code": 1008, "reason": error.code})
+        return
+    await response(error)(scope, receive, send)
+
+
+def response(error: RequestError) -> JSONResponse:
+    """Return the response of a request that is refused."""
+    headers = {}
+    if error.retry_after_s is not None:
+        headers["Retry-After"] = str(max(1, round(error.retry_after_s)))
+    return JSONResponse(error.body(), status_code=error.status, headers=headers)
+
+
+def is_loopback(host: str) -> bool:
+    """Return True if a host is this machine's loopback."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,322 @@
+"""HTTP and websocket server of sessions: FastAPI on uvicorn.
+
+The websocket at / speaks OpenPI's protocol: the server sends a map that describes it, then each
+binary message is a request and gets one reply, a map as a binary message or an error as text; only
+a step that asks for it gets its frames first. HTTP has the same requests as JSON. All that is
+refused has a status, a code and a message.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+from collections.abc import AsyncGenerator
+from contextlib import AbstractContextManager, aclosing
+from importlib import metadata
+from typing import Annotated, Any, Protocol, runtime_checkable
+
+import uvicorn
+from fastapi import Depends, FastAPI, Path, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, PlainTextResponse
+from starlette.exceptions import HTTPException
+
+from egosim_jax.interactive.server import wire
+from egosim_jax.interactive.server.connections import BoundedProtocol
+from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.guard import Guard, is_loopback, response, too_large, too_slow
+from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.server.service import Service
+from egosim_jax.io.untrusted.bounded import quote, quote_text
+from egosim_jax.types import InputError
+
+DRAIN_S = 300.0
+"""Longest time that a shutdown waits for the requests that are under way."""
+BODY = {
+    "requestBody": {
+        "description": "Fields of the request; see docs/serving.md.",
+        "content": {"application/json": {"schema": {"type": "object"}}},
+        "required": True,
+    }
+}
+"""Description of the body of a request, which is not read by FastAPI: its size is bounded first."""
+SessionId = Annotated[str, Path(description="Id that create has returned.")]
+
+
+@runtime_checkable
+class Requests(Protocol):
+    """Object that replies to clients: a `Service`, or several behind one entrance."""
+
+    @property
+    def metrics(self) -> Metrics:
+        """Metrics of the requests."""
+        ...
+
+    @property
+    def draining(self) -> bool:
+        """True if nothing new is taken."""
+        ...
+
+    async def describe(self) -> dict[str, Any]:
+        """Return the description that a client gets when it connects."""
+        ...
+
+    def active(self) -> AbstractContextManager[None]:
+        """Return the context in which a request is replied to."""
+        ...
+
+    def refused(self, error: Exception) -> RequestError:
+        """Return the error of a request for the client."""
+        ...
+
+    async def handle(self, message: Any) -> dict[str, Any]:
+        """Return the reply to a request."""
+        ...
+
+    def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the reply to a request, after the frames of a step that is streamed."""
+        ...
+
+
+async def _fields(request: Request) -> dict[str, Any]:
+    """Return the fields of a JSON body, unpacked in a thread."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise RequestError(
+            415,
+            "invalid",
+            f"The body is {quote(kind)}: its Content-Type must be application/json. Send JSON.",
+        )
+    return await asyncio.to_thread(wire.unpack_json, await request.body())
+
+
+Fields = Annotated[dict[str, Any], Depends(_fields)]
+
+
+def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
+    """Return the application of a service; without a token it is used from this machine only."""
+    app = FastAPI(
+        title="egosim_jax",
+        version=metadata.version("egosim-jax"),
+        docs_url=None,  # its pages run scripts of another server
+        redoc_url=None,
+    )
+    app.add_middleware(Guard, token=token)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(_: Any, error: RequestValidationError) -> JSONResponse:
+        found = error.errors()[0]
+        place = quote_text(".".join(map(str, found["loc"])))
+        what = quote_text(str(found["msg"]))
+        return response(RequestError(422, "invalid", f"{place}: {what}. Correct it."))
+
+    @app.exception_handler(InputError)
+    async def unreadable(_: Any, error: InputError) -> JSONResponse:
+        return response(service.refused(error))
+
+    @app.exception_handler(HTTPException)
+    async def refused(_: Any, error: HTTPException) -> JSONResponse:
+        if error.status_code == 413:
+            return response(too_large(wire.MAX_BYTES))
+        if error.status_code == 408:
+            return response(too_slow())
+        code = "unknown_path" if error.status_code in (404, 405) else "invalid"
+        message = f"{error.detail}: /openapi.json lists the paths and methods of this server."
+        return response(RequestError(error.status_code, code, message))
+
+    async def call(name: str, fields: dict[str, Any]) -> Response:
+        """Reply to a request of HTTP."""
+        with service.active():
+            try:
+                reply = await service.handle({**_from_json(fields), "request": name})
+            except Exception as error:
+                return response(service.refused(error))
+            data = await asyncio.to_thread(wire.pack_json, reply)
+            return Response(data, media_type="application/json")
+
+    @app.get("/healthz", summary="The process is up")
+    async def healthz() -> PlainTextResponse:
+        return PlainTextResponse("OK\n")
+
+    @app.get("/readyz", summary="The server takes requests")
+    async def readyz() -> PlainTextResponse:
+        if service.draining:
+            return PlainTextResponse("draining\n", status_code=503)
+        return PlainTextResponse("OK\n")
+
+    @app.get("/metrics", summary="Metrics in Prometheus's format")
+    async def metrics() -> PlainTextResponse:
+        return PlainTextResponse(service.metrics.text().decode())
+
+    @app.get("/", summary="World, limits and requests of the server")
+    async def describe() -> JSONResponse:
+        return JSONResponse(await service.describe())
+
+    @app.get("/sessions", summary="Sessions and their committed steps")
+    async def sessions() -> Response:
+        return await call("status", {})
+
+    @app.post("/sessions", summary="Create a session", openapi_extra=BODY)
+    async def create(fields: Fields) -> Response:
+        return await call("create", fields)
+
+    @app.get("/sessions/{session}", summary="Status of a session")
+    async def status(session: SessionId) -> Response:
+        return await call("status", {"session": session})
+
+    @app.delete("/sessions/{session}", summary="Close a session and remove its files")
+    async def close(session: SessionId, keep: bool = False) -> Response:
+        return await call("close", {"session": session, "keep": keep})
+
+    for name, summary in {
+        "step": "Make a step; a repeated step_id returns the result of the first time",
+        "reset": "Continue from a seed or episode",
+        "save": "Save where the session is under a name",
+        "load": "Continue from what was saved",
+    }.items():
+        _add(app, name, summary, call)
+
+    @app.websocket("/")
+    async def websocket(socket: WebSocket) -> None:
+        await _converse(socket, service)
+
+    return app
+
+
+def _add(app: FastAPI, name: str, summary: str, call: Any) -> None:
+    path = f"/sessions/{{session}}/{name}"
+
+    @app.post(path, summary=summary, operation_id=name, openapi_extra=BODY)
+    async def run(session: SessionId, fields: Fields) -> Response:
+        return await call(name, {**fields, "session": session})
+
+
+def _from_json(fields: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a JSON request, in which an episode is Base64."""
+    import base64
+    import binascii
+
+    episode = fields.get("episode")
+    if not isinstance(episode, str):
+        return fields
+    try:
+        return {**fields, "episode": base64.b64decode(episode, validate=True)}
+    except binascii.Error as error:
+        raise InputError("episode must be the bytes of a .zip in Base64.") from error
+
+
+async def _converse(socket: WebSocket, service: Requests) -> None:
+    """Describe the server to a client, then reply to its messages one after the other."""
+    await socket.accept()
+    connections = service.metrics.connections
+    connections.inc()
+    try:
+        await socket.send_bytes(wire.pack(await service.describe()))
+        while True:
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            with service.active():
+                await _reply(socket, service, message.get("bytes"))
+    except (WebSocketDisconnect, RuntimeError):  # it vanished while a reply was on its way
+        return
+    finally:
+        connections.dec()
+
+
+async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> None:
+    try:
+        if data is None:
+            raise InputError("The message is text: it must be binary, packed as MessagePack.")
+        message = await asyncio.to_thread(wire.unpack, data, limit=wire.MAX_BYTES)
+    except Exception as error:
+        await socket.send_text(json.dumps(service.refused(error).body()))
+        return
+    async with aclosing(service.replies(message)) as replies:
+        while True:
+            try:
+                reply = await asyncio.to_thread(wire.pack, await anext(replies))
+            except StopAsyncIteration:
+                return
+            except Exception as error:
+                await socket.send_text(json.dumps(service.refused(error).body()))
+                return
+            await socket.send_bytes(reply)
+
+
+class _Server(uvicorn.Server):
+    """Server that finishes the requests under way when it is asked to end."""
+
+    def __init__(self, config: uvicorn.Config, service: Service):
+        super().__init__(config)
+        self._service = service
+
+    def handle_exit(self, sig: int, frame: Any) -> None:
+        """Drain, then shut down; a second signal shuts down at once."""
+        if self._service.store.draining:
+            self.force_exit = self.should_exit = True
+            return
+        self._service.store.draining = True
+        threading.Thread(target=self._drain, daemon=True).start()
+
+    def _drain(self) -> None:
+        self._service.drain(DRAIN_S)
+        self.should_exit = True
+
+
+def bind(host: str, port: int, *, token: str | None) -> socket.socket:
+    """Return a socket that is bound to an address and listens once it is served; 0 is a free port.
+
+    Raises `InputError` if the port is in use, or for another address than the loopback's without a
+    token.
+    """
+    if not is_loopback(host) and not token:
+        raise InputError(
+            f"{host} can be reached from other machines: the server needs a token to listen on it. "
+            "Set EGOSIM_TOKEN, or listen on 127.0.0.1. (--host)"
+        )
+    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        raise InputError(
+            f"{host}:{port} cannot be listened on ({error.strerror}): address and port must be "
+            "of this machine and free. Choose another port, 0 for any free one. (--port)"
+        ) from error
+    return bound
+
+
+def serve(service: Service, bound: socket.socket, *, token: str | None, ready: Any = None) -> bool:
+    """Serve until SIGTERM or Ctrl-C; `ready` is called with the port that is listened on.
+
+    Returns False if a second signal has ended it before the requests under way were done.
+    """
+    config = uvicorn.Config(
+        make_app(service, token=token),
+        log_level="warning",
+        access_log=False,
+        http=BoundedProtocol,
+        limit_concurrency=service.store.limits.connections + 1,
+        ws="websockets-sansio",
+        ws_max_size=wire.MAX_BYTES,
+        ws_ping_interval=30.0,
+        ws_ping_timeout=300.0,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=30,
+    )
+    server = _Server(config, service)
+
+    async def run() -> None:
+        running = asyncio.create_task(server.serve([bound]))
+        while not server.started and not running.done():
+            await asyncio.sleep(0.02)
+        if server.started and ready is not None:
+            ready(bound.getsockname()[1])
+        await running
+
+    asyncio.run(run())
+    return not server.force_exit

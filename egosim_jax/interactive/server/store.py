@@ -1,0 +1,371 @@
+"""All sessions of a server: creation, a bounded queue of steps in threads, and resumption."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import shutil
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.env.specs import spec_of
+from egosim_jax.interactive.env.start import Start, check_size
+from egosim_jax.interactive.server.errors import RequestError, as_request_error
+from egosim_jax.interactive.server.fields import check_name, mapping, prompt_of, whole
+from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.server.session import (
+    CLOSED,
+    DAMAGE,
+    SETTINGS,
+    Result,
+    Session,
+    Show,
+    check_world,
+    request_hash,
+)
+from egosim_jax.io.atomic import lock_folder
+from egosim_jax.io.untrusted.bounded import quote, quote_path
+from egosim_jax.simulation.episode import Episode
+from egosim_jax.types import InputError, check_counts
+
+T = TypeVar("T")
+UNFINISHED = re.compile(r"starts|\.session\..*")
+"""Names that a crash during the creation of a session leaves in its folder."""
+MAX_SEED = 2**63 - 1_000_000
+"""Largest seed of a session, so that those of its steps are valid, too."""
+REMOVED = ".removed-{}"
+"""Name of the folder of a session while it is removed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Limits of a server."""
+
+    sessions: int = 64
+    """Most open sessions."""
+    queue: int = 32
+    """Most steps that wait or run."""
+    threads: int = 8
+    """Most steps that run at the same time."""
+    steps: int = 10_000
+    """Most steps of a session."""
+    saved: int = 100
+    """Most starts that a session saves."""
+    connections: int = 256
+    """Most connections of clients."""
+    step_timeout_s: float = 120.0
+    """Longest time that a request waits for its step, which continues without it."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` unless all are positive."""
+        check_counts({"queue": self.queue, "threads": self.threads, "sessions": self.sessions})
+        check_counts({"steps of a session": self.steps, "saved starts": self.saved})
+        check_counts({"connections": self.connections})
+        if not self.step_timeout_s > 0:
+            raise InputError(f"The timeout is {self.step_timeout_s} s: it must be positive.")
+
+
+class Store:
+    """Sessions in a folder, which is locked while the store is open."""
+
+    def __init__(self, folder: Path, backend: Backend, limits: Limits, metrics: Metrics):
+        self.folder, self.backend, self.limits, self.metrics = folder, backend, limits, metrics
+        self.sessions: dict[str, Session] = {}
+        self.damaged: dict[str, str] = {}
+        self.draining = False
+        self._reserved: set[str] = set()
+        self._changing = threading.Lock()
+        self._queued = 0
+        self._threads = ThreadPoolExecutor(limits.threads, thread_name_prefix="step")
+        self._lock = lock_folder(folder)
+        self._lock.__enter__()
+        self._resume()
+
+    def _resume(self) -> None:
+        """Open all sessions of the folder, and finish the steps that were under way."""
+        for path in self.folder.glob(REMOVED.format("*")):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in sorted(self.folder.glob(f"*/{SETTINGS}")):
+            try:
+                check_world(path.parent, self.backend)
+                session = Session(path.parent, self.backend)
+                number = session.committed + 1
+                key = (number, session.request(number)) if session.pending else None
+            except DAMAGE as error:
+                self.damaged[path.parent.name] = str(self._for_client(error))
+                print(f"session {path.parent.name} is not resumed: {error}", file=sys.stderr)
+                continue
+            self.sessions[session.id] = session
+            if key is not None:
+                session.flight = key, self.submit(session.finish, changes=session, bounded=False)
+        self.metrics.sessions.set(len(self.sessions))
+
+    def close(self, *, at_once: bool = False) -> None:
+        """Refuse new requests, wait for the steps that run or wait, then unlock the folder.
+
+        With `at_once` waiting ones are given up; those on disk are made when the store is opened.
+        """
+        self.draining = True
+        self._threads.shutdown(wait=True, cancel_futures=at_once)
+        self._lock.__exit__(None, None, None)
+
+    def get(self, session_id: object) -> Session:
+        """Return a session. Raises `RequestError` if there is none of that id."""
+        session = self.sessions.get(session_id) if isinstance(session_id, str) else None
+        if session is not None:
+            return session
+        if isinstance(session_id, str) and session_id in self.damaged:
+            raise RequestError(
+                410,
+                "damaged_session",
+                f"Session {session_id} could not be resumed: {self.damaged[session_id]}",
+            )
+        raise _unknown(session_id)
+
+    def create(self, request: Mapping[str, Any]) -> Session:
+        """Create a session of a seed or episode, with the id that is asked for or a new one."""
+        self._check_open()
+        actions = spec_of(mapping(request.get("actions", {}), "actions"))
+        name = check_name(request.get("session", secrets.token_hex(8)), "session")
+        folder = self._reserve(name)
+        try:
+            start = self._start(request, actions)
+            session = Session.create(folder, self.backend, actions, start)
+            with self._changing:
+                self.sessions[name] = session
+                self.metrics.sessions.set(len(self.sessions))
+        finally:
+            with self._changing:
+                self._reserved.remove(name)
+        return session
+
+    def _reserve(self, name: str) -> Path:
+        """Return the folder of a new session, which nobody else can create meanwhile."""
+        with self._changing:
+            count = len(self.sessions.keys() | self._reserved)
+            if count >= self.limits.sessions:
+                raise RequestError(
+                    429,
+                    "too_many_sessions",
+                    f"{count} sessions are open, the most of this server is "
+                    f"{self.limits.sessions}. Close one, or try again later.",
+                    retry_after_s=5.0,
+                )
+            folder = self.folder / name
+            taken = name in self.sessions or name in self._reserved
+            if not taken and folder.is_dir() and _is_unfinished(folder):
+                shutil.rmtree(folder)
+            if taken or folder.exists():
+                raise RequestError(
+                    409,
+                    "session_exists",
+                    f"There is a session {quote(name)} already: choose another id, or none for a "
+                    "new one.",
+                )
+            self._reserved.add(name)
+        return folder
+
+    def _start(
+        self,
+        request: Mapping[str, Any],
+        actions: ActionSpec,
+        default: Callable[[], Start] | None = None,
+    ) -> Start:
+        """Return the start that a request chooses: `seed`, or the bytes of an `episode`.
+
+        Without either it is the default, by default that of seed 0.
+        """
+        prompt = prompt_of(request)
+        seed = 0 if (chosen := request.get("seed")) is None else whole(chosen, "seed")
+        if not 0 <= seed <= MAX_SEED:
+            raise InputError(f"seed is {quote(seed)}: it must be from 0 to {MAX_SEED}.")
+        if (data := request.get("episode")) is not None:
+            if not isinstance(data, bytes):
+                raise InputError(f"episode is {quote(data)}: it must be the bytes of a .zip.")
+            start = Start.of(Episode.from_bytes(data), seed=seed)
+        elif chosen is None and default is not None:
+            start = default()
+        else:
+            start = self.backend.start(seed, actions)
+        check_size(start, self.backend.video)
+        return start if prompt is None else replace(start, prompt=prompt)
+
+    def step(self, request: Mapping[str, Any], show: Show | None = None) -> Future[Result]:
+        """Queue a step of a session, whose frames are shown unless it is a repeated one."""
+        session = self.get(request.get("session"))
+        step_id, prompt = whole(request.get("step_id"), "step_id"), prompt_of(request)
+        if step_id < 1:
+            raise InputError(
+                f"step_id is {step_id}: it must be one more than the last committed step. Send "
+                f"{session.committed + 1}."
+            )
+        if step_id > self.limits.steps:
+            raise RequestError(
+                429,
+                "too_many_steps",
+                f"Step {step_id} is more than a session's {self.limits.steps}: create a new one.",
+            )
+        if "actions" not in request:
+            raise InputError("The step has no actions: give rows of numbers.")
+        rows = request["actions"]
+        flight = session.flight
+        key = step_id, request_hash(rows, prompt)
+        if flight is not None and flight[0] == key and not flight[1].done():
+            return flight[1]  # a client that vanished and came back waits for its step
+        run = partial(session.step, step_id, rows, prompt, show)
+        if step_id <= session.committed:
+            return self.submit(run)
+        future = self.submit(run, changes=session)
+        session.flight = key, future
+        return future
+
+    def reset(self, request: Mapping[str, Any]) -> Future[Result]:
+        """Queue a reset of a session to a seed or episode, or to its own first start."""
+        session = self.get(request.get("session"))
+
+        def run() -> Result:
+            return session.restart(self._start(request, session.actions, session.first))
+
+        return self.submit(run, changes=session)
+
+    def save(self, request: Mapping[str, Any]) -> Future[str]:
+        """Queue the saving of a session under a name."""
+        session, name = self.get(request.get("session")), request.get("name")
+        check_name(name, "name")
+
+        def run() -> str:
+            saved = session.saved
+            if len(saved) >= self.limits.saved and name not in saved:
+                raise RequestError(
+                    429,
+                    "too_many_saved",
+                    f"The session has saved {len(saved)} starts, the most is {self.limits.saved}. "
+                    "Save under one of their names.",
+                )
+            session.save(str(name))
+            return str(name)
+
+        return self.submit(run, changes=session)
+
+    def load(self, request: Mapping[str, Any]) -> Future[Result]:
+        """Queue the return of a session to what it has saved."""
+        session, name = self.get(request.get("session")), request.get("name")
+        return self.submit(lambda: session.load(check_name(name, "name")), changes=session)
+
+    def remove(self, request: Mapping[str, Any]) -> Future[str]:
+        """Queue the end of a session, and the removal of its folder unless `keep` is true."""
+        session, keep = self.get(request.get("session")), request.get("keep", False)
+        if not isinstance(keep, bool):
+            raise InputError(f"keep is {quote(keep)}: it must be true or false.")
+
+        removed = self.folder / REMOVED.format(session.id)
+
+        def run() -> str:
+            with self._changing:
+                if keep:
+                    (session.folder / SETTINGS).rename(session.folder / CLOSED)
+                else:
+                    shutil.rmtree(removed, ignore_errors=True)
+                    session.folder.rename(removed)
+                self.sessions.pop(session.id, None)
+                self.metrics.sessions.set(len(self.sessions))
+            shutil.rmtree(removed, ignore_errors=True)
+            return session.id
+
+        return self.submit(run, changes=session)
+
+    def submit(
+        self,
+        run: Callable[[], T],
+        *,
+        changes: Session | None = None,
+        bounded: bool = True,
+    ) -> Future[T]:
+        """Run a request in a thread.
+
+        A `bounded` one is refused if the queue is full or the server ends, one that `changes` a
+        session if another such one is under way.
+        """
+        if bounded:
+            self._check_open()
+        with self._changing:
+            if bounded and self._queued >= self.limits.queue:
+                raise RequestError(
+                    429,
+                    "queue_full",
+                    f"{self._queued} requests wait or run, the most of this server is "
+                    f"{self.limits.queue}. Send it again later.",
+                    retry_after_s=1.0,
+                )
+            if changes is not None and not changes.busy.acquire(blocking=False):
+                raise RequestError(
+                    409,
+                    "session_busy",
+                    f"Session {changes.id} has a request under way: one at a time can change it. "
+                    "Wait for its reply, then send this one again.",
+                    retry_after_s=0.5,
+                )
+            if changes is not None and self.sessions.get(changes.id) is not changes:
+                changes.busy.release()  # it was closed after it was found
+                raise _unknown(changes.id)
+            self._queued += 1
+            self.metrics.queued.set(self._queued)
+        return self._threads.submit(self._run, run, changes)
+
+    def _run(self, run: Callable[[], T], changes: Session | None) -> T:
+        then = time.monotonic()
+        try:
+            return run()
+        except Exception as error:
+            found = as_request_error(self._for_client(error))
+            if found.code == "internal":
+                traceback.print_exc()
+            raise found from error
+        finally:
+            if changes is not None:
+                changes.flight = None
+                changes.busy.release()
+            with self._changing:
+                self._queued -= 1
+                self.metrics.queued.set(self._queued)
+            self.metrics.seconds.observe(time.monotonic() - then)
+
+    def _for_client(self, error: Exception) -> Exception:
+        """Return an error that does not show a client where the server's files are."""
+        folder = f"{quote_path(self.folder)}/"
+        if isinstance(error, InputError) and folder in str(error):
+            return InputError(str(error).replace(folder, ""))
+        return error
+
+    def _check_open(self) -> None:
+        if self.draining:
+            raise RequestError(
+                503,
+                "draining",
+                "The server is shutting down: it finishes what runs and takes nothing new. Connect "
+                "again when it is back; all sessions are kept.",
+                retry_after_s=10.0,
+            )
+
+
+def _unknown(session_id: object) -> RequestError:
+    return RequestError(
+        404,
+        "unknown_session",
+        f"There is no session {quote(session_id)}: session must be an id that create has returned "
+        "and that is not closed. Create one.",
+    )
+
+
+def _is_unfinished(folder: Path) -> bool:
+    return all(UNFINISHED.fullmatch(path.name) for path in folder.iterdir())

@@ -1,0 +1,196 @@
+"""Messages in MessagePack with NumPy arrays, as OpenPI's clients and servers exchange them; JSON.
+
+An array is a map of `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one of
+`__npgeneric__`, `data` and `dtype`; their keys are bytes. Nothing is unpickled: dtypes are numbers
+only, and an array's size must be that of its data.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.io.untrusted.bounded import quote, quote_text
+from egosim_jax.types import InputError
+
+MAX_BYTES = 16 << 20
+"""Largest message from a client in bytes."""
+DTYPES = re.compile(r"[<>=]?(?:i[1248]|u[1248]|f[248])|[|]?(?:b1|i1|u1)")
+"""Names of dtypes; NumPy would evaluate others, such as those with commas, as Python."""
+LISTED = 512
+"""Most numbers of an array that JSON has as a list."""
+MAX_DEPTH = 16
+"""Deepest nesting of a message."""
+MAX_ITEMS = 200_000
+"""Most items of all lists and maps of a message from a client."""
+
+
+def pack(value: Any) -> bytes:
+    """Return the bytes of a message."""
+    import msgpack
+
+    return bytes(msgpack.Packer(default=_packed).pack(value))
+
+
+def unpack(data: bytes, *, limit: int | None = None) -> Any:
+    """Return the message of some bytes. Raises `InputError` for what is not one.
+
+    Messages from outside are given a `limit` in bytes.
+    """
+    import msgpack
+
+    if limit is not None and len(data) > limit:
+        raise InputError(f"The message has {len(data):,} bytes: it may have at most {limit:,}.")
+    items, longest = 0, -1 if limit is None else MAX_ITEMS
+
+    def counted(value: Any) -> Any:
+        nonlocal items
+        items += 1 + len(value)
+        if limit is not None and items > MAX_ITEMS:
+            raise InputError(
+                f"The message has more than {MAX_ITEMS:,} items in its lists and maps, the most "
+                "that is read. Send NumPy arrays instead of lists."
+            )
+        return value
+
+    try:
+        value = msgpack.unpackb(
+            data,
+            object_hook=lambda value: _unpacked(counted(value)),
+            list_hook=counted,
+            strict_map_key=True,
+            max_array_len=longest,
+            max_map_len=longest,
+        )
+    except InputError:
+        raise
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError) as error:
+        raise InputError(
+            "The message is not MessagePack with arrays of numbers, as openpi_client.msgpack_numpy "
+            f"packs it: {quote_text(str(error) or type(error).__name__)}."
+        ) from error
+    if limit is not None:
+        _check_depth(value)
+    return value
+
+
+def _packed(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "biuf":
+        raise TypeError(f"an array of {value.dtype} cannot be sent")
+    if isinstance(value, np.ndarray):
+        data = np.ascontiguousarray(value).tobytes()
+        return {
+            b"__ndarray__": True,
+            b"data": data,
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    raise TypeError(f"{type(value).__name__} cannot be sent")
+
+
+def _unpacked(value: dict[Any, Any]) -> Any:
+    if b"__ndarray__" in value:
+        return _array(value.get(b"data"), value.get(b"dtype"), value.get(b"shape"))
+    if b"__npgeneric__" in value:
+        number = value.get(b"data")
+        if not isinstance(number, bool | int | float):
+            raise InputError(f"A NumPy scalar is {quote(number)}: it must be a number.")
+        try:
+            return _dtype(value.get(b"dtype")).type(number)
+        except (OverflowError, ValueError) as error:
+            raise InputError(f"A NumPy scalar is {quote(number)}: {quote_text(str(error))}.") from (
+                error
+            )
+    return value
+
+
+def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
+    kind = _dtype(dtype)
+    sizes = isinstance(shape, list) and all(type(n) is int and 0 <= n < 1 << 31 for n in shape)
+    if not isinstance(data, bytes) or not sizes or len(shape) > 8:
+        raise InputError(
+            f"An array has data {quote(data)} and shape {quote(shape)}: data must be bytes, the "
+            "shape a list of at most 8 whole numbers."
+        )
+    count = 1
+    for size in shape:
+        count *= size
+    if count * kind.itemsize != len(data):
+        raise InputError(
+            f"An array of {kind} has {len(data):,} bytes, its shape asks for "
+            f"{quote(count * kind.itemsize)}: they must agree."
+        )
+    return np.frombuffer(data, kind).reshape(shape)
+
+
+def _dtype(name: Any) -> np.dtype:
+    if not isinstance(name, str) or not DTYPES.fullmatch(name):
+        raise InputError(f"The dtype of an array is {quote(name)}: it must be of numbers or bool.")
+    return np.dtype(name)
+
+
+def _check_depth(value: Any) -> None:
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+        if not level:
+            return
+    raise InputError(f"The message is nested more than {MAX_DEPTH} levels deep.")
+
+
+def unpack_json(data: bytes) -> dict[str, Any]:
+    """Return the object of a JSON body, bounded as MessagePack is. Raises `InputError`."""
+    # each item follows a comma or opens a list or object: texts can only add to this bound
+    items = sum(data.count(mark) for mark in (b",", b"[", b"{"))
+    if items > MAX_ITEMS:
+        raise InputError(
+            f"The body has {items:,} commas and brackets: it may have at most {MAX_ITEMS:,}. Send "
+            "fewer rows, or use the websocket, which takes NumPy arrays."
+        )
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"The body is not JSON: {quote_text(str(error))}. It must be a JSON object."
+        ) from error
+    if not isinstance(value, dict):
+        raise InputError(f"The body is {quote(value)}: it must be a JSON object.")
+    _check_depth(value)
+    return value
+
+
+def pack_json(value: Any) -> bytes:
+    """Return the bytes of a reply in JSON."""
+    return json.dumps(to_json(value), allow_nan=False).encode()
+
+
+def to_json(value: Any) -> Any:
+    """Return a value for JSON: short arrays as lists, others as dtype, shape and Base64 data.
+
+    NaN and infinity are null.
+    """
+    if isinstance(value, np.ndarray) and value.size <= LISTED:
+        return to_json(value.tolist())
+    if isinstance(value, np.ndarray):
+        data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "base64": data}
+    if isinstance(value, np.generic):
+        return to_json(value.item())
+    if isinstance(value, dict):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,73 @@
+"""Columns of Parquet files, with sizes checked before they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from egosim_jax.io.untrusted.bounded import open_regular, quote_path, quote_text
+from egosim_jax.types import InputError
+
+MAX_FILE_BYTES = 1 << 32
+"""Largest file in bytes."""
+MAX_COLUMN_BYTES = 1 << 26
+"""Largest size of the columns that are read, in bytes, unpacked."""
+MAX_ROWS = 1 << 24
+"""Largest number of rows."""
+
+
+def read_columns(
+    path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()
+) -> dict[str, list[Any]]:
+    """Return the values of columns, as Python values, by name; only these columns are read.
+
+    Raises `InputError` if a column that is not optional is missing, or if the file is damaged or
+    declares more than is read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    name = quote_path(path)
+    with open_regular(path) as file:
+        if file.seek(0, 2) > MAX_FILE_BYTES:
+            raise InputError(f"{name} has more than {MAX_FILE_BYTES:,} bytes, the most.")
+        try:
+            opened = pq.ParquetFile(file)
+            found = opened.schema_arrow.names
+            absent = [column for column in columns if column not in found]
+            if absent:
+                raise InputError(
+                    f"{name} has no column {quote_text(', '.join(absent))}; it has "
+                    f"{quote_text(', '.join(found))}."
+                )
+            wanted = [*columns, *(column for column in optional if column in found)]
+            _check_sizes(opened.metadata, wanted, name)
+            table = opened.read(columns=wanted, use_threads=False)
+            return {column: table.column(column).to_pylist() for column in wanted}
+        except (pa.ArrowException, OSError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"{name} is not a readable Parquet file: {quote_text(str(error))}."
+            ) from error
+
+
+def _check_sizes(metadata: Any, wanted: Sequence[str], name: str) -> None:
+    size = 0
+    for number in range(metadata.num_row_groups):
+        group = metadata.row_group(number)
+        for index in range(group.num_columns):
+            chunk = group.column(index)
+            if any(chunk.path_in_schema in (w, *_nested(w, chunk.path_in_schema)) for w in wanted):
+                size += max(0, chunk.total_uncompressed_size)
+    if metadata.num_rows > MAX_ROWS or size > MAX_COLUMN_BYTES:
+        raise InputError(
+            f"{name} declares {metadata.num_rows:,} rows and {size:,} bytes to read: at most "
+            f"{MAX_ROWS:,} rows and {MAX_COLUMN_BYTES:,} bytes are read."
+        )
+
+
+def _nested(column: str, path: str) -> tuple[str, ...]:
+    """Return the path itself if it is that of the values in a list column."""
+    return (path,) if path.startswith(f"{column}.") else ()

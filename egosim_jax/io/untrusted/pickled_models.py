@@ -1,0 +1,149 @@
+"""Read the pickles of MANO hand models without executing them and without chumpy or scipy.
+
+They were written by Python 2 at protocol 2: its strings are bytes, of which arrays are made. Three
+kinds of objects are in them, each built by a state of plain values:
+
+    chumpy.ch.Ch                 an array, `x`
+    chumpy.reordering.Select     entries `idxs` of the flattened `a`, in the shape `preferred_shape`
+    scipy.sparse.csc.csc_matrix  `data`, `indices` and `indptr` of compressed columns
+
+Everything else is refused, as are globals that would run code. Files that were saved again by a
+later Python or with plain arrays are read as well.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from egosim_jax.io.mapped import RefusedError
+from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes
+from egosim_jax.io.untrusted.pickled import Name, Opaque
+from egosim_jax.io.untrusted.pickled_arrays import MAX_BYTES, NumPyInterpreter, PickledArray
+from egosim_jax.types import InputError
+
+ARRAY, SELECT = "chumpy.ch.Ch", "chumpy.reordering.Select"
+SPARSE = frozenset({"scipy.sparse.csc.csc_matrix", "scipy.sparse._csc.csc_matrix"})
+NEW = frozenset({"copy_reg._reconstructor", "copyreg._reconstructor"})
+OBJECT = frozenset({"__builtin__.object", "builtins.object"})
+SETS = frozenset({"__builtin__.set", "builtins.set"})
+MAX_DENSE = 1 << 24
+"""Most entries of a sparse matrix that is made dense."""
+
+
+def read_model(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a hand model by name; other values are ignored.
+
+    Raises `InputError` with the reason if the file is damaged or asks for code.
+    """
+    data = read_bytes(path, limit=MAX_BYTES)
+    try:
+        root = _Model(data).run()
+        if not isinstance(root, dict):
+            raise RefusedError(f"it holds {quote(root)}, not a dictionary")
+        arrays = {str(name): _dense(value) for name, value in root.items()}
+        return {name: array for name, array in arrays.items() if array is not None}
+    except (ValueError, struct.error, IndexError, TypeError, KeyError) as error:
+        reason = str(error) if isinstance(error, RefusedError) else quote_text(str(error))
+        raise InputError(
+            f"{quote_path(path)} cannot be read: {reason}. Only the arrays of a hand model are "
+            "supported, as in MANO_RIGHT.pkl and MANO_LEFT.pkl of mano.is.tue.mpg.de; download the "
+            "file again. (--mano-right, --mano-left)"
+        ) from error
+
+
+@dataclass
+class _Object(Opaque):
+    """Object of one of the three classes, whose state is set later."""
+
+    kind: str
+    state: dict[str, Any] | None = None
+
+
+class _Model(NumPyInterpreter):
+    """Interpreter that adds strings of Python 2, arrays of chumpy and sparse matrices."""
+
+    allowed = NumPyInterpreter.allowed | {ARRAY, SELECT} | SPARSE | NEW | OBJECT | SETS
+    actions: ClassVar = {
+        **NumPyInterpreter.actions,
+        "SHORT_BINSTRING": NumPyInterpreter.push,
+        "BINSTRING": NumPyInterpreter.push,
+        "NEWOBJ": NumPyInterpreter._call,
+    }
+
+    def called(self, name: str, arguments: tuple) -> Any:
+        """Return an object without its state, or what NumPy's names yield."""
+        classes = {ARRAY, SELECT} | SPARSE
+        match arguments:
+            case () if name in classes:
+                return _Object(name)
+            case (Name(kind), Name(base), None) if name in NEW and base in OBJECT:
+                if kind in classes:
+                    return _Object(kind)
+            case (list(items),) if name in SETS:
+                return items
+            case (Name("numpy.ndarray"), (0,), "b"):
+                return super().called(name, (Name("numpy.ndarray"), (0,), b"b"))
+            case (str(code), int(align), int(copy)) if name == "numpy.dtype":
+                return super().called(name, (code, bool(align), bool(copy)))
+        return super().called(name, arguments)
+
+    def set_state(self, target: Any, state: Any) -> None:
+        """Set the state of an object; of an array, whose bytes Python 2 wrote as a string."""
+        match (target, state):
+            case (_Object(state=None), dict()):
+                target.state = state
+            case (PickledArray(), (version, shape, dtype, by_column, str(data))):
+                by_column = bool(by_column) if type(by_column) is int else by_column
+                encoded = data.encode("latin-1")
+                super().set_state(target, (version, shape, dtype, by_column, encoded))
+            case _:
+                super().set_state(target, state)
+
+
+def _dense(value: Any) -> np.ndarray | None:
+    """Return the array that a value is, or None if it is none."""
+    match value:
+        case PickledArray():
+            return value.values()
+        case _Object(kind=kind, state=dict(state)):
+            if kind == ARRAY:
+                return _required(state, "x")
+            if kind == SELECT:
+                indices, shape = _required(state, "idxs"), state["preferred_shape"]
+                return _required(state, "a").reshape(-1)[indices].reshape(shape)
+            return _from_columns(state)
+        case _Object():
+            raise RefusedError("one of its objects has no state")
+    return None
+
+
+def _required(state: dict[str, Any], name: str) -> np.ndarray:
+    array = _dense(state.get(name))
+    if array is None:
+        raise RefusedError(f"one of its objects has no array {name}")
+    return array
+
+
+def _from_columns(state: dict[str, Any]) -> np.ndarray:
+    """Return the dense matrix of compressed columns."""
+    values, rows, starts = (_required(state, name) for name in ("data", "indices", "indptr"))
+    match state.get("_shape"):
+        case (int(height), int(width)) if min(height, width) >= 1 and height * width <= MAX_DENSE:
+            shape = height, width
+        case other:
+            raise RefusedError(f"a sparse matrix has the shape {quote_text(str(other))}")
+    counts = np.diff(starts)
+    if len(starts) != shape[1] + 1 or starts[0] != 0 or (counts < 0).any():
+        raise RefusedError("a sparse matrix has invalid columns")
+    if len(rows) != len(values) or starts[-1] != len(values):
+        raise RefusedError("a sparse matrix has other numbers of rows and values")
+    if len(rows) and not 0 <= rows.min() <= rows.max() < shape[0]:
+        raise RefusedError("a sparse matrix has rows outside of it")
+    dense = np.zeros(shape)
+    np.add.at(dense, (rows, np.repeat(np.arange(shape[1]), counts)), values)
+    return dense

@@ -1,0 +1,186 @@
+"""Read and write PyTorch's `.pth` files without PyTorch and without executing their pickles.
+
+A `.pth` is a zip archive of uncompressed entries: `NAME/data.pkl`, a pickle of dictionaries, lists
+and references to tensors, and `NAME/data/KEY`, the bytes of each storage. To the interpreter of
+`io/untrusted/pickled.py` this module adds storages and tensors. Every tensor is checked against its storage
+and stays in the memory-mapped file until it is accessed.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.mapped import (
+    CODES,
+    MAX_AXES,
+    RefusedError,
+    Tensor,
+    check_sizes,
+    map_file,
+    strides_of,
+)
+from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text
+from egosim_jax.io.untrusted.pickled import Interpreter, Name, Opaque, flatten
+from egosim_jax.io.untrusted.torch_zip import read_entries
+from egosim_jax.types import InputError
+
+STORAGES = {
+    "DoubleStorage": "float64", "FloatStorage": "float32", "HalfStorage": "float16",
+    "BFloat16Storage": "bfloat16", "LongStorage": "int64", "IntStorage": "int32",
+    "ShortStorage": "int16", "CharStorage": "int8", "ByteStorage": "uint8", "BoolStorage": "bool",
+}  # fmt: skip
+"""Dtype of the elements of each of torch's storage classes."""
+DTYPES = {dtype.name: dtype for dtype in CODES.values()} | {
+    name: np.dtype(name) for name in ("float8_e4m3fnuz", "float8_e5m2fnuz")
+}
+"""NumPy dtypes by their names in torch."""
+UNTYPED = "torch.storage.UntypedStorage"
+
+
+@dataclass(frozen=True)
+class Storage(Opaque):
+    """Bytes that tensors are views of."""
+
+    data: memoryview
+    dtype: str | None
+    """Element dtype; None for untyped storages, whose tensors have one."""
+
+
+def read_pth(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a `.pth` file by name, nested keys joined by dots.
+
+    The file stays mapped while any of them is alive. Raises `InputError` with the reason if it is
+    not a `.pth` archive, is damaged, or has anything but tensors, plain values and containers.
+    """
+    data = map_file(path)
+    try:
+        return flatten(_Torch(read_entries(data)).run(), Tensor)
+    except (ValueError, struct.error) as error:
+        reason = str(error) if isinstance(error, RefusedError) else quote_text(str(error))
+        raise InputError(
+            f"{quote_path(path)} cannot be read: {reason}. Only tensors in plain containers are "
+            "supported, as torch.save writes state dicts. Save the weights again as such, or "
+            "better as safetensors."
+        ) from error
+
+
+def write_pth(path: Path, array: np.ndarray) -> None:
+    """Write one tensor as `torch.save` does, for `torch.load` with `weights_only`; atomically."""
+    kinds = {dtype: kind for kind, dtype in STORAGES.items()}
+    kind, array = kinds[array.dtype.name], np.ascontiguousarray(array)
+    strides = [step // array.dtype.itemsize for step in array.strides]
+    storage = b"(" + _text("storage") + f"ctorch\n{kind}\n".encode() + _text("0") + _text("cpu")
+    storage += _number(array.size) + b"tQ"
+    ordered = b"ccollections\nOrderedDict\n)R"
+    arguments = storage + _number(0) + _numbers(array.shape) + _numbers(strides) + b"\x89" + ordered
+    program = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + arguments + b"tR."
+    entries = {
+        "data.pkl": program, "byteorder": b"little", "data/0": array.tobytes(), "version": b"3\n",
+    }  # fmt: skip
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(zipfile.ZipInfo(f"archive/{name}"), content)
+
+
+def _text(value: str) -> bytes:
+    return b"X" + struct.pack("<I", len(value)) + value.encode()
+
+
+def _number(value: int) -> bytes:
+    return b"\x8a\x08" + struct.pack("<q", value)
+
+
+def _numbers(values: Iterable[int]) -> bytes:
+    return b"(" + b"".join(map(_number, values)) + b"t"
+
+
+class _Torch(Interpreter):
+    """Interpreter that adds the tensors of torch, views of the storages in an archive."""
+
+    allowed = Interpreter.allowed | {
+        "torch.Size", "torch._utils._rebuild_parameter", "torch._utils._rebuild_tensor_v2",
+        "torch._utils._rebuild_tensor_v3", UNTYPED,
+        *(f"torch.{name}" for name in (*STORAGES, *DTYPES)),
+    }  # fmt: skip
+
+    def __init__(self, entries: Mapping[str, memoryview]):
+        super().__init__(entries["data.pkl"])
+        self.entries = entries
+
+    def referenced(self, identity: Any) -> Storage:
+        """Return a storage in the archive."""
+        match identity:
+            case ("storage", Name(kind), str(key), str(), int(count)):
+                pass
+            case _:
+                raise RefusedError(
+                    f"its pickle references {quote(identity)}, which is not a storage"
+                )
+        data = self.entries.get(f"data/{key}")
+        if data is None:
+            raise RefusedError(f"the storage {quote_text(key)} is missing")
+        dtype = None if kind == UNTYPED else STORAGES.get(kind.removeprefix("torch."))
+        if dtype is None and kind != UNTYPED:
+            raise RefusedError(f"{kind} is not a storage class")
+        size = count * (1 if dtype is None else DTYPES[dtype].itemsize)
+        if count < 0 or size > len(data):
+            raise RefusedError(
+                f"the storage {quote_text(key)} declares {quote(size)} bytes but has {len(data)}"
+            )
+        return Storage(data[:size], dtype)
+
+    def called(self, name: str, arguments: tuple) -> Any:
+        """Return a tensor or its size."""
+        match (name, arguments):
+            case ("torch.Size", (tuple(size),)):
+                return size
+            case ("torch._utils._rebuild_parameter", (Tensor() as tensor, bool(), {})):
+                return tensor
+            case (
+                "torch._utils._rebuild_tensor_v2",
+                (Storage(dtype=str(dtype)) as storage, offset, tuple(size), tuple(stride), *_),
+            ):
+                return _tensor(storage, dtype, offset, size, stride)
+            case (
+                "torch._utils._rebuild_tensor_v3",
+                (
+                    Storage() as storage, offset, tuple(size), tuple(stride), bool(), {},
+                    Name(dtype), *_,
+                ),
+            ):  # fmt: skip
+                return _tensor(storage, dtype.removeprefix("torch."), offset, size, stride)
+            case _:
+                return super().called(name, arguments)
+
+
+def _tensor(storage: Storage, dtype: str, offset: Any, size: tuple, stride: tuple) -> Tensor:
+    """Return a view of a storage. Raises `RefusedError` unless all its elements are inside."""
+    if dtype not in DTYPES:
+        raise RefusedError(f"a tensor has the unsupported dtype {dtype}")
+    if len(size) != len(stride) or len(size) > MAX_AXES:
+        raise RefusedError(f"a tensor has {len(size)} axes and {len(stride)} strides")
+    kind = DTYPES[dtype]
+    check_sizes("a tensor", (offset, *size, *stride))
+    strides_of("a tensor", size, kind)
+    count = math.prod(size)
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    here = len(storage.data) // kind.itemsize
+    if count and last >= here:
+        raise RefusedError(f"a tensor of size {size} reads element {last} of a storage of {here}")
+    if count > max(here, 1):
+        raise RefusedError(f"a tensor of size {size} repeats the {here} elements of its storage")
+    return Tensor(
+        shape=size,
+        dtype=kind,
+        data=storage.data[offset * kind.itemsize :],
+        strides=tuple(kind.itemsize * step for step in stride),
+    )

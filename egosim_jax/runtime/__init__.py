@@ -1,0 +1,1 @@
+"""What every command shares: parsing, exit codes, interrupts, progress and worker processes."""

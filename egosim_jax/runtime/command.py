@@ -1,0 +1,272 @@
+"""Command-line entry points: parsing, error messages and exit codes."""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import logging
+import os
+import select
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import is_dataclass, replace
+from enum import IntEnum
+from importlib import metadata
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Protocol,
+    get_args,
+    get_type_hints,
+    runtime_checkable,
+)
+
+from egosim_jax.runtime import interrupts
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+
+
+class ExitCode(IntEnum):
+    """Exit codes of every command, for scripts to act on."""
+
+    DONE = 0
+    FAILED = 1
+    USAGE = 2
+    """Wrong option or invalid input: the same command fails again."""
+    PARTIAL = 3
+    """Some items failed; the others are done."""
+    HUNG = 70
+    """Training made no progress within its timeout."""
+    RESUBMIT = 75
+    """Training was interrupted and saved: run the same command again."""
+
+
+class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
+    """Early end of a command, with the message to print and the exit code."""
+
+    def __init__(self, message: str, code: ExitCode):
+        super().__init__(message)
+        self.code = code
+
+
+HelpGroups = Mapping[str, tuple[str, ...]]
+"""Type of a command's `help_groups`: fields by the title of their group in its help.
+
+The help begins with all other fields: the few that one changes.
+"""
+
+
+@runtime_checkable
+class Command(Protocol):
+    """Command line that was parsed into a dataclass, which may have `help_groups`."""
+
+    def run(self) -> int:
+        """Run the command and return the exit code."""
+        ...
+
+
+def main(
+    commands: Any,
+    *,
+    program: str,
+    description: str,
+    args: Sequence[str] | None,
+    context: Callable[[], AbstractContextManager[None]] = nullcontext,
+    others: Sequence[str] = (),
+) -> int:
+    """Parse a command line into one of the dataclasses `commands`, run it, return its exit code.
+
+    The command runs inside the context manager that `context` makes after parsing. `others` are
+    subcommands that are not parsed here, to be suggested for mistyped ones. Results go to
+    stdout, progress and errors to stderr. A wrong option or invalid input prints one message; a
+    traceback means a defect of the program.
+    """
+
+    given = list(sys.argv[1:] if args is None else args)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax also raises what it logs
+
+    def run() -> int:
+        import tyro
+
+        if given == ["--version"]:
+            print(f"{program} {metadata.version('egosim-jax')}")
+            return ExitCode.DONE
+        if (mistake := _mistyped(commands, given, program, others)) is not None:
+            raise InputError(mistake)
+        command: Command = tyro.cli(
+            commands,
+            prog=program,
+            description=f"{description} --version prints the version.",
+            args=given,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+            registry=_rules(given),
+        )
+        with context():
+            code = command.run()
+        if args is None:
+            interrupts.ignore()  # the process ends, and nothing is left to continue
+        return code
+
+    return run_with_exit_codes(run)
+
+
+def _rules(args: Sequence[str]) -> ConstructorRegistry:
+    """Return tyro's rule for our dataclasses: a class with `help_groups` has a box for each.
+
+    Where a script of completions is printed, descriptions end after the first line: each is a line
+    of the script's output.
+    """
+    import tyro
+    from tyro.constructors import (
+        MISSING_NONPROP,
+        ConstructorRegistry,
+        StructConstructorSpec,
+        StructFieldSpec,
+    )
+
+    registry = ConstructorRegistry()
+    completing = any(arg.startswith("--tyro-") for arg in args)
+    open_types: list[Any] = []
+
+    def described(field: StructFieldSpec) -> StructFieldSpec:
+        text = field.helptext
+        if not completing or text is None:
+            return field
+        full = text() if callable(text) else text
+        return replace(field, helptext=full and full.strip().partition("\n")[0])
+
+    @registry.struct_rule
+    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if (members := getattr(info.type, "help_members", None)) is not None:
+            return StructConstructorSpec(instantiate=dict, fields=members)
+        if not is_dataclass(info.type) or info.type in open_types:
+            return None
+        open_types.append(info.type)
+        spec = ConstructorRegistry.get_struct_spec(info)
+        open_types.pop()
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        groups: Mapping[str, tuple[str, ...]] = getattr(info.type, "help_groups", {})
+        fields = {field.name: described(field) for field in spec.fields}
+        if "command" in fields:  # a subcommand's options have no prefix, in their titles neither
+            kind = Annotated[fields["command"].type, tyro.conf.arg(name="")]
+            fields["command"] = replace(fields["command"], type=kind)
+        boxes = []
+        for title, names in groups.items():
+            box = type(title, (), {"help_members": tuple(fields.pop(name) for name in names)})
+            kind: Any = Annotated[box, tyro.conf.OmitArgPrefixes]
+            boxes.append(StructFieldSpec(name=title, type=kind, default=MISSING_NONPROP))
+
+        def make(**values: Any) -> Any:
+            for title in groups:
+                values |= values.pop(title)
+            return spec.instantiate(**values)
+
+        make.__doc__ = info.type.__doc__  # the description that the help begins with
+        nested = [field for field in fields.values() if is_dataclass(field.default)]
+        single = [field for field in fields.values() if not is_dataclass(field.default)]
+        return StructConstructorSpec(instantiate=make, fields=(*single, *boxes, *nested))
+
+    return registry
+
+
+def _mistyped(
+    commands: Any, args: Sequence[str], program: str, others: Sequence[str] = ()
+) -> str | None:
+    """Return an error message for an unknown subcommand, or None; it names the nearest."""
+    known = {part.__metadata__[0].name: part.__origin__ for part in get_args(commands)}
+    if not known or not args or args[0].startswith("-") or args[0] in others:
+        return None
+    if args[0] in known:
+        below = get_type_hints(known[args[0]], include_extras=True).get("command")
+        return _mistyped(below, args[1:], f"{program} {args[0]}") if below else None
+    names = [*known, *others]
+    near = difflib.get_close_matches(args[0], names, n=1, cutoff=0.6)
+    meant = f" Did you mean {near[0]}?" if near else ""
+    return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(names)}."
+
+
+def run_with_exit_codes(run: Callable[[], int]) -> int:
+    """Run a command, printing exceptions as messages and returning their exit codes."""
+    try:
+        return run()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return ExitCode.USAGE
+    except CommandExit as early:
+        print(early, file=sys.stderr)
+        return early.code
+    except KeyboardInterrupt:
+        interrupts.print_how_to_continue()
+        return ExitCode.FAILED
+    except Exception as error:
+        if isinstance(error, BrokenPipeError) and _reader_ended():
+            return ExitCode.FAILED
+        if (reason := system_failure(error)) is not None:
+            print(f"error: {reason}", file=sys.stderr)
+        else:  # a defect of the program: show where
+            traceback.print_exc()
+        return ExitCode.FAILED
+    finally:
+        _reader_ended()  # also after --help, which exits
+
+
+def _reader_ended() -> bool:
+    """Return True if nobody reads stdout any more, as behind `head`, and discard what is left."""
+    try:
+        number = sys.stdout.fileno()
+    except (AttributeError, OSError, ValueError):  # closed, or replaced by what is no file
+        return False
+    pipe = select.poll()
+    pipe.register(number, 0)
+    if not any(event & select.POLLERR for _, event in pipe.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+    return True
+
+
+def system_failure(error: BaseException) -> str | None:
+    """Return a one-line message for an error of the system (disk, permissions, memory), or None.
+
+    Libraries in C++ raise their own errors, with the system's reason in their text.
+    """
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, MemoryError):
+            return "not enough memory. Use smaller batches or a machine with more memory."
+        text = str(seen).replace("\n", " ")
+        for code in REFUSALS:
+            reason = os.strerror(code)
+            if (isinstance(seen, OSError) and seen.errno == code) or reason in text:
+                name = getattr(seen, "filename", None)
+                where = f"{name}: {reason}" if name else text[:300]
+                return f"{where}. {REFUSALS[code]}"
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
+_WRITABLE = "Choose a folder that can be written to. (--out)"
+_RUN_AGAIN = "Free space and run the same command again; complete files are kept."
+REFUSALS = {
+    errno.ENOSPC: _RUN_AGAIN,
+    errno.EDQUOT: _RUN_AGAIN,
+    errno.EFBIG: _RUN_AGAIN,
+    errno.EROFS: _WRITABLE,
+    errno.EACCES: _WRITABLE,
+    errno.EPERM: _WRITABLE,
+    errno.ENOTDIR: "A file is where a folder has to be: choose another path.",
+    errno.EISDIR: "A folder is where a file has to be: choose another path.",
+    errno.EEXIST: "The path exists already: choose another path.",
+    errno.ENAMETOOLONG: "Choose a shorter path.",
+    errno.ELOOP: "Links are not followed here: give the real path.",
+    errno.ENOENT: "Check the path.",
+    errno.EMFILE: "Raise the limit of open files (ulimit -n).",
+    errno.EBUSY: "A mount point cannot be replaced: choose a folder inside it.",
+    errno.EIO: "Check the disk.",
+}
+"""Errors of the system that a user can fix, and the fix."""

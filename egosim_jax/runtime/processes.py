@@ -1,0 +1,51 @@
+"""Calls of a function in worker processes that start without the parent's state."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from egosim_jax.runtime import interrupts
+
+T = TypeVar("T")
+THREADS = "OPENBLAS_NUM_THREADS"
+"""Variable that a library of linear algebra reads when it is imported."""
+
+
+def run_in_processes(
+    run: Callable[..., T], calls: Sequence[tuple[Any, ...]], *, workers: int
+) -> Iterator[tuple[int, T]]:
+    """Yield the number and the result of each call as it finishes.
+
+    After an error or Ctrl-C, calls that have not started are canceled. Raises `BrokenProcessPool`
+    if a worker process was killed.
+    """
+    context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
+    pool = ProcessPoolExecutor(max(1, min(workers, len(calls))), mp_context=context)
+    try:
+        with interrupts.not_inherited(), _one_thread_each():
+            tasks = {pool.submit(run, *call): number for number, call in enumerate(calls)}
+        for task in as_completed(tasks):
+            yield tasks[task], task.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Give processes that are started in this context one thread of linear algebra, if not set.
+
+    Two processes that share the cores by threads take twice as long.
+    """
+    if THREADS in os.environ:
+        yield
+        return
+    os.environ[THREADS] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[THREADS]

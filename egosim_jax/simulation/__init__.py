@@ -1,0 +1,1 @@
+"""The closed loop over a state, and its inputs: episodes and actions."""

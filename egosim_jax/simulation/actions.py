@@ -1,0 +1,236 @@
+"""Actions: their checks in a scene, and their files; `simulation/episode.py` has the conventions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from egosim_jax.geometry import invert, pixels_of, transform
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.untrusted.bounded import quote, read_json
+from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.state.depth import DEPTH_M
+from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
+
+MAX_SPEED_M_S = 20.0
+"""Fastest camera that is accepted, in meters per second."""
+ARRAYS = ("world_from_camera", "intrinsics_px", "joints_m")
+"""Arrays of a file of an action."""
+MAX_JSON_BYTES = 256 << 20
+"""Largest .json file of an action in bytes."""
+_FINGERS = np.arange(1, 21).reshape(5, 4)
+ORDERS = {
+    "MANO's (index, middle, little, ring, thumb, then the tips)": np.array(
+        [0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20]
+    ),
+    "from tip to knuckle": np.array([0, *_FINGERS[:, ::-1].ravel()]),
+    "from tip to knuckle with the wrist last": np.array([20, *(_FINGERS[:, ::-1] - 1).ravel()]),
+    "with the wrist last": np.array([20, *range(20)]),
+    "by joint, each over all fingers": np.array([0, *np.arange(1, 21).reshape(4, 5).T.ravel()]),
+}
+"""Other orders of a human hand's joints in use, as indices that bring them into ours."""
+UNEQUAL = 1.4
+"""Median ratio of the lengths of a gripper's fingers that is too large to be one in our order."""
+SHORTER = 0.75
+"""Bones shorter by this factor under another order mean that the joints are in that order."""
+
+
+def check_action(action: Action, *, state: SceneState, fps: int, continued: bool = False) -> None:
+    """Raise `InputError` for too fast a camera, joints in another order, a scene out of sight.
+
+    The first camera must see the scene; of an action that is `continued` the last one, too, which
+    is the first of the next action.
+    """
+    _check_speed(action.cameras, fps)
+    check_order(action)
+    _check_scene(state, action.cameras, 0)
+    if continued:
+        _check_scene(state, action.cameras, -1)
+
+
+def _check_speed(cameras: Cameras, fps: int) -> None:
+    centers = cameras.world_from_camera[:, :3, 3]
+    speed = np.linalg.norm(np.diff(centers, axis=0), axis=1) * fps
+    if len(speed) and speed.max() > MAX_SPEED_M_S:
+        frame = int(speed.argmax())
+        raise InputError(
+            f"the camera moves at {speed.max():.4g} m/s from frame {frame} to {frame + 1}, more "
+            f"than {MAX_SPEED_M_S:g} m/s: world_from_camera must be in meters."
+        )
+
+
+def check_order(action: Action) -> None:
+    """Raise `InputError` if the joints of the hands are plausible only in another order."""
+    hands = action.joints_m[np.isfinite(action.joints_m).all(axis=(2, 3))]
+    if not len(hands):
+        return
+    if action.kind == "robot":
+        sides = np.linalg.norm(hands[:, 1:] - hands[:, :1], axis=-1)
+        ratio = np.median(sides.max(axis=1) / np.maximum(sides.min(axis=1), 1e-9))
+        if ratio > UNEQUAL:
+            raise InputError(
+                f"the fingers of a gripper differ in length by a factor of {ratio:.3g} "
+                f"(median), more than {UNEQUAL:g}: its joints must be in the order wrist, thumb "
+                "tip, index tip."
+            )
+        return
+    if _is_hand(hands):  # whose bones a fist may have shorter in another order
+        return
+    lengths = {name: _bone_length(hands[:, order]) for name, order in ORDERS.items()}
+    name = min(lengths, key=lambda name: lengths[name])
+    if lengths[name] < SHORTER * _bone_length(hands):
+        raise InputError(
+            f"the joints of the hands seem to be in the order {name}: the bones are "
+            f"{lengths[name] / _bone_length(hands):.2f} times as long in it. The order must be "
+            "wrist, then thumb, index, middle, ring and little finger, each from knuckle to tip; "
+            f"reorder them by joints_m[:, :, {ORDERS[name].tolist()}]."
+        )
+
+
+def _bones(hands: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, "n 5 4"]:
+    """Return the lengths of each finger's bones, from the wrist outwards."""
+    outer = np.arange(1, JOINTS["human"])
+    inner = np.where(outer % 4 == 1, 0, outer - 1)
+    return np.linalg.norm(hands[:, outer] - hands[:, inner], axis=-1).reshape(-1, 5, 4)
+
+
+def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
+    return float(_bones(hands).sum())
+
+
+def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
+    """Return True if bones are in proportion: those of the palm alike, and by far the longest.
+
+    Fingers but the thumb are looked at, by their medians; their last bones are shorter than the
+    first ones. It holds for any pose, however the fingers are bent.
+    """
+    palm, first, _, last = np.median(_bones(hands)[:, 1:], axis=0).T
+    alike = palm.min() > 0.75 * palm.mean() and palm.max() < 1.33 * palm.mean()
+    return bool(alike and (palm > 1.4 * first).all() and first.sum() > last.sum())
+
+
+def _check_scene(state: SceneState, cameras: Cameras, frame: int) -> None:
+    """Raise `InputError` unless the camera of a frame sees points at distances of meters."""
+    local = transform(invert(cameras.world_from_camera[frame]), state.points_m.astype(float))
+    inside = pixels_of(cameras, local)[2]
+    which = "last" if frame else "first"
+    if not inside.any():
+        raise InputError(
+            f"its {which} camera sees none of the {len(local)} points of the state: state and "
+            "cameras must be in one world frame (OpenCV axes, world_from_camera), in meters."
+        )
+    median = float(np.median(local[inside, 2]))
+    if not DEPTH_M[0] <= median <= DEPTH_M[1]:
+        raise InputError(
+            f"the points that its {which} camera sees are {median:.4g} m away (median): it must be "
+            f"from {DEPTH_M[0]} to {DEPTH_M[1]} m. Convert the state to meters."
+        )
+
+
+def save_action(path: Path, action: Action) -> None:
+    """Write cameras and joints of an action to an .npz file."""
+    cameras = action.cameras
+    with atomic_write(path) as temporary:
+        np.savez(
+            temporary,
+            world_from_camera=np.ascontiguousarray(cameras.world_from_camera, float),
+            intrinsics_px=np.ascontiguousarray(cameras.intrinsics_px, float),
+            joints_m=np.ascontiguousarray(action.joints_m),
+        )
+
+
+def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -> Action:
+    """Read an action's cameras and joints; `size` is height and width of its pictures."""
+    names = {"world_from_camera": "float64", "intrinsics_px": "float64"}
+    arrays = read_arrays(path, names, others=("joints_m",))
+    return Action(
+        cameras=Cameras(
+            world_from_camera=arrays["world_from_camera"],
+            intrinsics_px=arrays["intrinsics_px"],
+            height=size[0],
+            width=size[1],
+        ),
+        joints_m=arrays["joints_m"],
+        kind=kind,
+        prompt=prompt,
+    )
+
+
+def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> Action:
+    """Return the action of a user's .npz or .json file (`egosim episode make`).
+
+    `prompt` replaces the file's. The number of joints gives the kind of hands. Raises `InputError`
+    naming the file.
+    """
+    values: Mapping[str, Any]
+    if path.suffix == ".json":
+        values = _read_json(path)
+    elif path.suffix == ".npz":
+        values = read_arrays(path, {}, others=ARRAYS, packed=True)
+    else:
+        raise InputError(f"{path}: actions are read from .npz and .json files. (--actions)")
+    written = values.get("prompt")
+    if not isinstance(written, str | None):
+        raise InputError(f"{path}: prompt is {quote(written)}: it must be text.")
+    prompt = prompt or written
+    if not prompt:
+        raise InputError(f"{path} has no prompt: give one per clip. (--prompts)")
+    joints = np.asarray(values["joints_m"])
+    kinds: dict[int, Kind] = {count: kind for kind, count in JOINTS.items()}
+    try:
+        if joints.ndim != 4 or joints.shape[2] not in kinds:
+            raise InputError(
+                f"joints_m has shape {joints.shape}: it must be (frames, hands, joints, 3), with "
+                "21 joints of a human hand or 3 of a gripper."
+            )
+        return Action(
+            cameras=Cameras(
+                world_from_camera=np.asarray(values["world_from_camera"], float),
+                intrinsics_px=np.asarray(values["intrinsics_px"], float),
+                height=height,
+                width=width,
+            ),
+            joints_m=joints.astype(float),
+            kind=kinds[joints.shape[2]],
+            prompt=prompt,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return the arrays and the prompt of a .json file; a hand that is null has joints of NaN."""
+    written = read_json(path, limit=MAX_JSON_BYTES)
+    if not isinstance(written, dict) or not written.keys() <= {*ARRAYS, "prompt"}:
+        raise InputError(f"{path}: must be an object of {', '.join(ARRAYS)} and prompt.")
+    values: dict[str, Any] = {"prompt": written.get("prompt")}
+    for name in ARRAYS:
+        rows = written.get(name)
+        if name == "joints_m" and isinstance(rows, list):
+            rows = _fill_missing(rows)
+        try:
+            values[name] = np.array(rows, float)
+        except (ValueError, TypeError, OverflowError):
+            raise InputError(
+                f"{path}: {name} is {quote(rows)}, not an array of numbers: all rows must have "
+                "equal lengths."
+            ) from None
+    return values
+
+
+def _fill_missing(frames: list[Any]) -> list[Any]:
+    """Return frames of hands with null replaced by as many NaN joints as the others have.
+
+    Where all are null, they are human hands.
+    """
+    lists = [hands for hands in frames if isinstance(hands, list)]
+    given = [hand for hands in lists for hand in hands if isinstance(hand, list)]
+    nan = [[float("nan")] * 3] * (len(given[0]) if given else JOINTS["human"])
+    return [
+        [nan if hand is None else hand for hand in hands] if isinstance(hands, list) else hands
+        for hands in frames
+    ]

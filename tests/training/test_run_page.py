@@ -1,0 +1,105 @@
+"""The page of a training run, of folders as `train` writes them."""
+
+import base64
+import io
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egosim_jax.cli.view import View
+from egosim_jax.train.run_page import MAX_POINTS, Stage, draw_curves, stages_of, write_page
+from egosim_jax.types import InputError
+from tests.training.finished import write_stage
+
+
+def inline(page: str, kind: str) -> list[bytes]:
+    """Return the decoded contents of the inline data of a kind."""
+    return [base64.b64decode(text) for text in re.findall(f'"data:{kind};base64,([^"]*)"', page)]
+
+
+def test_the_page_has_curves_samples_times_and_settings(tmp_path):
+    run = write_stage(tmp_path / "run", samples=(20, 40))
+    page = write_page(run).read_text()
+    assert "<h2>run: step 40 of 40</h2>" in page
+    (curves,) = inline(page, r"image/svg\+xml")
+    assert curves.count(b'id="axes_') == 3  # loss with that of validations, lr, grad_norm
+    assert [Image.open(io.BytesIO(sheet)).size for sheet in inline(page, "image/jpeg")] == [
+        (192, 80)
+    ] * 2
+    assert inline(page, "video/mp4") == [(run / "samples" / "step_000040.mp4").read_bytes()]
+    assert page.index("step 40</p>") < page.index("step 20</p>")
+    for name, value in {
+        "loss": "0.05",
+        "validation_loss": "0.0731707",
+        "step_time_s": "0.25",
+        "compiling": "6.0 (75%)",
+        "training.batch_size": "8",
+        "packages.jax": "0.10.2",
+    }.items():
+        assert f"<tr><th>{name}</th><td>{value}</td></tr>" in page
+
+
+def test_the_page_loads_nothing_and_escapes_every_text(tmp_path):
+    page = write_page(write_stage(tmp_path / "<b>run", samples=(40,))).read_text()
+    assert "default-src 'none'" in page
+    assert not re.search(r"https?:|<script|<b>|<link|@import", page)
+    assert "&lt;script&gt;alert(1)" in page
+    assert "&lt;b&gt;run" in page
+
+
+def test_stages_are_in_the_order_of_the_recipe(tmp_path):
+    for name in ("denoiser", "vae"):
+        write_stage(tmp_path / name)
+    assert [stage.folder.name for stage in stages_of(tmp_path)] == ["denoiser", "vae"]
+    (tmp_path / "config.json").write_text('{"config": "debug", "vae": {}, "denoiser": {}}')
+    page = write_page(tmp_path).read_text()
+    assert re.findall("<h2>([a-z]+):", page) == ["vae", "denoiser"]
+    assert "Settings of the whole run" in page
+
+
+def test_the_scores_of_an_evaluation_are_no_training(tmp_path):
+    write_stage(tmp_path / "denoiser")
+    for folder in (tmp_path / "generated", tmp_path):
+        folder.mkdir(exist_ok=True)
+        (folder / "metrics.jsonl").write_text('{"video_id": "a", "generated": {"psnr": 20.0}}\n')
+        (folder / "config.json").write_text('{"model": {}, "seed": 0}')
+    assert [stage.folder.name for stage in stages_of(tmp_path)] == ["denoiser"]
+
+
+def test_a_long_log_is_drawn_by_means(tmp_path):
+    steps = np.arange(1, 10 * MAX_POINTS + 1)
+    short = draw_curves({"loss": {"training": (steps[:MAX_POINTS], np.sin(steps[:MAX_POINTS]))}})
+    long = draw_curves({"loss": {"training": (steps, np.sin(steps))}})
+    assert len(long) < 1.5 * len(short)
+
+
+def test_values_that_are_not_finite_are_drawn_around(tmp_path):
+    steps = np.arange(5)
+    curves = {"loss": {"training": (steps, np.array([1, np.nan, np.inf, 200, 1.0]))}}
+    assert b'id="axes_1"' in draw_curves(curves)
+
+
+def test_a_log_that_is_being_written_and_one_of_earlier_names_are_read(tmp_path):
+    run = write_stage(tmp_path / "run")
+    with (run / "metrics.jsonl").open("a") as log:
+        log.write('{"step": 50, "rate": 0.5, "gradient_norm": 2.0}\n{"step": 60, "los')
+    metrics = Stage(run).metrics
+    assert metrics["lr"][1][-1] == 0.5
+    assert metrics["grad_norm"][0][-1] == 50
+    assert metrics["loss"][0][-1] == 40
+
+
+def test_view_writes_the_page_of_a_training(tmp_path, capsys):
+    run = write_stage(tmp_path / "run")
+    assert View(path=run, out=tmp_path / "mine.html").run() == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "mine.html")
+    assert not (run / "index.html").exists()
+    View(path=run).run()
+    assert (run / "index.html").read_text() == (tmp_path / "mine.html").read_text()
+
+
+def test_a_folder_without_a_training_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"needs metrics\.jsonl"):
+        write_page(tmp_path)

@@ -1,0 +1,59 @@
+"""Agreement of rankings against SciPy, the definition of MMRV, and cases known by hand."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from egosim_jax.evaluation.metrics.rank_correlation import agreement, mmrv, pearson, spearman
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_correlations_equal_scipys_with_ties(seed):
+    rng = np.random.default_rng(seed)
+    values, reference = rng.integers(0, 6, (2, 9)) / 5
+    assert pearson(values, reference) == pytest.approx(scipy.stats.pearsonr(values, reference)[0])
+    assert spearman(values, reference) == pytest.approx(scipy.stats.spearmanr(values, reference)[0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mmrv_equals_its_definition(seed):
+    s, r = np.random.default_rng(seed).integers(0, 6, (2, 7)) / 5
+    violations = [
+        max(abs(r[i] - r[j]) * ((s[i] < s[j]) != (r[i] < r[j])) for j in range(7)) for i in range(7)
+    ]
+    assert mmrv(s, r) == pytest.approx(np.mean(violations))
+
+
+def test_mmrv_is_zero_for_equal_rankings_and_large_for_reversed_ones():
+    reference = np.array([0.1, 0.5, 0.9])
+    assert mmrv(np.array([0.4, 0.45, 0.5]), reference) == 0
+    assert mmrv(np.array([0.5, 0.45, 0.4]), reference) == pytest.approx((0.8 + 0.4 + 0.8) / 3)
+
+
+def test_constant_success_has_no_correlation():
+    assert np.isnan(pearson(np.ones(4), np.arange(4.0)))
+    assert np.isnan(spearman(np.ones(4), np.arange(4.0)))
+
+
+def test_intervals_contain_the_value_and_shrink_with_scenes():
+    rng = np.random.default_rng(0)
+    chance = np.linspace(0.05, 0.95, 8)[:, None]
+
+    def found(scenes):
+        true = (rng.random((8, scenes)) < chance).astype(float)
+        generated = np.where(rng.random((8, scenes)) < 0.8, true, 1 - true)
+        return agreement(generated, true, resamples=300)
+
+    few, many = found(12), found(200)
+    for result in (few, many):
+        for value in result.values():
+            assert value["low"] <= value["mean"] <= value["high"] or value is result["mmrv"]
+    gap = {name: value["high"] - value["low"] for name, value in few.items()}
+    assert many["pearson"]["high"] - many["pearson"]["low"] < gap["pearson"]
+
+
+def test_perfect_agreement_is_one_and_zero():
+    true = (np.random.default_rng(0).random((8, 24)) < np.linspace(0, 1, 8)[:, None]).astype(float)
+    result = agreement(true, true, resamples=100)
+    assert result["pearson"]["mean"] == result["spearman"]["mean"] == pytest.approx(1)
+    assert result["mmrv"] == {"mean": 0, "low": 0, "high": 0}

@@ -1,0 +1,76 @@
+"""Summaries of scores."""
+
+import numpy as np
+import pytest
+from scipy.stats import bootstrap
+
+from egosim_jax.evaluation.metrics.report import (
+    mean_and_spread,
+    paired_difference,
+    print_table,
+    summarize,
+)
+
+
+def test_a_summary_is_mean_and_sample_deviation():
+    scores = [{"psnr": 20.0, "ssim": 0.5}, {"psnr": 24.0, "ssim": 0.9}]
+    summary = summarize(scores, ("psnr", "ssim"))
+    assert (summary["psnr"]["mean"], summary["ssim"]["mean"]) == (22.0, pytest.approx(0.7))
+    # Two values d apart deviate by d / sqrt(2).
+    assert summary["psnr"]["spread"] == pytest.approx(4 / 2**0.5)
+    assert summary["ssim"]["spread"] == pytest.approx(0.4 / 2**0.5)
+
+
+def test_a_single_clip_has_no_spread():
+    assert summarize([{"psnr": 20.0}], ("psnr",))["psnr"]["spread"] == 0.0
+
+
+def test_what_is_not_finite_is_ignored():
+    assert mean_and_spread([1.0, np.nan, 3.0, np.inf]) == (2.0, pytest.approx(2**0.5))
+    assert np.isnan(mean_and_spread([np.nan])[0])
+
+
+def test_a_paired_difference_has_the_interval_of_scipys_bootstrap():
+    rng = np.random.default_rng(1)
+    pairs = rng.normal(1.0, 2.0, 30)
+    found = paired_difference([*pairs, np.nan], [0.0] * 31)
+    expected = bootstrap(
+        (pairs,), np.mean, n_resamples=10_000, method="percentile", rng=np.random.default_rng(2)
+    ).confidence_interval
+    assert found["mean"] == pytest.approx(pairs.mean())
+    # Quantiles of 10,000 draws differ by about a hundredth of the interval.
+    assert (found["low"], found["high"]) == pytest.approx((expected.low, expected.high), abs=0.03)
+
+
+def test_pairs_share_what_varies_between_clips():
+    clips = np.random.default_rng(0).normal(20.0, 5.0, 12)
+    difference = paired_difference(list(clips + 0.5), list(clips))
+    assert (difference["low"], difference["high"]) == pytest.approx((0.5, 0.5))
+
+
+def test_a_single_pair_excludes_nothing():
+    assert paired_difference([3.0], [2.0]) == {"mean": 1.0, "low": -np.inf, "high": np.inf}
+
+
+def test_an_interval_is_in_brackets(capsys):
+    row = {"psnr": {"mean": -1.0, "low": -1.5, "high": -0.5}}
+    print_table("", {"without prior": row}, {"psnr": ("PSNR dB", "{:.2f}")})
+    assert "-1.00 [-1.50, -0.50]" in capsys.readouterr().out
+
+
+def test_a_table_has_mean_and_spreads_and_empty_cells(capsys):
+    measures = {"psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.3f}")}
+    full = {"psnr": {"mean": 20.0, "spread": 1.0, "spread_over_seeds": 0.5}}
+    print_table("method", {"full": full}, measures, title="human")
+    row = next(line for line in capsys.readouterr().out.splitlines() if "full" in line)
+    assert [cell.strip() for cell in row.split("│")[1:-1]] == ["full", "20.00 ± 1.00 (± 0.50)", ""]
+
+
+def test_missing_values_are_counted(capsys):
+    scores = [{"psnr": value} for value in (20.0, float("nan"), 22.0)]
+    summary = summarize(scores, ["psnr"])
+    assert (summary["psnr"]["known"], summary["psnr"]["of"]) == (2, 3)
+    print_table("", {"ours": summary}, {"psnr": ("PSNR", "{:.1f}")})
+    assert "21.0 ± 1.4 (2 of 3)" in capsys.readouterr().out
+    difference = paired_difference([1.0, 2.0, float("nan")], [0.0, 0.0, 0.0])
+    assert (difference["known"], difference["of"]) == (2, 3)

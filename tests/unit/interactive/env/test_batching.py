@@ -1,0 +1,145 @@
+"""Clips of several threads in one program."""
+
+import functools
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.batching import Batcher
+from egosim_jax.rendering import reference
+from egosim_jax.types import InputError
+from tests.painted import painted
+
+
+class Counting:
+    """Generator that notes its batches; a clip of seed 13 fails."""
+
+    renderer = reference
+
+    def __init__(self):
+        self.batches, self.held = [], threading.Event()
+        self.held.set()
+
+    def condition(self, view, action, first_frame):
+        return action
+
+    def groups(self, triplets, seeds):
+        self.held.wait()
+        self.batches.append(list(seeds))
+        if 13 in seeds:
+            raise FloatingPointError("clip 13")
+        frames = np.tile(np.array(seeds, np.uint8)[:, None, None, None, None], (1, 2, 32, 48, 3))
+        yield frames[:, :1]
+        if 14 in seeds:
+            raise FloatingPointError("clip 14")
+        yield frames[:, 1:]
+
+    def fingerprint(self):
+        return "counting"
+
+    def __call__(self, *_):
+        raise AssertionError
+
+
+@functools.cache
+def inputs():
+    """View, action and first frame of a small scene."""
+    actions = ActionSpec()
+    start = painted().start(3, actions)
+    action, _ = actions.to_action(actions.rest[None], camera=start.camera, prompt="rest")
+    return reference.render(start.state, start.camera, point_px=2), action, start.first_frame
+
+
+def ask(batcher, seed):
+    with batcher.announced():
+        time.sleep(0.02)
+        return int(batcher(*inputs(), seed)[0, 0, 0, 0])
+
+
+def run(batcher, seeds):
+    with ThreadPoolExecutor(len(seeds)) as threads:
+        return [future for future in [threads.submit(ask, batcher, seed) for seed in seeds]]
+
+
+@pytest.fixture
+def generator():
+    inputs()
+    return Counting()
+
+
+def test_callers_that_announced_themselves_share_a_program(generator):
+    batcher = Batcher(generator, most=4, wait_s=5.0)
+    assert [f.result() for f in run(batcher, [1, 2, 3, 4])] == [1, 2, 3, 4]
+    assert [sorted(batch) for batch in generator.batches] == [[1, 2, 3, 4]]
+    batcher.close()
+
+
+def test_the_largest_program_that_is_filled_runs(generator):
+    batcher = Batcher(generator, most=8, wait_s=0.0)
+    generator.held.clear()
+    first = threading.Thread(target=ask, args=(batcher, 0))
+    first.start()
+    time.sleep(0.1)
+    with ThreadPoolExecutor(7) as threads:
+        for seed in range(1, 8):
+            threads.submit(ask, batcher, seed)
+        time.sleep(0.3)
+        generator.held.set()
+    first.join()
+    assert [len(batch) for batch in generator.batches] == [1, 4, 2, 1]
+    batcher.close()
+
+
+def test_a_batch_is_padded_to_the_devices_only(generator):
+    batcher = Batcher(generator, most=4, unit=2, wait_s=0.0)
+    assert batcher.sizes == [2, 4]
+    assert ask(batcher, 5) == 5
+    assert generator.batches == [[5, 5]]
+    with pytest.raises(InputError, match="a multiple of 2"):
+        Batcher(generator, most=3, unit=2)
+    batcher.close()
+
+
+def test_one_failing_clip_does_not_fail_the_others(generator):
+    batcher = Batcher(generator, most=2, wait_s=5.0)
+    found = run(batcher, [1, 13])
+    assert found[0].result() == 1
+    with pytest.raises(FloatingPointError, match="clip 13"):
+        found[1].result()
+    batcher.close()
+
+
+def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator):
+    batcher = Batcher(generator, most=2, wait_s=5.0)
+
+    def stream(seed):
+        with batcher.announced():
+            time.sleep(0.02)
+            return [int(frames[0, 0, 0, 0]) for frames in batcher.stream(*inputs(), seed)]
+
+    with ThreadPoolExecutor(2) as threads:
+        good, bad = threads.submit(stream, 1), threads.submit(stream, 14)
+        assert good.result(timeout=10) == [1, 1]
+        with pytest.raises(FloatingPointError, match="clip 14"):
+            bad.result(timeout=10)
+    assert [len(batch) for batch in generator.batches] == [2, 1, 1]
+    batcher.close()
+
+
+def test_a_caller_that_fails_before_is_not_waited_for(generator):
+    batcher = Batcher(generator, most=2, wait_s=60.0)
+
+    def fail():
+        with batcher.announced():
+            raise InputError("no view")
+
+    with ThreadPoolExecutor(2) as threads:
+        good, bad = threads.submit(ask, batcher, 1), threads.submit(fail)
+        assert good.result(timeout=10) == 1
+        with pytest.raises(InputError):
+            bad.result()
+    batcher.close()

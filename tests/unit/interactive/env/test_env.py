@@ -1,0 +1,200 @@
+"""Gymnasium environments of a painted world: no model, no compilation."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from egosim_jax.interactive import env as egosim
+from egosim_jax.interactive.env import rewards
+from egosim_jax.interactive.env.action_spec import LAYOUTS, ActionSpec
+from egosim_jax.interactive.env.rewards import GoalImage, MoveObject
+from egosim_jax.interactive.env.start import Start
+from egosim_jax.interactive.env.vector import WorldVectorEnv
+from egosim_jax.types import InputError
+from tests.painted import VIDEO, painted
+
+
+def make(**options):
+    return gymnasium.make(egosim.ID, backend=painted(), disable_env_checker=True, **options)
+
+
+def ahead(env, rows=4):
+    """Rows that move the hand away from the wearer."""
+    env = env.unwrapped
+    return env.actions.rest + np.linspace(0, 0.1, rows + 1)[1:, None] * np.eye(7)[1]
+
+
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")
+@pytest.mark.parametrize(
+    "layout",
+    [n if n == "wrist" else pytest.param(n, marks=pytest.mark.slow) for n in LAYOUTS],
+)
+def test_gymnasiums_checker_passes(layout):
+    actions = ActionSpec(layout=layout, camera=layout == "gripper")
+    observe = ("frames", "depth", "keypoints", "state")
+    env = make(actions=actions, observe=observe, render_mode="rgb_array")
+    check_env(env.unwrapped)
+
+
+def test_equal_seeds_and_actions_give_equal_states():
+    infos = []
+    for _ in range(2):
+        env = make()
+        env.reset(seed=3)
+        infos.append(env.unwrapped.chunk_step(ahead(env))[-1])
+    assert infos[0]["state_sha256"] == infos[1]["state_sha256"]
+    assert infos[0]["chunk"] == 1
+
+
+def test_a_short_chunk_is_padded_and_says_so():
+    env = make()
+    env.reset(seed=3)
+    _, _, _, _, info = env.unwrapped.chunk_step(ahead(env, rows=1))
+    assert info["padded_frames"] == VIDEO.frames - 2
+    held, _, _, _, _ = env.unwrapped.chunk_step(ahead(env, rows=4))
+    assert held["row"] == pytest.approx(ahead(env)[-1])
+
+
+def test_a_plain_step_moves_in_a_straight_line():
+    plain, chunked = make(), make()
+    target = ahead(plain)[-1]
+    for env in (plain, chunked):
+        env.reset(seed=3)
+    a = plain.step(target)[0]
+    b = chunked.unwrapped.chunk_step(ahead(chunked))[0]
+    np.testing.assert_array_equal(a["frames"], b["frames"])
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (np.full((1, 7), np.nan), "nan as right x: all must be finite"),
+        (np.zeros((1, 6)), r"shape \(1, 6\).*must be \(1 to 4, 7\)"),
+        (np.zeros((9, 7)), r"must be \(1 to 4, 7\)"),
+        (np.full((1, 7), 300.0), "300 as right x: it must be from -0.35 to 0.35"),
+    ],
+)
+def test_invalid_rows_are_refused_and_change_nothing(rows, message):
+    env = make()
+    env.reset(seed=3)
+    before = env.unwrapped.running.info()
+    with pytest.raises(InputError, match=message):
+        env.unwrapped.chunk_step(rows)
+    assert env.unwrapped.running.info() == before
+
+
+def test_a_start_is_saved_and_loaded_whole(tmp_path):
+    env = make()
+    env.reset(seed=3)
+    env.unwrapped.chunk_step(ahead(env))
+    env.unwrapped.running.now.save(tmp_path / "start")
+    again = make()
+    again.reset(options={"start": Start.load(tmp_path / "start")})
+    for one in (env, again):
+        one.unwrapped.chunk_step(ahead(env))
+    np.testing.assert_array_equal(env.unwrapped.running.frames(), again.unwrapped.running.frames())
+
+
+def test_a_past_too_long_to_be_read_is_not_saved(tmp_path):
+    env = make().unwrapped
+    env.reset(seed=3)
+    action = env.running.chunk(ahead(env)).action
+    with pytest.raises(InputError, match="1001 past actions"):
+        replace(env.running.now, past=(action,) * 1001).save(tmp_path / "start")
+    assert not (tmp_path / "start").exists()
+
+
+def test_moving_an_object_is_rewarded_by_its_distance():
+    env = make(reward=MoveObject(number=10, offset_m=(0.0, 0.0, 0.0)))
+    env.reset(seed=3)
+    _, reward, terminated, _, info = env.unwrapped.chunk_step(ahead(env))
+    assert (reward, terminated, info["success"]) == (0.0, True, True)
+
+
+def test_a_goal_image_is_reached_by_its_own_frame(monkeypatch):
+    env = make()
+    env.reset(seed=3)
+    goal = env.unwrapped.chunk_step(ahead(env))[0]["frames"][-1]
+    monkeypatch.setattr(rewards, "_lpips", lambda a, b: float(np.abs(a / 255 - b / 255).mean()))
+    near = make(reward=GoalImage(image=goal, threshold=0.001))
+    near.reset(seed=3)
+    assert near.unwrapped.chunk_step(ahead(env))[4]["success"]
+    far = make(reward=GoalImage(image=255 - goal))
+    far.reset(seed=3)
+    _, reward, terminated, _, _ = far.unwrapped.chunk_step(ahead(env))
+    assert reward < -0.1
+    assert not terminated
+
+
+@pytest.mark.slow
+def test_lpips_to_the_same_image_is_zero():
+    image = np.random.default_rng(0).integers(0, 255, (1, 64, 64, 3)).astype(np.uint8)
+    assert rewards._lpips(image, image) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_vector_environment_equals_its_episodes():
+    envs = gymnasium.make_vec(egosim.ID, num_envs=2, backend=painted())
+    assert isinstance(envs, WorldVectorEnv)
+    envs.reset(seed=3)
+    env = make()
+    rows = ahead(env)
+    observed, _, _, _, infos = envs.chunk_step(np.stack([rows, rows]))
+    assert observed in envs.observation_space
+    for number in range(2):
+        env.reset(seed=3 + number)
+        single, _, _, _, info = env.unwrapped.chunk_step(rows)
+        np.testing.assert_array_equal(observed["frames"][number], single["frames"])
+        assert infos["state_sha256"][number] == info["state_sha256"]
+
+
+def test_an_ended_episode_must_be_reset_alone():
+    envs = WorldVectorEnv(painted(), 2, max_chunks=1)
+    envs.reset(seed=0)
+    rows = np.stack([envs.actions.rest[None]] * 2)
+    assert envs.chunk_step(rows)[3].all()
+    with pytest.raises(InputError, match="Episode 0 has ended"):
+        envs.chunk_step(rows)
+    envs.reset(seed=5, options={"reset_mask": np.array([True, True])})
+    envs.chunk_step(rows)
+
+
+def test_a_refused_action_of_one_episode_changes_none():
+    envs = WorldVectorEnv(painted(), 2, actions=ActionSpec(camera=True, camera_reach=(5.0, 1.0)))
+    envs.reset(seed=0)
+    rows = np.stack([envs.actions.rest[None]] * 2)
+    rows[1, 0, 7] = 4.0  # meters in one frame
+    with pytest.raises(InputError, match="camera moves at"):
+        envs.chunk_step(np.repeat(rows, 4, axis=1) * 1.0)
+    assert [running.chunks for running in envs.running] == [0, 0]
+
+
+def test_a_refused_start_of_one_episode_begins_none():
+    envs = WorldVectorEnv(painted(), 2)
+    envs.reset(seed=3)
+    before = [running.start.seed for running in envs.running]
+    with pytest.raises(InputError, match="nonsense"):
+        envs.reset(seed=8, options={"starts": [{}, {"nonsense": 1}]})
+    assert [running.start.seed for running in envs.running] == before
+
+
+def test_a_seeded_vector_environment_repeats_its_later_resets():
+    seeds = []
+    for _ in range(2):
+        envs = WorldVectorEnv(painted(), 2)
+        envs.reset(seed=np.int64(3))
+        envs.reset(options={"reset_mask": np.array([False, True])})
+        seeds.append([running.start.seed for running in envs.running])
+    assert seeds[0] == seeds[1]
+    assert seeds[0][0] == 3
+
+
+@pytest.mark.parametrize("row", [np.full(7, 9.0), np.full(7, np.nan), np.zeros(63)])
+def test_a_start_with_a_row_of_other_actions_is_refused(row):
+    env = make()
+    start = painted().start(3, ActionSpec())
+    env.reset(options={"start": replace(start, row=ActionSpec().rest)})
+    with pytest.raises(InputError, match="row of the start"):
+        env.reset(options={"start": replace(start, row=row)})

@@ -1,0 +1,150 @@
+"""The true tabletop world as an environment."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.interactive.env import ActionSpec, Start, true_world
+from egosim_jax.interactive.env.chunks import make_chunk
+from egosim_jax.interactive.env.placed import PlacedAction, with_places
+from egosim_jax.interactive.env.rewards import MoveObject
+from egosim_jax.interactive.env.single import WorldEnv
+from egosim_jax.interactive.env.true_world import TrueWorld
+from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.worlds.tabletop import make_scripts
+from egosim_jax.worlds.tabletop.policies import POLICIES
+
+VIDEO = VideoSpec(frames=17, height=8, width=16, fps=8)
+JOINTS = ActionSpec(
+    layout="keypoints", workspace_m=((-0.6, -0.4, -0.1), (0.6, 0.8, 0.6)), sides=("right",)
+)
+WIDE = replace(JOINTS, workspace_m=((-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)))
+
+
+def carry():
+    """Seed, script, rows and task of a scene in which a body is carried."""
+    for seed in range(20):
+        script = next(make_scripts(seed, spec=VIDEO))
+        if script.intent.verb == "carry":
+            break
+    joints = POLICIES[0].plan(script, np.random.default_rng(0))
+    body = script.scene.body(script.intent.name)
+    offset = script.intent.goal_m - body.world_from_body[:3, 3]
+    number = script.scene.number(script.intent.name)
+    return seed, joints.reshape(VIDEO.frames, -1), MoveObject(number=number, offset_m=tuple(offset))
+
+
+def test_an_exact_policy_succeeds_exactly_and_a_resting_one_does_not():
+    seed, rows, task = carry()
+    world = TrueWorld(video=VIDEO)
+    env = WorldEnv(world, actions=JOINTS, reward=task)
+    start = replace(world.start(seed, JOINTS), row=rows[0])
+    env.reset(options={"start": start})
+    _, reward, terminated, _, info = env.chunk_step(rows[1:])
+    assert (terminated, info["success"]) == (True, True)
+    assert reward > -0.005  # the true world lets it down where the hand opens
+    env.reset(options={"start": start})
+    _, reward, terminated, _, info = env.chunk_step(rows[:1])
+    assert not info["success"]
+    assert reward == pytest.approx(-np.linalg.norm(task.offset_m))
+
+
+@pytest.mark.slow
+def test_a_start_of_the_past_continues_to_the_same_state():
+    seed, rows, _ = carry()
+    world = TrueWorld(video=VIDEO)
+    hashes = []
+    for number in range(2):
+        env = WorldEnv(world if number == 0 else TrueWorld(video=VIDEO), actions=JOINTS)
+        if number == 0:
+            env.reset(options={"start": replace(world.start(seed, JOINTS), row=rows[0])})
+            env.chunk_step(rows[1:])
+            middle = env.running.now
+        else:
+            env.reset(options={"start": middle})
+        hashes.append(env.chunk_step(rows[::-1][:4])[-1]["state_sha256"])
+    assert hashes[0] == hashes[1]
+
+
+def follow(start, *paths):
+    """The start after some chunks, and the last chunk; nothing is filmed."""
+    for rows in paths:
+        chunk = make_chunk(WIDE, rows, start=start, frames=VIDEO.frames, hide=True)
+        start = start.after(start.state, chunk.rows[-1], chunk.action)
+    return start, chunk
+
+
+def taken():
+    """A start, rows that take a body, and rows that carry it out of view."""
+    seed, rows, task = carry()
+    start = replace(TrueWorld(video=VIDEO).start(seed, WIDE), row=rows[0])
+    behind = (rows[9].reshape(-1, 3) + [0, -0.9, 0.2]).ravel()
+    out = rows[9] + np.linspace(0, 1, 17)[1:, None] * (behind - rows[9])
+    return start, rows, out, task
+
+
+def test_a_hand_out_of_view_still_holds_its_body(tmp_path):
+    start, rows, out, _ = taken()
+    world = TrueWorld(video=VIDEO)
+    now, _ = follow(start, rows[1:10])
+    (held,) = world.after(now, "human").grasps
+    away, chunk = follow(now, out, out[-1:])
+    assert chunk.hidden.all()
+    assert np.isnan(chunk.action.joints_m).all()
+    away.save(tmp_path / "start")
+    for found in (away, Start.load(tmp_path / "start")):
+        back, _ = follow(found, out[::-1])
+        (kept,) = TrueWorld(video=VIDEO).after(back, "human").grasps
+        assert kept.name == held.name
+        np.testing.assert_array_equal(kept.part_from_hand, held.part_from_hand)
+
+
+@pytest.mark.slow
+def test_a_body_that_was_carried_out_of_view_is_put_down():
+    start, rows, out, task = taken()
+    env = WorldEnv(TrueWorld(video=VIDEO), actions=WIDE, reward=task)
+    env.reset(options={"start": start})
+    for path in (rows[1:10], out, out[-1:], out[::-1]):
+        _, _, _, _, info = env.chunk_step(path)
+        assert not info["success"]
+    assert env.chunk_step(rows[9:])[-1]["success"]
+
+
+def test_a_start_without_places_of_hands_is_read(tmp_path):
+    start, _, out, _ = taken()
+    away, _ = follow(start, out, out[-1:])
+    away.save(tmp_path / "start")
+    past = tmp_path / "start" / "past"
+    assert sorted(p.name for p in past.iterdir()) == ["1.npz", "2.npz", "2_hands.npz"]
+    (past / "2_hands.npz").unlink()  # as earlier versions wrote it
+    found = Start.load(tmp_path / "start").past
+    assert not any(isinstance(action, PlacedAction) for action in found)
+    assert np.isnan(found[1].joints_m).all()
+
+
+def test_places_that_do_not_agree_with_the_joints_are_refused():
+    start, _, out, _ = taken()
+    _, chunk = follow(start, out, out[-1:])
+    with pytest.raises(InputError, match="finite joints of all"):
+        with_places(chunk.action, chunk.action.joints_m)
+
+
+def test_the_worlds_that_were_used_last_are_kept(monkeypatch):
+    monkeypatch.setattr(true_world, "REMEMBERED", 2)
+    world = TrueWorld(video=VIDEO)
+    starts = [world.start(seed, JOINTS) for seed in (1, 2, 3)]
+    kept = world.after(starts[0], "human")
+    for start in (starts[1], starts[0], starts[2]):
+        world.after(start, "human")
+    assert world.after(starts[0], "human") is kept
+    assert len(world._worlds) == 2
+
+
+def test_a_state_of_elsewhere_is_refused():
+    world = TrueWorld(video=VIDEO)
+    env = WorldEnv(world, actions=JOINTS)
+    start = world.start(3, JOINTS)
+    env.reset(options={"start": replace(start, state=replace(start.state, provenance={}))})
+    with pytest.raises(InputError, match="true world has the scenes of its seeds"):
+        env.chunk_step(JOINTS.rest[None])

@@ -1,0 +1,144 @@
+"""Requests that are refused before they are read, and connections."""
+
+import asyncio
+import http.client as http_client
+import json
+import socket
+import threading
+import urllib.error
+import urllib.request
+
+import pytest
+import websockets.sync.client
+from fastapi import FastAPI
+from starlette.datastructures import URL
+from starlette.requests import HTTPConnection
+
+from egosim_jax.interactive.server import connections, guard, wire
+from egosim_jax.interactive.server.client import Client
+from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.guard import Guard
+from egosim_jax.interactive.server.server import make_app
+from egosim_jax.interactive.server.store import Limits
+from tests.unit.interactive.server.served import TOKEN, http, run
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "http://["}, 400),
+        ({"Host": "evil.example"}, 403),
+    ],
+)
+def test_pages_of_other_origins_are_refused(server, headers, status):
+    _, port = server
+    assert http(port, "/sessions", **headers)[0] == status
+    address = f"ws://127.0.0.1:{port}"
+    with (
+        pytest.raises(websockets.exceptions.InvalidStatus),
+        websockets.sync.client.connect(address, additional_headers=headers),
+    ):
+        pass
+
+
+def test_a_body_too_large_or_no_json_is_refused(server):
+    _, port = server
+    connection = http_client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.putrequest("POST", "/sessions")
+    connection.putheader("Content-Length", str(wire.MAX_BYTES + 1))
+    connection.endheaders()
+    with connection.getresponse() as reply:
+        assert (reply.status, json.loads(reply.read())["code"]) == (413, "too_large")
+    connection.close()
+    for path, fields, code in (("/sessions", [1], "invalid"), ("/fly", None, "unknown_path")):
+        assert json.loads(http(port, path, fields)[1])["code"] == code
+
+
+def test_a_body_that_grows_too_large_is_refused(server):
+    sent = []
+
+    async def receive():
+        return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": "/sessions", "headers": headers}
+    asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
+    assert sent[0]["status"] == 413
+    assert json.loads(sent[1]["body"])["code"] == "too_large"
+
+
+def test_a_body_of_too_many_items_or_of_another_kind_is_refused(server):
+    _, port = server
+    for data, kind, status in (
+        (b"[" * 300_000, "application/json", 422),
+        (b'{"seed": ' + b"[" * 20 + b"]" * 20 + b"}", "application/json", 422),
+        (b"{}", "text/plain", 415),
+    ):
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{port}/sessions", data=data, headers={"Content-Type": kind}
+        )
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(request, timeout=60)  # noqa: S310 - of this machine
+        with refused.value as error:
+            found = json.loads(error.read())
+        assert (error.code, found["code"]) == (status, "invalid")
+
+
+def test_a_body_that_comes_too_slowly_is_refused(server, monkeypatch):
+    monkeypatch.setattr(guard, "BODY_S", 0.01)
+    sent = []
+
+    async def receive():
+        await asyncio.sleep(60)
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": "/sessions", "headers": headers}
+    asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
+    assert (sent[0]["status"], json.loads(sent[1]["body"])["code"]) == (408, "too_slow")
+
+
+def test_an_idle_connection_is_closed_and_one_above_the_limit_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(connections, "HEAD_S", 0.4)
+    service, port, _ = run(tmp_path, limits=Limits(connections=1))
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        status, body = http(port, "/healthz")
+        assert (status, json.loads(body)["code"]) == (503, "too_many_connections")
+        threading.Event().wait(0.5)
+        assert client.request("status")["sessions"] == {}
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as slow:
+        slow.sendall(b"GET / HTTP/1.1\r\nHost: ")
+        assert slow.recv(1) == b""
+    assert http(port, "/healthz")[0] == 200
+    service.store.close()
+
+
+def test_a_token_is_asked_for(tmp_path):
+    service, port, _ = run(tmp_path, token=TOKEN)
+    assert http(port, "/healthz")[0] == 200
+    assert http(port, "/sessions")[0] == 401
+    assert http(port, "/sessions", Authorization="Bearer wrong")[0] == 401
+    assert http(port, "/sessions", Authorization=f"Api-Key {TOKEN}")[0] == 200
+    assert http(port, "/sessions", Authorization=f"bearer {TOKEN}")[0] == 200
+    with Client(f"ws://127.0.0.1:{port}", token=TOKEN) as client:
+        assert client.request("status")["sessions"] == {}
+    service.store.close()
+
+
+class OldConnection(HTTPConnection):
+    """Connection whose URL begins with the Host header, as in older versions of Starlette."""
+
+    url = URL("http://a/healthz?/sessions")
+
+
+def test_the_host_header_does_not_open_a_path():
+    headers = [(b"host", b"a/healthz?")]
+    connection = OldConnection({"type": "http", "path": "/sessions", "headers": headers})
+    with pytest.raises(RequestError, match="token"):
+        Guard(FastAPI(), token=TOKEN)._check(connection)

@@ -1,0 +1,399 @@
+"""Sessions of a painted world: journaled, resumed, never disturbed by each other."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.true_world import TrueWorld
+from egosim_jax.interactive.server import session as session_module
+from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.server.session import Session
+from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.simulation.episode import Episode
+from egosim_jax.types import InputError
+from tests.painted import VIDEO, painted
+
+
+@pytest.fixture
+def store(tmp_path):
+    opened = Store(tmp_path / "sessions", painted(), Limits(), Metrics())
+    yield opened
+    opened.close()
+
+
+def rows(session, step=1):
+    return session.actions.rest + step * 0.02 * np.eye(7)[1][None]
+
+
+def step(store, session, number, actions=None):
+    actions = rows(session, number) if actions is None else actions
+    request = {"session": session.id, "step_id": number, "actions": actions}
+    return store.step(request).result()
+
+
+def hashes(results):
+    return [result.info["state_sha256"] for result in results]
+
+
+def test_a_repeated_step_returns_the_same_result(store):
+    session = store.create({"seed": 3})
+    first = step(store, session, 1)
+    second = step(store, session, 2)
+    for known in (first, second):
+        again = step(store, session, known.step_id)
+        np.testing.assert_array_equal(again.frames, known.frames)
+        assert again.info == known.info
+    assert session.committed == 2
+
+
+def test_a_session_that_is_closed_after_it_was_found_is_not_changed(store):
+    session = store.create({"seed": 3})
+    store.remove({"session": session.id}).result()
+    with pytest.raises(RequestError, match="There is no session"):
+        store.submit(lambda: session.step(1, rows(session), None), changes=session)
+    assert not session.folder.exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(3, "step_out_of_order"), (1, "step_used")])
+def test_a_step_out_of_order_or_of_another_action_is_refused(store, number, code):
+    session = store.create({"seed": 3})
+    step(store, session, 1)
+    with pytest.raises(RequestError) as refused:
+        step(store, session, number, rows(session, 9))
+    assert (refused.value.status, refused.value.code) == (409, code)
+    assert step(store, session, 2).step_id == 2
+
+
+def test_a_failed_step_leaves_the_session_where_it_was(store, monkeypatch):
+    session = store.create({"seed": 3})
+    first = step(store, session, 1)
+
+    def fail(*_):
+        raise FloatingPointError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(store.backend.generator), "__call__", fail)
+        with pytest.raises(RequestError, match="not finite"):
+            step(store, session, 2)
+    assert not (session.folder / "steps" / "2").exists()
+    assert session.result == first
+    assert step(store, session, 2, rows(session, 5)).step_id == 2
+
+
+def test_a_step_that_fails_at_its_last_write_is_removed(store, monkeypatch):
+    write = session_module.write_json
+
+    def fail(path, value):
+        if path.name == "info.json":
+            raise OSError("no space")
+        write(path, value)
+
+    made = store.create({"seed": 3})
+    with monkeypatch.context() as patched:
+        patched.setattr(session_module, "write_json", fail)
+        with pytest.raises(RequestError, match="inside the server"):
+            step(store, made, 1)
+    assert not made.pending
+    assert step(store, made, 1, rows(made, 5)).step_id == 1
+
+
+def test_a_pending_step_without_its_request_is_not_resumed(store):
+    made = store.create({"seed": 3, "session": "one"})
+    for number in (1, 2):
+        step(store, made, number)
+    store.close()
+    last = made.folder / "steps" / "2"
+    for name in ("info.json", "request.json"):
+        (last / name).unlink()
+    again = Store(store.folder, painted(), Limits(), Metrics())
+    assert step(again, again.sessions["one"], 2, rows(made, 5)).step_id == 2
+    again.close()
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "{"])
+def test_a_damaged_request_does_not_keep_the_store_from_opening(store, text):
+    for name in ("good", "bad"):
+        step(store, store.create({"session": name}), 1)
+    store.close()
+    last = store.folder / "bad" / "steps" / "1"
+    (last / "info.json").unlink()
+    (last / "request.json").write_text(text)
+    again = Store(store.folder, painted(), Limits(), Metrics())
+    assert (set(again.sessions), set(again.damaged)) == ({"good"}, {"bad"})
+    again.close()
+
+
+def test_more_pending_steps_than_the_queue_are_resumed(store):
+    for name in ("one", "two", "three"):
+        made = store.create({"seed": 3, "session": name})
+        step(store, made, 1)
+        (made.folder / "steps" / "1" / "info.json").unlink()
+    store.close()
+    again = Store(store.folder, painted(), Limits(queue=1, threads=1), Metrics())
+    again.close()
+    assert [session.committed for session in again.sessions.values()] == [1, 1, 1]
+
+
+def test_a_start_that_the_world_refuses_changes_nothing(store, tmp_path):
+    world = TrueWorld(video=VIDEO)
+    start = store.backend.start(3, ActionSpec())
+    made = Session.create(tmp_path / "one", world, ActionSpec(), start)
+    with pytest.raises(InputError, match="scenes of its seeds"):
+        made.restart(replace(start, seed=4))
+    assert Session(made.folder, world).now.seed == 3
+    with pytest.raises(InputError, match="scenes of its seeds"):
+        Session.create(tmp_path / "two", world, ActionSpec(), replace(start, seed=4))
+    assert not (tmp_path / "two").exists()
+
+
+def test_a_folder_is_taken_for_an_unfinished_session_only_if_it_is_one(store):
+    (store.folder / "one" / "starts" / "0").mkdir(parents=True)
+    (store.folder / "other").mkdir()
+    (store.folder / "other" / "config.json").write_text("{}")
+    assert store.create({"session": "one"}).id == "one"
+    with pytest.raises(RequestError, match="choose another id"):
+        store.create({"session": "other"})
+    store.remove({"session": "one"}).result()
+    assert {path.name for path in store.folder.iterdir()} == {".lock", "other"}
+
+
+def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
+    session = store.create({"seed": 3, "session": "one"})
+    wanted = [step(store, session, number) for number in (1, 2, 3)]
+    store.close()
+    copy = tmp_path / "copy"
+    shutil.copytree(store.folder, copy)
+    last = copy / "one" / "steps" / "3"
+    (last / "info.json").unlink()
+    shutil.rmtree(last / "rollout")
+    again = Store(copy, painted(), Limits(), Metrics())
+    found = again.sessions["one"]
+    result = step(again, found, 3)
+    assert hashes([result]) == hashes(wanted[2:])
+    np.testing.assert_array_equal(result.frames, wanted[2].frames)
+    assert step(again, found, 4).step_id == 4
+    again.close()
+
+
+def test_rows_of_text_or_huge_numbers_are_refused(store):
+    made = store.create({"seed": 3})
+    for actions in ([["0.1"] * 7], [[10**400] * 7]):
+        with pytest.raises(InputError, match="must be rows of numbers"):
+            step(store, made, 1, actions)
+    assert not made.pending
+    assert step(store, made, np.int64(1)).step_id == 1
+
+
+def test_a_reset_returns_to_the_first_start_and_takes_a_prompt(store):
+    made = store.create({"seed": 3, "session": "one", "prompt": "Wave."})
+    store.reset({"session": "one", "seed": 4}).result()
+    assert made.now.seed == 4
+    store.reset({"session": "one", "episode": None}).result()
+    assert (made.now.seed, made.now.prompt) == (3, "Wave.")
+    store.reset({"session": "one", "prompt": "Clap."}).result()
+    assert (made.now.seed, made.now.prompt) == (3, "Clap.")
+    assert Session(made.folder, store.backend).now.prompt == "Clap."
+
+
+def test_a_session_is_not_continued_in_another_world(store):
+    step(store, store.create({"session": "one"}), 1)
+    store.close()
+    again = Store(store.folder, painted("classical"), Limits(), Metrics())
+    with pytest.raises(RequestError, match="perception of the session is 'None', of this server"):
+        again.get("one")
+    again.close()
+
+
+def test_a_session_that_is_created_counts_before_it_is_there(store, monkeypatch):
+    store.limits = Limits(sessions=1)
+    create = Session.create
+
+    def during(*args):
+        with pytest.raises(RequestError, match="1 sessions are open"):
+            store.create({"session": "two"})
+        return create(*args)
+
+    monkeypatch.setattr(Session, "create", during)
+    assert store.create({"session": "one"}).id == "one"
+
+
+def test_a_reset_and_a_load_continue_the_step_numbers(store):
+    session = store.create({"seed": 3})
+    first = step(store, session, 1)
+    store.save({"session": session.id, "name": "here"}).result()
+    step(store, session, 2)
+    loaded = store.load({"session": session.id, "name": "here"}).result()
+    assert (loaded.step_id, loaded.info["state_sha256"]) == (2, first.info["state_sha256"])
+    third = step(store, session, 3, rows(session, 2))
+    assert np.array_equal(third.frames, step(store, session, 2).frames)
+    reset = store.reset({"session": session.id, "seed": 4}).result()
+    assert reset.step_id == 3
+    reopened = Session(session.folder, store.backend)
+    assert reopened.now.seed == 4
+    assert reopened.result.info == reset.info
+
+
+def test_an_episode_of_a_session_can_be_simulated_again(store):
+    session = store.create({"seed": 3})
+    for number in (1, 2):
+        step(store, session, number)
+    ((start, steps),) = session.runs()
+    episode = Episode(
+        state=start.state,
+        actions=tuple(map(session.action, steps)),
+        fps=VIDEO.fps,
+        first_frame=start.first_frame,
+    )
+    created = store.create({"seed": 3, "episode": episode.to_bytes()})
+    assert created.result.info["state_sha256"] == session.result.info["state_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"session": "../x"}, "letters, digits"),
+        ({"seed": -1}, "must be from 0"),
+        ({"seed": "7"}, "whole number"),
+        ({"actions": {"layout": "feet"}}, "no action layout"),
+        ({"actions": {"fingers": 5}}, "no setting 'fingers'"),
+        ({"actions": {"workspace_m": [[0, 0, 0], [0, 0, "x"]]}}, "workspace_m"),
+        ({"episode": b"PK"}, "not a readable zip"),
+        ({"prompt": 5}, "must be a text"),
+        ({"seed": 2**63 - 1}, "must be from 0"),
+        ({"actions": {"camera": True, "camera_reach": [float("nan"), 1]}}, "reach of the camera"),
+        ({"actions": {"sides": ["right", "right"]}}, "one of each"),
+    ],
+)
+def test_an_invalid_session_is_refused_and_not_made(store, request_, message):
+    with pytest.raises(InputError, match=message):
+        store.create(request_)
+    assert not store.sessions
+    assert [path.name for path in store.folder.iterdir()] == [".lock"]
+
+
+def test_limits_are_kept(tmp_path):
+    limits = Limits(sessions=1, queue=1, steps=2)
+    store = Store(tmp_path, painted(), limits, Metrics())
+    session = store.create({})
+    with pytest.raises(RequestError, match="Close one"):
+        store.create({})
+    with pytest.raises(RequestError, match="more than a session's 2"):
+        step(store, session, 3)
+    session.busy.acquire()
+    with pytest.raises(RequestError, match="one at a time"):
+        step(store, session, 1)
+    session.busy.release()
+    store.draining = True
+    with pytest.raises(RequestError, match="shutting down"):
+        step(store, session, 1)
+    store.close()
+
+
+def test_a_full_queue_and_a_busy_session_are_refused_and_nothing_is_lost(tmp_path):
+    store = Store(tmp_path, painted(pause=0.3), Limits(queue=2), Metrics())
+    one, two, three = (store.create({"session": name}) for name in ("one", "two", "three"))
+    runs = [store.step({"session": s.id, "step_id": 1, "actions": rows(s)}) for s in (one, two)]
+    for session, number, code in ((one, 2, "queue_full"), (three, 1, "queue_full")):
+        with pytest.raises(RequestError) as refused:
+            step(store, session, number)
+        assert (refused.value.status, refused.value.code) == (429, code)
+        assert refused.value.retry_after_s
+    store.limits = Limits()
+    with pytest.raises(RequestError, match="one at a time") as refused:
+        step(store, one, 1, rows(one, 5))  # of another client
+    assert (refused.value.status, refused.value.code) == (409, "session_busy")
+    assert [run.result().step_id for run in runs] == [1, 1]
+    assert step(store, three, 1).step_id == 1
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"row": np.full(7, np.nan)}, "Row 0 of the actions has nan as right x: all must be"),
+        ({"row": np.full(7, np.inf)}, "must be finite"),
+        ({"row": np.zeros(63)}, "must be \\(1 to 4, 7\\)"),
+        ({"row": [0.1, 0.2, 0.1, 0, 0, 0, 2]}, "2 as right closure: it must be from 0 to 1"),
+        ({"row": [150, 20, 160, 0, 0, 0, 0]}, "150 as right x.*Positions are in meters"),
+        ({"row": [0.1, 0.2, 0.1, 0, 0, 180, 0]}, "180 as right rz.*rotations in radians"),
+        ({"rows": 5}, "must be \\(1 to 4, 7\\)"),
+    ],
+)
+def test_an_invalid_action_is_refused_with_rule_and_value(store, change, message):
+    made = store.create({"seed": 3})
+    row = np.asarray(change.get("row", made.actions.rest), float)
+    with pytest.raises(RequestError, match=message) as refused:
+        step(store, made, 1, np.tile(row, (change.get("rows", 1), 1)))
+    assert (refused.value.status, refused.value.code) == (422, "invalid")
+    assert (made.committed, made.pending, made.busy.locked()) == (0, False, False)
+    assert step(store, made, 1).step_id == 1
+
+
+def test_an_action_out_of_view_is_refused(store):
+    made = store.create({"actions": {"workspace_m": [[-9, -9, -9], [9, 9, 9]]}})
+    behind = made.actions.rest + 8 * np.eye(7)[1] * -1
+    assert step(store, made, 1, behind[None]).step_id == 1  # it begins in view
+    with pytest.raises(RequestError, match="view") as refused:
+        step(store, made, 2, behind[None])
+    assert refused.value.status == 422
+    store.reset({"session": made.id}).result()
+    assert step(store, made, 2).step_id == 2
+
+
+def test_a_second_store_of_a_folder_is_refused(store):
+    import subprocess
+    import sys
+
+    code = "import sys; from pathlib import Path; from egosim_jax.io.atomic import lock_folder\n"
+    code += "with lock_folder(Path(sys.argv[1])): pass"
+    command = [sys.executable, "-c", code, str(store.folder)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "is in use by another process" in found.stderr
+
+
+def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):
+    for name in ("good", "bad"):
+        step(store, store.create({"session": name}), 1)
+    store.close()
+    (store.folder / "bad" / "starts" / "0" / "start.json").write_text("{")
+    (store.folder / "bad" / "steps" / "1" / "info.json").unlink()
+    again = Store(store.folder, painted(), Limits(), Metrics())
+    assert set(again.sessions) == {"good"}
+    with pytest.raises(
+        RequestError, match=r"could not be resumed: bad/starts/0/start\.json"
+    ) as shown:
+        again.get("bad")
+    assert str(store.folder) not in str(shown.value)
+    again.close()
+
+
+def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store):
+    made = store.create({"seed": 3})
+    store.save({"session": made.id, "name": "a"}).result()
+    (made.folder / "saved" / "a" / "start.json").write_text("{")
+    with pytest.raises(RequestError, match=r"start\.json") as refused:
+        store.load({"session": made.id, "name": "a"}).result()
+    assert (refused.value.status, str(store.folder) in str(refused.value)) == (422, False)
+    assert step(store, made, 1).step_id == 1
+
+
+def test_a_store_that_closes_at_once_gives_up_what_waits(tmp_path, monkeypatch):
+    store = Store(tmp_path, painted(pause=0.3), Limits(threads=1), Metrics())
+    one, two = (store.create({"session": name}) for name in ("one", "two"))
+    runs = [store.step({"session": s.id, "step_id": 1, "actions": rows(s)}) for s in (one, two)]
+    store.close(at_once=True)
+    assert (one.committed, two.committed) == (1, 0)
+    assert runs[0].result().step_id == 1
+
+
+def test_an_action_that_ends_out_of_sight_of_the_scene_is_refused(store):
+    fields = {"camera": True, "camera_reach": [0.15, 3.14]}
+    made = store.create({"seed": 3, "actions": fields})
+    away = np.concatenate([made.actions.rest[:-6], [0, 0, 0, 0, 3.1, 0]])[None]
+    with pytest.raises(RequestError, match="its last camera sees none"):
+        step(store, made, 1, away)
+    assert step(store, made, 1, made.actions.rest[None]).step_id == 1

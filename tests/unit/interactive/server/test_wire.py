@@ -1,0 +1,59 @@
+"""Messages between clients and server."""
+
+import msgpack
+import numpy as np
+import pytest
+
+from egosim_jax.interactive.server import wire
+from egosim_jax.types import InputError
+
+ARRAY = {b"__ndarray__": True, b"data": bytes(8), b"dtype": "<f8", b"shape": [1]}
+
+
+def test_arrays_scalars_and_text_come_back():
+    message = {"a": np.arange(6, dtype=np.uint8).reshape(2, 3), "b": np.float32(2.5), "c": ["x"]}
+    found = wire.unpack(wire.pack(message), limit=wire.MAX_BYTES)
+    np.testing.assert_array_equal(found["a"], message["a"])
+    assert (found["b"], found["b"].dtype, found["c"]) == (2.5, np.float32, ["x"])
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({**ARRAY, b"dtype": "O"}, "must be of numbers"),
+        ({**ARRAY, b"dtype": "<c8"}, "must be of numbers"),
+        ({**ARRAY, b"dtype": ",f8"}, "must be of numbers"),
+        ({**ARRAY, b"shape": [1 << 40]}, "whole numbers"),
+        ({**ARRAY, b"shape": [2]}, "they must agree"),
+        ({**ARRAY, b"shape": [-1, -1]}, "whole numbers"),
+        ({**ARRAY, b"data": "text"}, "data must be bytes"),
+        ({b"__npgeneric__": True, b"data": "7", b"dtype": "<i8"}, "must be a number"),
+        ({b"__npgeneric__": True, b"data": 1 << 63, b"dtype": "|i1"}, "NumPy scalar"),
+        ([[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]], "levels deep"),
+    ],
+)
+def test_what_is_no_array_of_numbers_is_refused(value, message):
+    with pytest.raises(InputError, match=message):
+        wire.unpack(msgpack.packb({"actions": value}), limit=wire.MAX_BYTES)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\x81", wire.pack({1: 2}), b"\x93" * 3000])
+def test_what_is_not_messagepack_is_refused(data):
+    with pytest.raises(InputError, match="is not MessagePack"):
+        wire.unpack(data, limit=wire.MAX_BYTES)
+
+
+@pytest.mark.parametrize("item", [b"\x80", b"\x90", b"\xa1x"])
+def test_a_message_of_too_many_items_is_refused(item, monkeypatch):
+    monkeypatch.setattr(wire, "MAX_ITEMS", 2000)
+    lists = b"\xdd\x00\x00\x02\x00" + item * (1 << 9)
+    with pytest.raises(InputError, match="more than 2,000 items"):
+        wire.unpack(b"\x94" + lists * 4, limit=wire.MAX_BYTES)
+    assert len(wire.unpack(b"\x94" + lists * 4)) == 4
+    with pytest.raises(InputError, match="max_array_len"):
+        wire.unpack(b"\xdd\x00\xff\xff\xff" * 3, limit=wire.MAX_BYTES)
+
+
+def test_a_large_message_is_refused_by_its_size():
+    with pytest.raises(InputError, match="at most 10"):
+        wire.unpack(bytes(11), limit=10)

@@ -1,0 +1,263 @@
+"""The page of a training run: loss curves, sample clips, times and settings in one HTML file.
+
+It is made of the files in the run folder alone, so that it can be made again at any time, also
+while the run continues. The page loads nothing: curves and pictures are inline data, and its
+content security policy allows no other. Every text is escaped.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egosim_jax.io.renamed import upgrade, upgrade_metrics
+from egosim_jax.io.run import CONFIG, ENVIRONMENT, write_text
+from egosim_jax.io.untrusted.bounded import read_bytes, read_json, read_lines
+from egosim_jax.types import InputError
+
+PAGE, METRICS, TIMES = "index.html", "metrics.jsonl", "times.json"
+VALIDATION = "validation_"
+"""Prefix of the names of validation metrics."""
+SPEED = (
+    "step_time_s", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min",
+)  # fmt: skip
+"""Metrics of a run's speed, which are in the table of the last values."""
+COLORS = {"training": "tab:blue", "validation": "tab:orange"}
+MAX_POINTS = 1000
+"""Points of a curve; of longer ones, means of consecutive values are drawn."""
+MAX_SHEETS, SHEET_PX, JPEG_QUALITY = 8, 1200, 85
+"""Contact sheets on a page, evenly spaced from the first to the last, and their width."""
+MAX_CLIP_BYTES, MAX_SHEET_BYTES = 1 << 24, 1 << 27
+"""Size of a sample video beyond which the page omits it, and of a sheet that is read."""
+_HEAD = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+body {{ font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px;
+ padding: 0 1rem; color: #1b1f24 }}
+h1 {{ font-size: 1.6rem }}
+h2 {{ font-size: 1.3rem; margin-top: 2.4rem; border-top: 1px solid #dde1e6; padding-top: 1rem }}
+h3 {{ font-size: 1rem; margin-bottom: .3rem }}
+img, video {{ max-width: 100%; display: block }}
+video {{ min-width: min(100%, 30rem) }}
+table {{ border-collapse: collapse; margin: .4rem 0 1rem; font-variant-numeric: tabular-nums }}
+th, td {{ padding: .2rem 1.2rem .2rem 0; text-align: left; border-bottom: 1px solid #dde1e6;
+ font-weight: 400 }}
+th {{ color: #57606a }}
+.row {{ display: flex; gap: 4rem }}
+summary {{ cursor: pointer; font-weight: 600; margin: .4rem 0 }}
+</style></head><body>
+"""
+
+
+def write_page(run: Path, out: Path | None = None) -> Path:
+    """Write the page of a run folder, by default to its index.html, and return the path.
+
+    Raises `InputError` if the folder holds no training.
+    """
+    stages = stages_of(run)
+    if not stages:
+        raise InputError(
+            f"{run} is not the folder of a training: it needs {METRICS} and {CONFIG}, or folders "
+            "of stages that have both. Give the --out of egosim train."
+        )
+    name = run.resolve().name
+    parts = [_HEAD.format(title=escape(f"Training {name}")), f"<h1>Training {escape(name)}</h1>"]
+    for stage in stages:
+        parts += stage.sections()
+    if stages[0].folder != run:
+        parts += _details("Settings of the whole run", Stage(run).json(CONFIG))
+    path = out or run / PAGE
+    write_text(path, "\n".join([*parts, "</body></html>\n"]))
+    return path
+
+
+def stages_of(run: Path) -> list[Stage]:
+    """Return the trainings in a run folder: its own, or those of its stages, in their order."""
+    if (alone := Stage(run)).is_training:
+        return [alone]
+    found = (Stage(path.parent) for path in sorted(run.glob(f"*/{METRICS}")))
+    stages = [stage for stage in found if stage.is_training]
+    places = {name: place for place, name in enumerate(alone.json(CONFIG))}
+    return sorted(stages, key=lambda stage: places.get(stage.folder.name, len(places)))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One training of a run, by its folder."""
+
+    folder: Path
+    """Folder with metrics.jsonl, config.json, and samples/ if there are sample clips."""
+
+    @property
+    def is_training(self) -> bool:
+        """True if a training has written the folder: evaluations have such files, too."""
+        return (self.folder / METRICS).exists() and "training" in self.json(CONFIG)
+
+    def sections(self) -> Iterator[str]:
+        """Yield the HTML of the training."""
+        yield f"<h2>{escape(self.title)}</h2>"
+        if self.curves:
+            yield f'<img alt="curves" src="{_data("image/svg+xml", draw_curves(self.curves))}">'
+        yield '<div class="row"><div><h3>Last values</h3>'
+        yield _table({name: f"{y[-1]:.6g}" for name, (_, y) in self.metrics.items()})
+        if times := self.json(TIMES):
+            total = sum(times.values())
+            yield "</div><div><h3>Seconds since the last start</h3>"
+            yield _table({name: f"{s:.1f} ({s / total:.0%})" for name, s in times.items()})
+        yield "</div></div>"
+        yield from self._samples()
+        yield from _details("Settings", self.json(CONFIG))
+        yield from _details("Versions and devices", self.json(ENVIRONMENT))
+
+    @property
+    def title(self) -> str:
+        """Name of the training, with its progress."""
+        steps = self.json(CONFIG).get("training", {}).get("steps")
+        last = max((int(x[-1]) for x, _ in self.metrics.values()), default=0)
+        progress = f"step {last:,}" + ("" if steps is None else f" of {steps:,}")
+        return f"{self.folder.resolve().name}: {progress}"
+
+    @cached_property
+    def metrics(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Steps and values of each metric, in the order of the log."""
+        found: dict[str, list[tuple[int, float]]] = {}
+        for _, line in read_lines(self.folder / METRICS):
+            if not isinstance(line, dict) or type(line.get("step")) is not int:
+                continue
+            for name, value in upgrade_metrics(line).items():
+                if name != "step" and isinstance(value, int | float):
+                    found.setdefault(name, []).append((line["step"], float(value)))
+        return {
+            name: (np.array([step for step, _ in points]), np.array([y for _, y in points]))
+            for name, points in found.items()
+        }
+
+    @property
+    def curves(self) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+        """Curves by the title of their plot: training and validation are in one."""
+        plots: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
+        for name, points in self.metrics.items():
+            if level := re.fullmatch(f"{VALIDATION}loss_([0-9.]+)", name):
+                title = "validation loss by noise level"
+                plots.setdefault(title, {})[level[1]] = points
+            elif name not in SPEED:
+                kind = "validation" if name.startswith(VALIDATION) else "training"
+                plots.setdefault(name.removeprefix(VALIDATION), {})[kind] = points
+        first = [name for name in ("loss", "lr", "grad_norm") if name in plots]
+        return {name: plots[name] for name in [*first, *(n for n in plots if n not in first)]}
+
+    def json(self, name: str) -> dict[str, Any]:
+        """Return the values of a file under today's names; none if it is not there."""
+        path = self.folder / name
+        value = upgrade(read_json(path)) if path.exists() else {}
+        return value if isinstance(value, dict) else {}
+
+    def _samples(self) -> Iterator[str]:
+        """Yield the newest sample clips as a video, and contact sheets, the newest first."""
+        sheets = sorted(self.folder.glob("samples/step_*.png"))
+        if not sheets:
+            return
+        yield "<h3>Sample clips: generated and ground truth</h3>"
+        clip = sheets[-1].with_suffix(".mp4")
+        if clip.exists() and clip.stat().st_size <= MAX_CLIP_BYTES:
+            video = _data("video/mp4", read_bytes(clip, limit=MAX_CLIP_BYTES))
+            yield f'<video src="{video}" muted autoplay loop controls playsinline></video>'
+        chosen = np.linspace(0, len(sheets) - 1, min(len(sheets), MAX_SHEETS)).round().astype(int)
+        for sheet in reversed([sheets[i] for i in chosen]):
+            number = re.sub(r"\D", "", sheet.stem)
+            yield f"<p>step {int(number or 0):,}</p>"
+            yield f'<img alt="{escape(sheet.stem)}" src="{_data("image/jpeg", _small(sheet))}">'
+
+
+def draw_curves(plots: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> bytes:
+    """Return an SVG of plots over the number of updates, three in a row."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    last = max(max(steps) for curves in plots.values() for steps, _ in curves.values()) or 1
+    columns = min(3, len(plots))
+    rows = -(-len(plots) // columns)
+    figure = Figure(figsize=(4 * columns, 2.7 * rows), layout="constrained")
+    axes = iter(figure.subplots(rows, columns, squeeze=False).flat)
+    for (title, curves), plot in zip(plots.items(), axes, strict=False):
+        for kind, (steps, values) in curves.items():
+            x, y = _shortened(steps, values)
+            mark, color = "o" if len(x) < 30 else None, COLORS.get(kind)
+            plot.plot(x, y, marker=mark, markersize=3, linewidth=1.2, label=kind, color=color)
+        finite = np.concatenate([y[np.isfinite(y)] for _, y in curves.values()])
+        if len(finite) and finite.min() > 0 and finite.max() > 10 * finite.min():
+            plot.set_yscale("log")
+        plot.set_title(title, fontsize=10)
+        plot.set_xlim(-last / 50, last * 1.02)
+        plot.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+        plot.grid(alpha=0.3)
+        plot.legend(fontsize=8, frameon=False)
+    for unused in axes:
+        unused.set_axis_off()
+    data = io.BytesIO()
+    with rc_context({"svg.hashsalt": "egosim"}):  # the same curves are the same file
+        figure.savefig(data, format="svg", metadata={"Date": None})
+    return data.getvalue()
+
+
+def _shortened(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most `MAX_POINTS` points of a curve, means of consecutive ones if it has more."""
+    count = -(-len(steps) // MAX_POINTS)
+    if count == 1:
+        return steps, values
+    starts = np.arange(0, len(steps), count)
+    sizes = np.diff(np.append(starts, len(steps)))
+    return np.add.reduceat(steps, starts) / sizes, np.add.reduceat(values, starts) / sizes
+
+
+def _small(sheet: Path) -> bytes:
+    """Return a contact sheet as a JPEG of at most `SHEET_PX` columns."""
+    from PIL import Image
+
+    picture = Image.open(io.BytesIO(read_bytes(sheet, limit=MAX_SHEET_BYTES))).convert("RGB")
+    picture.thumbnail((SHEET_PX, picture.height))
+    data = io.BytesIO()
+    picture.save(data, "JPEG", quality=JPEG_QUALITY)
+    return data.getvalue()
+
+
+def _data(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _table(rows: Mapping[str, str]) -> str:
+    cells = (f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in rows.items())
+    return f"<table>{''.join(cells)}</table>"
+
+
+def _details(title: str, value: Any) -> list[str]:
+    """Return a folded table of a JSON value, by dotted paths."""
+    rows = dict(_flat(value))
+    if not rows:
+        return []
+    return [f"<details><summary>{escape(title)}</summary>{_table(rows)}</details>"]
+
+
+def _flat(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if key != "type":
+                yield from _flat(item, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        yield path, ", ".join(str(item) for item in value)
+    else:
+        yield path, "" if value is None else str(value)
