@@ -77,9 +77,9 @@ __all__ = [
 
 _HOMES = {
     "Condition": ("conditioning.condition", "Condition"),
-    "Episode": ("episode", "Episode"),
-    "Generator": ("generator", "Generator"),
-    "Rollout": ("rollout", "Rollout"),
+    "Episode": ("simulation.episode", "Episode"),
+    "Generator": ("generation.generator", "Generator"),
+    "Rollout": ("simulation.rollout", "Rollout"),
     "get_config": ("configs", "get"),
     "get_perception": ("perception.registry", "get"),
     "load_state": ("state.snapshot", "load"),
@@ -88,10 +88,10 @@ _HOMES = {
     "register_perception": ("perception.registry", "register"),
     "save_state": ("state.snapshot", "save"),
     "state_from_depth": ("state.depth", "state_from_depth"),
-    "write_conditions": ("conditions", "write_conditions"),
+    "write_conditions": ("generation.export", "write_conditions"),
     "write_video": ("io.video", "write_video"),
-    **{name: ("networks", name) for name in ("ModelConfig", "Networks")},
-    **{name: ("simulator", name) for name in ("Simulator", "Step")},
+    **{name: ("configs.model", name) for name in ("ModelConfig", "Networks")},
+    **{name: ("simulation.simulator", name) for name in ("Simulator", "Step")},
     **{
         name: ("types", name)
         for name in (

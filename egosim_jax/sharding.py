@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import prod
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 from flax import nnx
@@ -25,6 +25,8 @@ from jax.experimental import mesh_utils
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from egosim_jax.types import InputError, MeshConfig
+
+Module = TypeVar("Module")
 
 WEIGHTS: Mapping[str, tuple[str, ...]] = {"embed": ("fsdp", "context")}
 """Mesh axes of a weight's logical axes; an axis that is not listed is never split."""
@@ -148,3 +150,29 @@ def _fitting(
             used |= set(rule)
             found.append(rule)
     return PartitionSpec(*found)
+
+
+def shard_params(networks: Module, mesh: Mesh | None) -> Module:
+    """Return networks with their weights sharded over a mesh; unchanged without one.
+
+    The weights may be shapes, which then get the shardings.
+    """
+    if mesh is None:
+        return networks
+    graph, params = nnx.split(networks, nnx.Param)
+    return nnx.merge(graph, jax.tree.map(_put, params, state_sharding(mesh, params)))
+
+
+def _put(leaf: Any, sharding: Any) -> Any:
+    """Return an array placed by a sharding; of a shape, the shape with that sharding."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+    return jax.device_put(leaf, sharding)
+
+
+def replicate_params(network: Module) -> Module:
+    """Return a network with its weights replicated on every device of the current mesh."""
+    if not several_devices():
+        return network
+    graph, params = nnx.split(network)
+    return nnx.merge(graph, jax.lax.with_sharding_constraint(params, PartitionSpec()))

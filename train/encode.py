@@ -40,7 +40,7 @@ from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.static import check_static
-from egosim_jax.generation.compiled import CompiledFn, shard_params
+from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import Inputs
 from egosim_jax.generation.generator import batches, targets_of
 from egosim_jax.io.decoding import Decoding
@@ -48,7 +48,7 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted.bounded import listing, quote
 from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
-from egosim_jax.sharding import check_batch
+from egosim_jax.sharding import check_batch, shard_params
 from egosim_jax.train.distributed import stop_if_preempted
 from egosim_jax.train.encoded_parts import PartWindows, Window
 from egosim_jax.train.windows import Damaged, read_windows, windows

@@ -66,11 +66,12 @@ class Comparison:
 
     def output(self, *inputs: Any, call: Callable[..., Any] | None = None) -> np.ndarray:
         """Return the output of the network, or of `call(network, *inputs)`."""
-        from egosim_jax.generation.compiled import CompiledFn
+        import jax
+        from flax import nnx
 
-        return np.asarray(
-            CompiledFn(call or (lambda network, *x: network(*x)), self.network)(*inputs)
-        )
+        graph, params = nnx.split(self.network)
+        run = call or (lambda network, *x: network(*x))
+        return np.asarray(jax.jit(lambda p, *x: run(nnx.merge(graph, p), *x))(params, *inputs))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

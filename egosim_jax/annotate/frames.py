@@ -22,8 +22,7 @@ from jaxtyping import Float, Int, UInt8
 
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.untrusted.bounded import quote_path
-from egosim_jax.types import InputError, check_counts
-from egosim_jax.types.grid import WAN_GRID
+from egosim_jax.types import WAN_GRID, InputError, check_counts
 
 MAX_FPS = 60
 """Highest rate that is kept, in frames per second."""

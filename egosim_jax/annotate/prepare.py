@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from egosim_jax.annotate.frames import CHUNK, MAX_CLIP_FRAMES, Plan
 from egosim_jax.data.recording import Recording
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import WAN_GRID
+from egosim_jax.types import WAN_GRID, InputError
 
 THUMB_PX = 160
 """Width of the thumbnails, on which changes and motion are measured, in pixels."""

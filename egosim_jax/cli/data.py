@@ -17,8 +17,7 @@ from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.data.metadata import Prompts
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
-from egosim_jax.types import InputError, VideoSpec, check_counts
-from egosim_jax.types.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_counts
 
 
 def _grid(name: str | None) -> VideoGrid:

@@ -23,8 +23,7 @@ from jaxtyping import Array, Float, UInt8
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.mask import Packing, pack_mask
 from egosim_jax.data.static import check_observed
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, VideoGrid
 
 Part = Literal["noisy", "mask", "prior", "hands"]
 PACKED: dict[Packing, int] = {"space": 4, "single": 1}

@@ -30,8 +30,7 @@ from einops import rearrange
 from jaxtyping import UInt8
 
 from egosim_jax.data.static import HALF_WHITE, check_observed
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import WAN_GRID, InputError, VideoGrid
 
 Packing = Literal["space", "time", "single", "observed"]
 

@@ -27,7 +27,7 @@ RELEASED = Path(__file__).with_name("released.json")
 
 def names() -> list[str]:
     """Return the names of all configs."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return sorted({module.name for module in pkgutil.iter_modules(__path__)} - {"model"})
 
 
 def get(name: str) -> ModelConfig:

@@ -38,8 +38,7 @@ from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, Triplet, VideoGrid, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
 """Role of a network in a model, which is also the stem of its file of weights."""

@@ -15,8 +15,7 @@ from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.untrusted.bounded import quote
 from egosim_jax.io.video import decode_video
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, VideoGrid
 
 
 def check(folder: Path) -> Iterator[tuple[ShardInfo, list[str]]]:

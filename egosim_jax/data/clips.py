@@ -37,8 +37,7 @@ from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
 from egosim_jax.io.untrusted.bounded import listing, quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.video import VideoInfo, probe_video, read_video, write_video
-from egosim_jax.types import InputError, Triplet, VideoSpec
-from egosim_jax.types.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 logger = logging.getLogger(__name__)
 

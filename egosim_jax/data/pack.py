@@ -18,8 +18,7 @@ from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.untrusted.bounded import listing, read_bytes
 from egosim_jax.io.video import probe_encoded
-from egosim_jax.types import InputError, Triplet, VideoSpec
-from egosim_jax.types.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 MAX_FILE = 1 << 28
 """Maximum size of a source file that is packed, in bytes."""

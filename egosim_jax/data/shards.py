@@ -41,8 +41,7 @@ from egosim_jax.data.records import DTYPES, Record, RecordError, from_bytes, to_
 from egosim_jax.io.atomic import LOCK, atomic_folder
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.untrusted.bounded import listing, quote_text
-from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.types.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec
 
 _OPTIONS = "group_size:1,uncompressed"
 

@@ -1,20 +1,18 @@
-"""Compiled functions of networks, and the placement of their weights; inference is jitted here."""
+"""Compiled functions of networks: inference is jitted here."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
 from flax import nnx
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
 from egosim_jax.io.executables import cached_compile
-from egosim_jax.sharding import batch_sharding, check_batch, several_devices, state_sharding
-
-Module = TypeVar("Module")
+from egosim_jax.sharding import batch_sharding, check_batch
 
 
 class CompiledFn:
@@ -92,29 +90,3 @@ class CompiledFn:
 
 def _signature(args: Any) -> Any:
     return tuple((leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(args))
-
-
-def shard_params(networks: Module, mesh: Mesh | None) -> Module:
-    """Return networks with their weights sharded over a mesh; unchanged without one.
-
-    The weights may be shapes, which then get the shardings.
-    """
-    if mesh is None:
-        return networks
-    graph, params = nnx.split(networks, nnx.Param)
-    return nnx.merge(graph, jax.tree.map(_put, params, state_sharding(mesh, params)))
-
-
-def _put(leaf: Any, sharding: Any) -> Any:
-    """Return an array placed by a sharding; of a shape, the shape with that sharding."""
-    if isinstance(leaf, jax.ShapeDtypeStruct):
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-    return jax.device_put(leaf, sharding)
-
-
-def replicate_params(network: Module) -> Module:
-    """Return a network with its weights replicated on every device of the current mesh."""
-    if not several_devices():
-        return network
-    graph, params = nnx.split(network)
-    return nnx.merge(graph, jax.lax.with_sharding_constraint(params, PartitionSpec()))

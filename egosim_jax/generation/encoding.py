@@ -22,7 +22,7 @@ from egosim_jax.conditioning.posterior import (
 )
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
-from egosim_jax.generation.compiled import replicate_params
+from egosim_jax.sharding import replicate_params
 from egosim_jax.types import InputError, Triplet
 
 

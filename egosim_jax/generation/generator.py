@@ -2,10 +2,10 @@
 
     triplet --tokenize, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
 
-Each arrow is one compiled program (`generation/compiled.py`); `generation/encoding.py` has the first two. All denoising
-steps are one, a scan without a round trip to the host; what the steps share (embeddings,
-cross-attention keys and values, the condition's part of the patch embedding) is computed before the
-scan, and the noise is donated. An item's noise depends on its own seed only, so that a clip does
+Each arrow is one compiled program (`compiled.py`); `encoding.py` has the first two. All denoising
+steps are one scan, without a round trip to the host. Embeddings, cross-attention keys and values and
+the condition's part of the patch embedding do not change between steps: they are computed before
+the scan. The noise is donated. An item's noise depends on its own seed only, so that a clip does
 not depend on its batch.
 
 On a mesh (`sharding.py`) every batch is dealt out over data x fsdp; the devices along context share
@@ -31,12 +31,13 @@ from egosim_jax.conditioning.video import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
-from egosim_jax.generation.compiled import CompiledFn, shard_params
+from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import Inputs, encode_condition, keys_for, last_32_bits
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import Denoiser
 from egosim_jax.rendering import Renderer, jitted
+from egosim_jax.sharding import shard_params
 from egosim_jax.types import (
     Action,
     Clip,

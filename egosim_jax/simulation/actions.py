@@ -1,4 +1,4 @@
-"""Actions: their checks in a scene, and their files; `simulation/episode.py` has the conventions."""
+"""Actions: their checks in a scene, and their files; `episode.py` has the conventions."""
 
 from __future__ import annotations
 

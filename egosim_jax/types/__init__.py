@@ -12,432 +12,62 @@ frames has k+1 latent frames: the first latent frame encodes one frame, the othe
 Masks are 1 (or 255) where nothing was observed and pixels must be generated, and 0 where the prior
 is kept.
 
-This module does not import JAX: generators in any framework can use these types.
+No module here imports JAX: generators in any framework can use these types.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal, no_type_check
+from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, is_rigid
+from egosim_jax.types.flow import (
+    HAND_SIZE_M,
+    JOINTS,
+    NEAR_PICTURE,
+    REACH_M,
+    Action,
+    Clip,
+    GroundTruth,
+    Kind,
+    Perceived,
+    SceneState,
+    Triplet,
+    View,
+    near_view,
+)
+from egosim_jax.types.settings import (
+    WAN_GRID,
+    InputError,
+    MeshConfig,
+    VideoGrid,
+    VideoSpec,
+    check_counts,
+    check_seed,
+    check_video,
+)
 
-import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
-
-Kind = Literal["human", "robot"]
-"""Kind of hands: human with 21 keypoints, or robot grippers with 3."""
-
-
-class InputError(ValueError):
-    """Bad usage or bad input: says what happened, the rule, the value and the fix. Exit code 2."""
-
-
-def check_video(what: str, frames: np.ndarray, shape: tuple[int, int, int] | None = None) -> None:
-    """Raise `InputError` unless `frames` is a uint8 RGB video `f h w 3`, of a size if given."""
-    have = np.shape(frames)
-    fits = len(have) == 4 and have[3] == 3 and 0 not in have and shape in (None, have[:3])
-    if not fits or getattr(frames, "dtype", None) != np.uint8:
-        size = "(frames, height, width" if shape is None else str(shape)[:-1]
-        raise InputError(
-            f"{what} is {getattr(frames, 'dtype', type(frames).__name__)} {have}: it must be uint8 "
-            f"{size}, 3)."
-        )
-
-
-def check_seed(seed: int, *, name: str = "--seed") -> None:
-    """Raise `InputError` unless a seed is a whole number from 0 to 2**63 - 1."""
-    if not (hasattr(seed, "__index__") and 0 <= seed < 2**63):
-        raise InputError(f"{name} must be a whole number from 0 to 2**63 - 1, not {seed!r:.40}.")
-
-
-def check_counts(counts: Mapping[str, int | None]) -> None:
-    """Raise `InputError` at the first count below 1; by name, None if none was given."""
-    for name, count in counts.items():
-        if count is not None and count < 1:
-            raise InputError(f"{name} must be at least 1, not {count}.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class VideoSpec:
-    """Length, size and rate of the videos that a model reads and writes."""
-
-    frames: int = 61
-    """Pixel frames of a video."""
-    height: int = 480
-    """Rows of a frame in pixels."""
-    width: int = 832
-    """Columns of a frame in pixels."""
-    fps: int = 16
-    """Frame rate of the video in frames per second."""
-
-    def __post_init__(self) -> None:
-        """Check that all are positive; what a model can encode is up to its `VideoGrid`."""
-        counts = ("frames", "height", "width", "fps")
-        check_counts({name: getattr(self, name) for name in counts})
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshConfig:
-    """Sizes of the mesh axes, whose product is the number of devices.
-
-    One of them may be -1: it takes all remaining devices.
-    """
-
-    data: int = 1
-    """Copies of the weights, each with its own part of the batch."""
-    fsdp: int = -1
-    """Devices that share one copy of the weights."""
-    context: int = 1
-    """Devices that share one sample, each with a part of its tokens."""
-
-
-FOCAL_WIDTHS = (0.1, 20.0)
-"""Smallest and largest plausible focal length, in widths of the picture."""
-MAX_SKEW = 0.1
-"""Largest plausible skew of the pixels, in focal lengths."""
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Cameras:
-    """Camera trajectory: one pose per frame, in OpenCV axes (x right, y down, z forward)."""
-
-    world_from_camera: Float[np.ndarray, "f 4 4"]
-    """Rigid transforms, in meters."""
-    intrinsics_px: Float[np.ndarray, "3 3"]
-    """Focal lengths and principal point in pixels, with pixel centers at integer coordinates."""
-    height: int
-    """Image rows in pixels."""
-    width: int
-    """Image columns in pixels."""
-
-    def __post_init__(self) -> None:
-        """Check shapes, that every pose is a rigid transform, and the intrinsics and image size."""
-        for name, shape in (("world_from_camera", (4, 4)), ("intrinsics_px", (3, 3))):
-            value = getattr(self, name)
-            have, dtype = np.shape(value), getattr(value, "dtype", None)
-            if have[-2:] != shape or len(have) != (3 if name == "world_from_camera" else 2):
-                raise InputError(
-                    f"{name} has shape {have}: it must be "
-                    f"{'(frames, 4, 4)' if shape == (4, 4) else '(3, 3)'}."
-                )
-            if 0 in have or dtype is None or dtype.kind not in "fiu":
-                raise InputError(
-                    f"{name} is {dtype or type(value).__name__} {have}: it must be an array of "
-                    "numbers, with at least one frame of poses."
-                )
-        rigid = is_rigid(self.world_from_camera)
-        if not rigid.all():
-            frame = int(np.argmin(rigid))
-            raise InputError(
-                f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with "
-                "a rotation of determinant 1 and the last row 0 0 0 1, not "
-                f"{self.world_from_camera[frame].tolist()}."
-            )
-        self._check_intrinsics()
-
-    def _check_intrinsics(self) -> None:
-        (fx, skew, cx), (_, fy, cy), _ = matrix = np.asarray(self.intrinsics_px, float)
-        sizes = self.height, self.width
-        given = f"intrinsics_px {matrix.tolist()}, width {self.width}, height {self.height}"
-        integers = all(hasattr(size, "__index__") for size in sizes)
-        if not (integers and np.isfinite(matrix).all() and min(fx, fy, *sizes) > 0):
-            raise InputError(
-                f"Cameras have invalid intrinsics or image size: {given}. All must be finite, "
-                "focal lengths positive, sizes positive whole numbers."
-            )
-        low, high = FOCAL_WIDTHS[0] * self.width, FOCAL_WIDTHS[1] * self.width
-        plausible = np.abs(matrix[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() < 1e-6
-        plausible &= low <= min(fx, fy) and max(fx, fy) <= high and abs(skew) <= MAX_SKEW * fx
-        plausible &= -0.5 <= cx <= self.width - 0.5 and -0.5 <= cy <= self.height - 0.5
-        if not plausible:
-            raise InputError(
-                f"Cameras have implausible intrinsics: {given}. They must be [fx, skew, cx], "
-                f"[0, fy, cy], [0, 0, 1] in pixels of this size: focal lengths from {low:g} to "
-                f"{high:g}, the principal point inside the picture. Do not transpose or normalize "
-                "them, and scale them to the clip's size."
-            )
-
-
-def is_rigid(poses: Float[np.ndarray, "f 4 4"]) -> Bool[np.ndarray, " f"]:
-    """Return which poses are rigid transforms."""
-    rigid = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    poses = np.where(rigid[:, None, None], poses, np.eye(4))
-    rotations = poses[:, :3, :3]
-    drift = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
-    rigid &= (drift < 1e-3) & (np.linalg.det(rotations) > 0)
-    return rigid & (np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) < 1e-6)
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Triplet:
-    """Conditions of one clip at the model's length and size, and its target video if known."""
-
-    video_id: str
-    prompt: str
-    prior: UInt8[np.ndarray, "f h w 3"]
-    """The scene rendered along the camera path, without hands."""
-    mask: UInt8[np.ndarray, "f h w"]
-    """Unobserved pixels of the prior: 255 not observed, 0 observed, gray where it was resized."""
-    hands: UInt8[np.ndarray, "f h w 3"]
-    """The hand skeletons on black."""
-    first_frame: UInt8[np.ndarray, "h w 3"]
-    """The image for CLIP: the scene at the first frame."""
-    target: UInt8[np.ndarray, "f h w 3"] | None = None
-    """The recorded video."""
-    extra: Mapping[str, str] = field(default_factory=dict)
-    """Further metadata columns, carried to the results."""
-    tokens: Float32[np.ndarray, "m e"] | None = None
-    """Tokens for the denoiser's image branch where it has no encoder; None: zeros."""
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Clip:
-    """A generated video."""
-
-    frames: UInt8[np.ndarray, "f h w 3"]
-    fps: int
-
-    def __post_init__(self) -> None:
-        """Check that the frames are a uint8 RGB video."""
-        check_video("A clip", self.frames)
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class SceneState:
-    """State of the world: colored 3D points, with object instance and last observation of each."""
-
-    points_m: Float32[np.ndarray, "n 3"]
-    """Positions in the world, in meters."""
-    colors: UInt8[np.ndarray, "n 3"]
-    object_ids: Int32[np.ndarray, " n"]
-    """Object instance of each point; 0 is the background."""
-    last_seen: Int32[np.ndarray, " n"]
-    """Step in which each point was last observed."""
-    intrinsics_px: Float[np.ndarray, "3 3"]
-    """Intrinsics of the camera that observed the scene, in pixels."""
-    step: int = 0
-    """Number of clips fused into the state."""
-    names: Mapping[int, str] = field(default_factory=dict)
-    """Names of object instances, by id."""
-    world_from_object: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """Poses of the objects that have moved, relative to where they were first observed."""
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    """Origin of the state, as free key-value pairs."""
-
-    def __post_init__(self) -> None:
-        """Check shapes and dtypes, which are never converted, and that all points are finite."""
-        count = len(self.points_m)
-        for name, dtype, shape in (
-            ("points_m", np.float32, (count, 3)),
-            ("colors", np.uint8, (count, 3)),
-            ("object_ids", np.int32, (count,)),
-            ("last_seen", np.int32, (count,)),
-        ):
-            value = getattr(self, name)
-            have = getattr(value, "dtype", type(value).__name__)
-            if np.shape(value) != shape or have != np.dtype(dtype):
-                raise InputError(
-                    f"{name} of a state of {count} points is {have} {np.shape(value)}: it must be "
-                    f"{np.dtype(dtype)} {shape}, one for each point. Convert it with "
-                    f"astype(np.{np.dtype(dtype)})."
-                )
-        if not count:
-            raise InputError("SceneState must contain at least one point.")
-        poses = {f"pose of object {n}": pose for n, pose in self.world_from_object.items()}
-        for name, matrix in {"intrinsics_px": self.intrinsics_px, **poses}.items():
-            size = 3 if name == "intrinsics_px" else 4
-            if np.shape(matrix) != (size, size) or not np.isfinite(matrix).all():
-                raise InputError(
-                    f"The {name} of a state must be finite and of shape ({size}, {size}), not "
-                    f"{np.shape(matrix)}."
-                )
-        finite = np.isfinite(self.points_m).all(axis=1)
-        if not finite.all():
-            raise InputError(
-                f"Point {int(np.argmin(finite))} of the state is not finite: "
-                f"{self.points_m[np.argmin(finite)]}."
-            )
-
-
-JOINTS: Mapping[Kind, int] = {"human": 21, "robot": 3}
-"""Number of keypoints of a hand, by kind."""
-HAND_SIZE_M = (0.01, 1.0)
-"""Smallest and largest plausible extent of a hand, in meters."""
-NEAR_PICTURE = 0.25
-"""Margin around the image in which a joint counts as near the view, in widths and heights."""
-REACH_M = 3.0
-"""Largest distance in front of a camera at which a joint counts as near the view, in meters."""
-
-
-def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[np.ndarray, "f n"]:
-    """Return which hands have a joint within reach of the camera and in or near its picture."""
-    poses = cameras.world_from_camera
-    given = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
-    where = np.where(given[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
-    x, y, z = np.moveaxis(np.einsum("fnjc,fcd->fnjd", where, poses[:, :3, :3]), -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
-        v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
-    near_u, near_v = NEAR_PICTURE * cameras.width, NEAR_PICTURE * cameras.height
-    seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
-    seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
-    return np.asarray(seen.any(axis=2))
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Action:
-    """The wearer's camera path, hands and caption for one clip."""
-
-    cameras: Cameras
-    """Trajectory of the head's camera."""
-    joints_m: Float[np.ndarray, "f n j 3"]
-    """Joints of n hands in the world, in meters: 21 of a human hand, 3 of a gripper.
-
-    All joints of a hand are NaN in frames in which it is missing; without hands, give one hand that
-    is missing from all frames."""
-    kind: Kind
-    """Kind of hands."""
-    prompt: str
-    """Caption of the clip."""
-
-    def __post_init__(self) -> None:
-        """Check kind, joint count, frame count, units and frame of reference.
-
-        Raises `InputError`, also where a hand is given and never comes near any camera's view:
-        then it is not in world coordinates.
-        """
-        if self.kind not in JOINTS:
-            raise InputError(
-                f"The kind of hands must be 'human' or 'robot', not {str(self.kind)[:40]!r}."
-            )
-        if not isinstance(self.prompt, str):
-            raise InputError(f"The prompt must be text, not {type(self.prompt).__name__}.")
-        joints = np.asarray(self.joints_m)
-        frames, wanted = len(self.cameras.world_from_camera), JOINTS[self.kind]
-        shape = (frames, max(1, joints.shape[1] if joints.ndim == 4 else 1), wanted, 3)
-        if joints.shape != shape or joints.dtype.kind != "f":
-            raise InputError(
-                f"joints_m is {joints.dtype} {joints.shape}: {self.kind} hands of a path of "
-                f"{frames} cameras must be floats ({frames}, hands, {wanted}, 3), at least one "
-                "hand. A missing hand has joints of NaN."
-            )
-        finite = np.isfinite(joints)
-        given = np.asarray(finite.all(axis=(2, 3)))
-        broken = ~given & ~np.isnan(joints).all(axis=(2, 3))
-        if broken.any():
-            frame, hand = np.argwhere(broken)[0].tolist()
-            raise InputError(
-                f"Hand {hand} of frame {frame} has joints that are not finite and others that are: "
-                "give all joints of a hand, or NaN for all where it is missing."
-            )
-        if given.any():
-            self._check_size(joints, given)
-            self._check_place(joints, given)
-
-    def _check_size(self, joints: np.ndarray, given: np.ndarray) -> None:
-        hands = joints[given]
-        extent = np.linalg.norm(hands.max(axis=1) - hands.min(axis=1), axis=-1)
-        low, high = HAND_SIZE_M
-        bad = (extent < low) | (extent > high)
-        if bad.any():
-            frame, hand = np.argwhere(given)[np.argmax(bad)].tolist()
-            raise InputError(
-                f"Hand {hand} of frame {frame} is {extent[np.argmax(bad)]:.4g} m large: a hand has "
-                f"{low} to {high} m. Joints must be in meters."
-            )
-
-    def _check_place(self, joints: np.ndarray, given: np.ndarray) -> None:
-        """Raise `InputError` if no joint of a hand is within reach of a camera and near its image.
-
-        Each hand that is given in any frame is checked separately.
-        """
-        seen = near_view(self.cameras, joints)
-        lost = given.any(axis=0) & ~seen.any(axis=0)
-        if lost.any():
-            raise InputError(
-                f"No joint of hand {int(np.argmax(lost))} comes near the view of the cameras, at "
-                f"most {REACH_M:g} m away, in any frame: joints must be in world coordinates, as "
-                "the cameras are, and in meters. A hand that is out of sight all the time is given "
-                "as NaN."
-            )
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """Rendering of a state along a camera trajectory."""
-
-    frames: UInt8[np.ndarray, "f h w 3"]
-    """Rendered colors; black where no point is visible."""
-    mask: UInt8[np.ndarray, "f h w"]
-    """Unobserved pixels: 255 not observed, 0 observed."""
-    depth_m: Float32[np.ndarray, "f h w"]
-    """Depth along the camera's z axis in meters; infinite where no point is visible."""
-    object_ids: Int32[np.ndarray, "f h w"]
-    """Object instance of each pixel; 0 for the background and where no point is visible."""
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Perceived:
-    """Reconstruction of a clip in world coordinates, frame by frame."""
-
-    step: int
-    """Number of the clip, from 1."""
-    frames: UInt8[np.ndarray, "f h w 3"]
-    cameras: Cameras
-    depth_m: Float32[np.ndarray, "f h w"]
-    """Depth along the camera's z axis in meters; infinite where unknown."""
-    object_ids: Int32[np.ndarray, "f h w"]
-    """Object instance of each pixel: 0 background, negative hands and arms, never fused."""
-    names: Mapping[int, str]
-    """Names of object instances, by id."""
-    world_from_object: Mapping[int, Float[np.ndarray, "f 4 4"]]
-    """Poses of tracked objects; the first frame's is that in the state before."""
-    interacted_frames: Mapping[int, Bool[np.ndarray, " f"]]
-    """Frames in which hands acted on each object; only objects with at least one."""
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class GroundTruth:
-    """Ground truth of one clip; None where it is unknown."""
-
-    frames: UInt8[np.ndarray, "f h w 3"]
-    """Recorded or ray-cast video of the action."""
-    depth_m: Float32[np.ndarray, "f h w"] | None = None
-    """Depth along the camera's z axis in meters; infinite where a ray hits nothing."""
-    object_ids: Int32[np.ndarray, "f h w"] | None = None
-    """Object instance of each pixel: 0 background, negative hands and arms, else the state's."""
-    motions: Mapping[int, Float[np.ndarray, "f 4 4"]] | None = None
-    """Rigid motion in the world of each object that moves, relative to its pose in frame 0."""
-    target_id: int | None = None
-    """Object that the hands act on."""
-
-    def __post_init__(self) -> None:
-        """Check that the frames are a video and that everything else fits them."""
-        check_video("The ground truth", self.frames)
-        shape = self.frames.shape[:3]
-        for name, dtype in (("depth_m", np.float32), ("object_ids", np.int32)):
-            value = getattr(self, name)
-            if value is not None and (value.shape != shape or value.dtype != dtype):
-                raise InputError(
-                    f"Ground truth {name} is {value.dtype} {value.shape}: it must be "
-                    f"{np.dtype(dtype)} {shape}, one value per pixel of the frames."
-                )
-        if self.depth_m is not None and not (self.depth_m > 0).all():
-            raise InputError(
-                "Ground truth depth_m has values that are not positive: depth is in meters along "
-                "the camera's z axis, and infinite where it is unknown."
-            )
-        for number, motion in (self.motions or {}).items():
-            if np.shape(motion) != (shape[0], 4, 4) or not is_rigid(np.asarray(motion)).all():
-                raise InputError(
-                    f"The ground-truth motion of object {number} is of shape {np.shape(motion)}: "
-                    f"it must be one finite rigid transform per frame, ({shape[0]}, 4, 4)."
-                )
+__all__ = [
+    "FOCAL_WIDTHS",
+    "HAND_SIZE_M",
+    "JOINTS",
+    "MAX_SKEW",
+    "NEAR_PICTURE",
+    "REACH_M",
+    "WAN_GRID",
+    "Action",
+    "Cameras",
+    "Clip",
+    "GroundTruth",
+    "InputError",
+    "Kind",
+    "MeshConfig",
+    "Perceived",
+    "SceneState",
+    "Triplet",
+    "VideoGrid",
+    "VideoSpec",
+    "View",
+    "check_counts",
+    "check_seed",
+    "check_video",
+    "is_rigid",
+    "near_view",
+]

@@ -1,7 +1,7 @@
 """Episodes of LeRobot datasets, version 3.0, that have hands and cameras.
 
-A row of each frame has the vectors that `data/lerobot_writer.py` names: joints of the hands in the world,
-pose and intrinsics of the camera. Datasets with videos only are annotated first (docs/video.md).
+Each frame's row has the vectors that `data/lerobot_writer.py` names: hand joints in the world,
+camera pose and intrinsics. Datasets with videos only are annotated first (docs/video.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Episode that a person plays: a session, the true world next to it, and all earlier moments.
 
-The session (`interactive/server/session.py`) is the engine and the record: every clip is in its folder. The
-true world executes the same actions, if the scene is one of a seed.
+The session (`interactive/server/session.py`) is the engine and the record: every clip is in its
+folder. The true world executes the same actions, if the scene is one of a seed.
 """
 
 from __future__ import annotations

@@ -17,8 +17,7 @@ from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.rendering import get
 from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.rerun_log import Recording
-from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoSpec, View
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 A pickle is a program for a stack machine. This one knows containers, numbers and text. Names of
 globals are kept as `Name` and only those on an allow-list; what calling one of them would have made
-is built by the dialect, a subclass (`io/untrusted/pth.py` for torch, `io/untrusted/pickled_arrays.py` for NumPy).
+is built by the dialect, a subclass (`pth.py` for torch, `pickled_arrays.py` for NumPy).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A `.pth` is a zip archive of uncompressed entries: `NAME/data.pkl`, a pickle of dictionaries, lists
 and references to tensors, and `NAME/data/KEY`, the bytes of each storage. To the interpreter of
-`io/untrusted/pickled.py` this module adds storages and tensors. Every tensor is checked against its storage
+`pickled.py` this module adds storages and tensors. Every tensor is checked against its storage
 and stays in the memory-mapped file until it is accessed.
 """
 

@@ -42,8 +42,7 @@ from egosim_jax.models.wan.vae_layers import (
     init_constant_channels,
     norm,
 )
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, VideoGrid
 
 
 @dataclass(frozen=True, kw_only=True)

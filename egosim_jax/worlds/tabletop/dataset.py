@@ -19,8 +19,15 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.runtime.processes import run_in_processes
-from egosim_jax.types import InputError, Kind, SceneState, VideoSpec, check_seed
-from egosim_jax.types.grid import WAN_GRID, VideoGrid
+from egosim_jax.types import (
+    WAN_GRID,
+    InputError,
+    Kind,
+    SceneState,
+    VideoGrid,
+    VideoSpec,
+    check_seed,
+)
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions

@@ -16,8 +16,7 @@ from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.atomic import LOCK, hold_folder
 from egosim_jax.io.video import decode_video, read_video
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
-from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, VideoGrid, VideoSpec
 
 
 @pytest.fixture

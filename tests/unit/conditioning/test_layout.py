@@ -9,8 +9,7 @@ import pytest
 
 from egosim_jax.conditioning import ChannelLayout, Condition
 from egosim_jax.conditioning.layout import EGOSIM, WAN_INPAINT, WAN_TEXT
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import WAN_GRID
+from egosim_jax.types import WAN_GRID, InputError
 
 GRID = (2, 3, 2, 4)
 

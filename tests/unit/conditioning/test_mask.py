@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.conditioning import pack_mask
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, VideoGrid
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import DecodeWindow
-from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.types.grid import WAN_GRID
+from egosim_jax.types import WAN_GRID, InputError, VideoSpec
 
 RECORDS = 12
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.types.grid import VideoGrid
+from egosim_jax.types import InputError, VideoGrid, VideoSpec
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 SPEC = VideoSpec(frames=5, height=32, width=48)

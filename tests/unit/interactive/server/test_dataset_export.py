@@ -17,8 +17,7 @@ from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.io.untrusted.parquet import read_columns
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.types import InputError
-from egosim_jax.types.grid import WAN_GRID
+from egosim_jax.types import WAN_GRID, InputError
 from tests.painted import VIDEO, painted
 
 LOADED = """
