@@ -1,11 +1,12 @@
-"""Check the wording of the repository: the field's words, in American spelling.
+"""Check the wording of the repository: the field's words, plain sentences, American spelling.
 
     python -m tests.words                     check every tracked .py and .md file
     python -m tests.words egosim_jax/state    check these files and folders
     python -m tests.words --draw 20 --seed 0  print docstring first lines drawn at random
 
 Comments, docstrings, messages, identifiers and Markdown are read. A string without white space is a
-key or a path, not prose: names that old files carry may stay in the code that reads them.
+key or a path, not prose. In Markdown, no sentence has more than 35 words, and the mean over all
+pages is at most 16. Tables, headings and code are not counted.
 """
 
 from __future__ import annotations
@@ -59,6 +60,8 @@ PHRASES = {
     r"beside": "versus, next to, along with",
     r"people": "humans, users",
     r"sound": "valid; audio",
+    r"pictures?|pictured": "image, frame",
+    r"(?-i:MOST|LEAST)(?= )": "MAX_, MIN_",
 }
 """Regular expressions of words in prose and in identifiers, and what to write instead."""
 
@@ -72,6 +75,10 @@ PROSE = {
     ),
     r"the way out": "fix",
     r"twice there|there twice": "duplicate",
+    r"(?:that|those) of(?! which)": "name the noun again",
+    r"(?:of|by) which": "a second sentence",
+    r"what is(?! the matter)": "the noun itself",
+    r"(?-i:is none|are none)": "there is no, is not",
 }
 """Regular expressions of words in prose alone."""
 
@@ -108,6 +115,9 @@ RENAMED = {
 
 OPENINGS = re.compile(r"(?:What|How|Of|Those|That|Whether|Where|Which|Who|Why)\b")
 """Words with which the first line of a docstring does not make sense alone."""
+
+MAX_SENTENCE, MAX_MEAN_SENTENCE = 35, 16.0
+"""Maximum length of a sentence in Markdown, and of the mean over all pages, in words."""
 
 ALLOWED: dict[tuple[str, str], str] = {
     ("tests/words.py", "*"): "the list itself",
@@ -148,8 +158,11 @@ def main(args: list[str] | None = None) -> int:
         print(*random.Random(given.seed).sample(lines, given.draw), sep="\n")
         return 0
     findings = [finding for path in files for finding in check(path)]
+    lengths = [length for path in files if path.suffix == ".md" for _, length in sentences(path)]
+    mean = sum(lengths) / max(1, len(lengths))
     print(*findings, f"{len(findings)} findings in {len(files)} files", sep="\n")
-    return int(bool(findings))
+    print(f"{len(lengths)} sentences in Markdown, {mean:.1f} words on average")
+    return int(bool(findings) or mean > MAX_MEAN_SENTENCE)
 
 
 def tracked(paths: list[str]) -> list[Path]:
@@ -272,6 +285,35 @@ def markdown(path: Path) -> Iterator[tuple[int, str, str]]:
     fenced = re.compile(r"^```.*?^```", re.M | re.S)
     text = fenced.sub(lambda m: "\n" * m[0].count("\n"), path.read_text())
     yield from phrases(re.sub(r"`[^`\n]*`", "`0`", text), 1)
+    for line, length in sentences(path):
+        if length > MAX_SENTENCE:
+            yield line, f"sentence of {length} words", f"at most {MAX_SENTENCE}: split it"
+
+
+def sentences(path: Path) -> Iterator[tuple[int, int]]:
+    """Yield line and number of words of each sentence of a Markdown file."""
+    text = re.sub(
+        r"^```.*?^```", lambda m: "\n" * m[0].count("\n"), path.read_text(), flags=re.M | re.S
+    )
+    block: list[str] = []
+    first = 1
+    for number, line in enumerate([*text.splitlines(), ""], 1):
+        begins = re.match(r"\s*(?:[-*+]|\d+\.)\s+", line)
+        ends = not line.strip() or line.startswith(("    ", "|", "#", "!", "<", ">"))
+        if begins or ends:
+            yield from _sentences(" ".join(block), first)
+            block = []
+        if not ends or begins:
+            first = first if block else number
+            block.append(line[begins.end() :] if begins else line)
+
+
+def _sentences(paragraph: str, line: int) -> Iterator[tuple[int, int]]:
+    plain = re.sub(r"`[^`]*`", "0", paragraph)
+    plain = re.sub(r"\]\([^)]*\)", "]", plain)
+    for sentence in re.split(r"(?<=[.!?])[\])*_\"']*\s+(?=[\[(*_\"'A-Z0-9])", plain):
+        if length := len(re.findall(r"\w[\w'.,/×-]*", sentence)):
+            yield line, length
 
 
 if __name__ == "__main__":

@@ -160,7 +160,7 @@ class Options:
         result["shown"] = (*result["shown"], *extra)
         paged = self.page_clips > 0 and pages.can_be_written()
         if self.page_clips and not paged:
-            unavailable.append(f"{page.PAGE}: {page.MISSING}")
+            unavailable.append(f"{pages.PAGE}: {pages.MISSING}")
         evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
         write_files(evaluation, out)
         if self.page_clips:

@@ -3,10 +3,10 @@
     triplet --tokenize, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
 
 Each arrow is one compiled program (`compiled.py`); `encoding.py` has the first two. All denoising
-steps are one scan, without a round trip to the host. Embeddings, cross-attention keys and values and
-the condition's part of the patch embedding do not change between steps: they are computed before
-the scan. The noise is donated. An item's noise depends on its own seed only, so that a clip does
-not depend on its batch.
+steps are one scan, without a round trip to the host. Embeddings, cross-attention keys and values
+and the condition's part of the patch embedding do not change between steps: they are computed
+before the scan. The noise is donated. An item's noise depends on its own seed only, so that a clip
+does not depend on its batch.
 
 On a mesh (`sharding.py`) every batch is dealt out over data x fsdp; the devices along context share
 the denoising of a clip, and each of them encodes and decodes it, too.

@@ -5,9 +5,9 @@
 GENERATED and TARGET are video files. Ours: `psnr`, `ssim` and `frame_distances` with AlexNet.
 Theirs: torchmetrics' PSNR and SSIM if it is installed, else scikit-image's; and LPIPS computed
 eagerly in torch with the same weights (tests/unit/evaluation/metrics/test_lpips.py). Each clip is
-measured by both in turn, after a warm-up of both on its first frame; printed are seconds a clip, the ratio of
-each pair and their median, and the largest differences of all frames' values. Both use all cores
-given to the process (taskset -c 0,1).
+measured by both in turn, after a warm-up of both on its first frame; printed are seconds a clip,
+the ratio of each pair and their median, and the largest differences of all frames' values. Both
+use all cores given to the process (taskset -c 0,1).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Training a video VAE further, with a term that compares as eyes do and more weight on motion.
 
-To the loss of `autoencoding` comes LPIPS (`evaluation/metrics/lpips.py`, AlexNet) between some frames
-of the crop and of its reconstruction:
+LPIPS (`evaluation/metrics/lpips.py`, AlexNet) is added to the loss of `autoencoding` between some
+frames of the crop and of its reconstruction:
 
     perceptual_weight * mean over frames of LPIPS(y_t, x_t)
 
