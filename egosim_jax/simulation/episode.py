@@ -7,7 +7,7 @@
     clip_2/...              one folder per clip
     first_frame.png         first frame of the first clip, if it is known
 
-    {"format": "egosim_jax.simulation.episode", "version": 1, "kind": "human", "fps": 16,
+    {"format": "egosim_jax.episode", "version": 1, "kind": "human", "fps": 16,
      "height": 480, "width": 832, "prompts": ["The left hand ..."], "target_ids": [14],
      "sha256": {"clip_1/action.npz": "9a...", ...}}
 
@@ -44,7 +44,7 @@ from egosim_jax.simulation.actions import check_action, load_action, save_action
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, GroundTruth, InputError, SceneState, check_counts
 
-FORMAT, VERSION = "egosim_jax.simulation.episode", 1
+FORMAT, VERSION = "egosim_jax.episode", 1
 DESCRIPTION, FIRST_FRAME = "episode.json", "first_frame.png"
 MAX_CLIPS, MAX_BYTES = 1000, 1 << 32
 """Most clips of an episode, and most bytes of one in the byte format."""
