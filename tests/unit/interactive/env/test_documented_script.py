@@ -9,7 +9,7 @@ import egosim_jax.interactive.env
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.types import VideoSpec
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 VIDEO = VideoSpec(frames=17, height=8, width=16, fps=8)
 
 

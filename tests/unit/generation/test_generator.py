@@ -11,11 +11,11 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
+from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
+from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import Inputs, encode_condition
 from egosim_jax.generation.generator import Generator, NonFiniteError, denoise
-from egosim_jax.configs.model import ModelConfig, Networks
-from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from egosim_jax.cli.__main__ import main
 from egosim_jax.generation import rank
 from egosim_jax.generation.batch import BatchJob
-from egosim_jax.cli.__main__ import main
 from egosim_jax.perception.networks.xclip import prepare
 from egosim_jax.types import InputError
 from tests import shown

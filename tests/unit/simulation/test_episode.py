@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.simulation.actions import ORDERS, SHORTER, _bone_length
 from egosim_jax.simulation.episode import Episode, _read_ground_truth
-from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.state.snapshot import save
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_episode

@@ -2,8 +2,8 @@
 
 import pytest
 
-from egosim_jax.generation.batch import BatchJob
 from egosim_jax.data.windows import read_results
+from egosim_jax.generation.batch import BatchJob
 from egosim_jax.generation.generator import Generator, NonFiniteError
 from egosim_jax.io.video import read_video
 from egosim_jax.testing import random_triplet

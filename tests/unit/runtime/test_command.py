@@ -15,7 +15,6 @@ import pytest
 from packaging.requirements import Requirement
 
 import egosim_jax
-from egosim_jax.runtime import command
 from egosim_jax.cli.__main__ import Commands
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.cli.annotate import Annotate
@@ -24,12 +23,13 @@ from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.convert.__main__ import main as convert
+from egosim_jax.runtime import command
 from egosim_jax.train.__main__ import main as train
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipes import RECIPES
 from egosim_jax.types import InputError, MeshConfig
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.parametrize(

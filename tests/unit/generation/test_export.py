@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from egosim_jax.generation.export import write_conditions
 from egosim_jax.data.clips import load_triplet
 from egosim_jax.data.metadata import read_metadata
+from egosim_jax.generation.export import write_conditions
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_triplet
 
