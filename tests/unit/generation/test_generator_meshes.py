@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[3]
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     """Everything that `run_generator` computes, in one program that imports jax once."""
     folder = tmp_path_factory.mktemp("meshes")
-    command = [sys.executable, "-m", "tests.unit.generation.run_genera", str(folder)]
+    command = [sys.executable, "-m", "tests.unit.generation.run_generator", str(folder)]
     environment = os.environ | devices(8)
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
