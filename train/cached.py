@@ -32,7 +32,7 @@ from egosim_jax.data.moments import (
 from egosim_jax.data.pack import clip_metadata
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.generation.compiled import CompiledFn
-from egosim_jax.generation.encoding import Inputs
+from egosim_jax.generation.encoding import pack
 from egosim_jax.io.untrusted.pth import write_pth
 from egosim_jax.io.weights import hashes
 from egosim_jax.train.encode import Encoding, mask_of
@@ -113,9 +113,9 @@ def write_caches(config: ModelConfig, folder: Path, clips: Sequence[ClipFiles]) 
     encode = CompiledFn(_moments, networks)
     for files in clips:
         triplet = load_triplet(files, config.video, grid=config.grid)
-        inputs = Inputs.of([triplet], config)
+        batch = pack([triplet], config)
         videos = np.stack([getattr(triplet, name)[None] for name in VIDEOS])
-        means, logvars, text = encode(videos, inputs.ids, inputs.ids_mask)
+        means, logvars, text = encode(videos, batch["ids"], batch["ids_mask"])
         for name, mean, logvar in zip(VIDEOS, means, logvars, strict=True):
             write_moments(_cache(files, name), np.asarray(mean[0]), np.asarray(logvar[0]))
         write_pth(_cache(files, "text"), np.asarray(text[0]).astype(ml_dtypes.bfloat16))

@@ -41,7 +41,7 @@ from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.static import check_static
 from egosim_jax.generation.compiled import CompiledFn
-from egosim_jax.generation.encoding import Inputs
+from egosim_jax.generation.encoding import Batch, batch_shapes, pack
 from egosim_jax.generation.generator import batches, targets_of
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import open_folder
@@ -76,26 +76,24 @@ class Encoding:
 
         With frozen encoders they hold embeddings; with joint ones, the encoders' inputs.
         """
-        inputs = Inputs.of(triplets, self.config)
-        arrays = {"mask": inputs.mask, **self._encode(inputs, targets_of(triplets))}
-        if self.config.encoders == "joint":
-            arrays |= _encoder_inputs(inputs)
+        packed = pack(triplets, self.config)
+        encoded = self._encode({**packed, "target": targets_of(triplets)})
+        arrays = {**_kept(packed, self.config), **encoded}
         if any(triplet.tokens is not None for triplet in triplets):
-            arrays["image"] = inputs.image
-        present = {name: np.asarray(a) for name, a in arrays.items() if a is not None}
-        return [{name: a[i] for name, a in present.items()} for i in range(len(triplets))]
+            arrays["image"] = packed["image"]
+        arrays = {name: np.asarray(array) for name, array in arrays.items()}
+        return [{name: a[i] for name, a in arrays.items()} for i in range(len(triplets))]
 
 
 def _encode(
-    encoders: Networks, inputs: Inputs, target: jax.Array, *, posterior: str | None = None
+    encoders: Networks, batch: Batch, *, posterior: str | None = None
 ) -> dict[str, jax.Array]:
     """Encode one video after the other: the VAE is compiled once and needs little memory.
 
     With the posterior `sampled` there are deviations too, so that a training can draw.
     """
-    videos = {"target": target, "prior": inputs.prior, "hands": inputs.hands}
-    videos = {name: jnp.asarray(video) for name, video in videos.items() if video is not None}
-    stacked = jnp.stack([*videos.values()])
+    videos = [name for name in ("target", "prior", "hands") if name in batch]
+    stacked = jnp.stack([jnp.asarray(batch[name]) for name in videos])
     if posterior is None:
         latents = jax.lax.map(lambda video: encoders.vae.encode(to_model(video)), stacked)
         arrays = dict(zip(videos, latents, strict=True))
@@ -105,37 +103,35 @@ def _encode(
         arrays = dict(zip(videos, means, strict=True))
         arrays |= dict(zip((f"{name}{STD}" for name in videos), stds, strict=True))
     if encoders.text is not None:
-        arrays["text"] = encoders.text(inputs.ids, inputs.ids_mask)
-        if inputs.null_ids is not None and inputs.null_mask is not None:
-            arrays["null_text"] = encoders.text(inputs.null_ids, inputs.null_mask)
-    if encoders.image is not None and inputs.pixels is not None:
-        arrays["image"] = encoders.image(inputs.pixels)
+        arrays["text"] = encoders.text(batch["ids"], batch["ids_mask"])
+        if "null_ids" in batch:
+            arrays["null_text"] = encoders.text(batch["null_ids"], batch["null_mask"])
+    if encoders.image is not None and "pixels" in batch:
+        arrays["image"] = encoders.image(batch["pixels"])
     return arrays
 
 
-def _encoder_inputs(inputs: Inputs) -> dict[str, Any]:
-    """Return the inputs of encoders that are trained; None where the model has none."""
-    names = ("ids", "ids_mask", "null_ids", "null_mask", "pixels")
-    return {name: getattr(inputs, name) for name in names}
+def _kept(batch: Batch, config: ModelConfig) -> dict[str, Any]:
+    """Return the arrays of a batch that a record holds as they are."""
+    names = ["mask"]
+    if config.encoders == "joint":
+        names += ["ids", "ids_mask", "null_ids", "null_mask", "pixels"]
+    return {name: batch[name] for name in names if name in batch}
 
 
 def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeStruct]:
     """Return the shapes of a batch of a model's latents records."""
-    inputs, video = Inputs.shapes(batch, config), config.video
+    packed, video = batch_shapes(batch, config), config.video
     target = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
     graph, params = nnx.split(Networks.abstract(config, only=config.cached_networks))
     encoded = jax.eval_shape(
-        lambda params, *given: _encode(
-            nnx.merge(graph, params), *given, posterior=config.posterior
+        lambda params, arrays: _encode(
+            nnx.merge(graph, params), arrays, posterior=config.posterior
         ),
         params,
-        inputs,
-        target,
+        {**packed, "target": target},
     )
-    given = {"mask": inputs.mask}
-    if config.encoders == "joint":
-        given |= _encoder_inputs(inputs)
-    return {name: shape for name, shape in {**given, **encoded}.items() if shape is not None}
+    return {**_kept(packed, config), **encoded}
 
 
 def mask_of(config: ModelConfig) -> dict[str, Any]:

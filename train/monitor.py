@@ -292,7 +292,7 @@ def _generate(
     networks: Any = nnx.merge(graph, params)
     keys = jax.random.split(jax.random.key(0), len(batch["target"]))
     noise = jax.vmap(lambda key: jax.random.normal(key, batch["target"].shape[1:]))(keys)
-    condition = condition_of(networks, batch, model.zero_image(len(batch["target"])))
+    condition = condition_of(networks, batch, model)
     return denoise(networks.dit, condition, noise, model, keys)
 
 

@@ -1,15 +1,20 @@
-"""From triplets to the conditions of a denoiser: tokenize and pack, then encode."""
+"""From triplets to the conditions of a denoiser: pack them into arrays, then encode the arrays.
+
+    triplets --pack--> Batch --encode_condition--> Condition
+
+Training reads batches of latents shards, in which some arrays are encoded already. The same
+function encodes the rest.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, cast, no_type_check
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
+from jaxtyping import Array, Float, Key, UInt32
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.image import clip_pixels
@@ -25,121 +30,121 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.sharding import replicate_params
 from egosim_jax.types import InputError, Triplet
 
+Batch = Mapping[str, Any]
+"""Arrays of a batch of clips, by name. What a model does not have is absent.
 
-@no_type_check
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """Batch of triplets as arrays."""
+    prior hands target   uint8 videos `b f h w 3`; encoded: latents `b f h w z`
+    mask                 packed mask, uint8 `b f h w m`
+    ids ids_mask         tokens of the prompts `b n`; encoded: `text`, `b n d`
+    null_ids null_mask   tokens of `ModelConfig.unconditional_prompt`; encoded: `null_text`
+    pixels               first frames as CLIP takes them, float32 `b s s 3`; encoded: `image` `b m e`
+    seeds                seeds of the model's `encoding_noise`, uint32 `b`
+"""
 
-    prior: UInt8[Any, "b f h w 3"] | None
-    hands: UInt8[Any, "b f h w 3"] | None
-    mask: UInt8[Any, "b lf lh lw m"] | None
-    ids: Int[Any, "b n"]
-    ids_mask: Bool[Any, "b n"]
-    null_ids: Int[Any, "b n"] | None
-    """Token ids of the model's `unconditional_prompt`."""
-    null_mask: Bool[Any, "b n"] | None
-    pixels: Float[Any, "b s s 3"] | None
-    image: Float[Any, "b m e"] | None = None
-    """Image tokens of zeros, of a model that has them in place of an encoder's."""
-    seeds: UInt32[Any, " b"] | None = None
-    """Seeds of the model's `encoding_noise`; None without."""
 
-    @classmethod
-    def of(
-        cls, triplets: Sequence[Triplet], config: ModelConfig, seeds: Sequence[int] | None = None
-    ) -> Inputs:
-        """Tokenize the prompts, pack the masks and prepare the image for CLIP.
+def pack(
+    triplets: Sequence[Triplet], config: ModelConfig, seeds: Sequence[int] | None = None
+) -> dict[str, np.ndarray]:
+    """Return triplets as a batch: tokenize prompts, pack masks, resize the images for CLIP.
 
-        `seeds` are only needed, and kept, where the encoding is random.
-        """
-        tokens, layout = config.tokenizer.tokenize([t.prompt for t in triplets]), config.layout
-        masks = [layout.pack_mask(t.mask, config.grid) for t in triplets if "mask" in layout]
-        null = config.unconditional_prompt
-        nulls = None if null is None else config.tokenizer.tokenize([null] * len(triplets))
-        return cls(
-            prior=np.stack([t.prior for t in triplets]) if "prior" in layout else None,
-            hands=np.stack([t.hands for t in triplets]) if "hands" in layout else None,
-            mask=np.stack(masks) if "mask" in layout else None,
-            ids=tokens.ids,
-            ids_mask=tokens.mask,
-            null_ids=nulls and nulls.ids,
-            null_mask=nulls and nulls.mask,
-            pixels=config.image
-            and clip_pixels(
-                np.stack([t.first_frame for t in triplets]),
-                image_size=config.image.image_size,
-                image_range=config.image_range,
-            ),
-            image=config.given_image(triplets),
-            seeds=None if seeds is None or config.encoding_noise is None else last_32_bits(seeds),
+    `seeds` are only needed, and kept, where the encoding is random.
+    """
+    layout = config.layout
+    tokens = config.tokenizer.tokenize([t.prompt for t in triplets])
+    batch = {"ids": tokens.ids, "ids_mask": tokens.mask}
+    if config.unconditional_prompt is not None:
+        null = config.tokenizer.tokenize([config.unconditional_prompt] * len(triplets))
+        batch |= {"null_ids": null.ids, "null_mask": null.mask}
+    for name in ("prior", "hands"):
+        if name in layout:
+            batch[name] = np.stack([getattr(t, name) for t in triplets])
+    if "mask" in layout:
+        batch["mask"] = np.stack([layout.pack_mask(t.mask, config.grid) for t in triplets])
+    if config.image is not None:
+        batch["pixels"] = clip_pixels(
+            np.stack([t.first_frame for t in triplets]),
+            image_size=config.image.image_size,
+            image_range=config.image_range,
         )
+    if (image := config.given_image(triplets)) is not None:
+        batch["image"] = image
+    if seeds is not None and config.encoding_noise is not None:
+        batch["seeds"] = last_32_bits(seeds)
+    return batch
 
-    @classmethod
-    def shapes(cls, batch: int, config: ModelConfig) -> Inputs:
-        """Return the shapes and dtypes of a batch, to compile for before there is one."""
-        shape = lambda dtype, *sizes: jax.ShapeDtypeStruct((batch, *sizes), dtype)  # noqa: E731
-        video, tokens, layout = config.video, config.tokenizer.max_tokens, config.layout
-        frames = shape(np.uint8, video.frames, video.height, video.width, 3)
-        size = config.image and config.image.image_size
-        mask = shape(np.uint8, *config.latent_shape, layout.count("mask"))
-        null, zeros = config.unconditional_prompt is not None, config.zero_image(1)
-        return cls(
-            prior=frames if "prior" in layout else None,
-            hands=frames if "hands" in layout else None,
-            mask=mask if "mask" in layout else None,
-            ids=shape(np.int32, tokens),
-            ids_mask=shape(np.bool_, tokens),
-            null_ids=shape(np.int32, tokens) if null else None,
-            null_mask=shape(np.bool_, tokens) if null else None,
-            pixels=size and shape(np.float32, size, size, 3),
-            image=None if zeros is None else shape(zeros.dtype, *zeros.shape[1:]),
-            seeds=None if config.encoding_noise is None else shape(np.uint32),
-        )
+
+def batch_shapes(size: int, config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shapes and dtypes of what `pack` returns, to compile for before there is one."""
+    video, layout = config.video, config.layout
+    frames = (video.frames, video.height, video.width, 3)
+    tokens = (config.tokenizer.max_tokens,)
+    shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+        "ids": (tokens, np.int32),
+        "ids_mask": (tokens, np.bool_),
+    }
+    if config.unconditional_prompt is not None:
+        shapes |= {"null_ids": (tokens, np.int32), "null_mask": (tokens, np.bool_)}
+    shapes |= {name: (frames, np.uint8) for name in ("prior", "hands") if name in layout}
+    if "mask" in layout:
+        shapes["mask"] = (*config.latent_shape, layout.count("mask")), np.uint8
+    if config.image is not None:
+        shapes["pixels"] = (config.image.image_size, config.image.image_size, 3), np.float32
+    if (zeros := config.zero_image(1)) is not None:
+        shapes["image"] = zeros.shape[1:], zeros.dtype
+    if config.encoding_noise is not None:
+        shapes["seeds"] = (), np.uint32
+    return {name: jax.ShapeDtypeStruct((size, *s), dtype) for name, (s, dtype) in shapes.items()}
 
 
 def encode_condition(
-    networks: Networks, inputs: Inputs, noise: EncodingNoise | None = None
+    networks: Networks, batch: Batch, noise: EncodingNoise | None = None
 ) -> Condition:
-    """Encode the conditions: videos to latents, prompt and image to tokens.
+    """Encode what is not encoded yet: videos to latents, prompts and images to embeddings.
 
-    `noise` draws from the inputs' seeds.
+    An array whose network is absent is taken as it is. `noise` draws from the batch's seeds.
     """
     noise = noise or EncodingNoise()
-    if inputs.seeds is None and noise != EncodingNoise():
+    if "seeds" not in batch and noise != EncodingNoise():
         raise InputError("A random encoding needs seeds: give each triplet one. (seeds)")
-    keys: Any = (
-        () if inputs.seeds is None else (keys_for(inputs.seeds, 2), keys_for(inputs.seeds, 3))
-    )
-
-    def encode(video: Array | None, *, std: float = 0.0, drawn: bool = False) -> Array | None:
-        if video is None:
-            return None
-        pixels: Any = to_model(video)
-        if std:
-            pixels = add_pixel_noise(pixels, std, keys[0])
-        if drawn:
-            return draw(*posterior(cast(NormalizedCodec, networks.vae), pixels), keys[1])
-        return networks.vae.encode(pixels)
-
-    embed = replicate_params(networks.text)
+    mask = batch.get("mask")
     return Condition(
-        mask=None if inputs.mask is None else inputs.mask.astype(jnp.float32),
-        prior=encode(inputs.prior, std=noise.prior_pixels),
-        hands=encode(inputs.hands, drawn=noise.hands),
-        text=embed(inputs.ids, inputs.ids_mask),
-        null_text=None
-        if inputs.null_ids is None or inputs.null_mask is None
-        else embed(inputs.null_ids, inputs.null_mask),
-        image=inputs.image
-        if networks.image is None or inputs.pixels is None
-        else replicate_params(networks.image)(inputs.pixels),
+        mask=None if mask is None else mask.astype(jnp.float32),
+        prior=_latents(networks, batch, "prior", pixel_std=noise.prior_pixels),
+        hands=_latents(networks, batch, "hands", drawn=noise.hands),
+        text=_embeddings(networks, batch, "text", "ids", "ids_mask"),
+        null_text=_embeddings(networks, batch, "null_text", "null_ids", "null_mask"),
+        image=batch.get("image")
+        if networks.image is None or "pixels" not in batch
+        else replicate_params(networks.image)(batch["pixels"]),
     )
+
+
+def _latents(
+    networks: Networks, batch: Batch, name: str, *, pixel_std: float = 0.0, drawn: bool = False
+) -> Any:
+    """Return the latents of a video, the mean of the VAE's posterior or drawn from it."""
+    if name not in batch or networks.vae is None:
+        return batch.get(name)
+    pixels = to_model(batch[name])
+    if pixel_std:
+        pixels = add_pixel_noise(pixels, pixel_std, keys_for(batch["seeds"], 2))
+    if drawn:
+        codec = cast(NormalizedCodec, networks.vae)
+        return draw(*posterior(codec, pixels), keys_for(batch["seeds"], 3))
+    return networks.vae.encode(pixels)
+
+
+def _embeddings(
+    networks: Networks, batch: Batch, name: str, ids: str, mask: str
+) -> Float[Array, "b n d"] | None:
+    """Return the embeddings of prompts, which a batch has itself where no encoder is given."""
+    if networks.text is None or ids not in batch:
+        return batch.get(name)
+    return replicate_params(networks.text)(batch[ids], batch[mask])
 
 
 def last_32_bits(seeds: Sequence[int]) -> UInt32[np.ndarray, " b"]:
-    """Return the part of each seed that counts, its last 32 bits."""
+    """Return the last 32 bits of each seed, the part that matters."""
     return np.array([seed & 0xFFFFFFFF for seed in seeds], np.uint32)
 
 

@@ -1,6 +1,6 @@
 """From conditions to a clip: encode, denoise, decode.
 
-    triplet --tokenize, pack--> Inputs --encode--> Condition --denoise--> latents --decode--> clip
+    triplets --pack--> Batch --encode--> Condition --denoise--> latents --decode--> clips
 
 Each arrow is one compiled program (`compiled.py`); `encoding.py` has the first two. All denoising
 steps are one scan, without a round trip to the host. Embeddings, cross-attention keys and values
@@ -32,7 +32,13 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
 from egosim_jax.generation.compiled import CompiledFn
-from egosim_jax.generation.encoding import Inputs, encode_condition, keys_for, last_32_bits
+from egosim_jax.generation.encoding import (
+    batch_shapes,
+    encode_condition,
+    keys_for,
+    last_32_bits,
+    pack,
+)
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import Denoiser
@@ -111,7 +117,7 @@ class Generator:
         self.renderer = renderer
         self.networks = networks = shard_params(networks, mesh)
         self._encode = CompiledFn(
-            lambda networks, inputs: encode_condition(networks, inputs, config.encoding_noise),
+            lambda networks, batch: encode_condition(networks, batch, config.encoding_noise),
             networks,
             mesh=mesh,
             cache_key=("encode", config),
@@ -178,11 +184,11 @@ class Generator:
 
     def programs(self, batch: int) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """Yield name, function and input shapes of each function that `generate` calls."""
-        inputs = Inputs.shapes(batch, self.config)
-        yield "encode", self._encode, (inputs,)
+        arrays = batch_shapes(batch, self.config)
+        yield "encode", self._encode, (arrays,)
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
         yield "noise", self._noise, (seeds,)
-        given = self._encode.shapes(inputs), self._noise.shapes(seeds), *self._stepping(seeds)
+        given = self._encode.shapes(arrays), self._noise.shapes(seeds), *self._stepping(seeds)
         yield "denoise", self._denoise, given
         yield "decode", self._decode, (self._denoise.shapes(*given),)
 
@@ -214,7 +220,7 @@ class Generator:
         without: ConditionName | None = None,
     ) -> Float[Array, "b f h w z"]:
         """Return the latents that `generate` decodes; raises what it raises."""
-        condition = self._encode(Inputs.of(triplets, self.config, seeds))
+        condition = self._encode(pack(triplets, self.config, seeds))
         if without is not None:
             condition = condition.drop(without)
         latents = self._denoise(condition, self.noise(seeds), *self._stepping(last_32_bits(seeds)))

@@ -33,7 +33,7 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig, Networks
-from egosim_jax.generation.encoding import Inputs
+from egosim_jax.generation.encoding import batch_shapes
 from egosim_jax.generation.generator import Generator
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import init_sharded
@@ -183,7 +183,7 @@ def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         _timed(line, f"{name}_compile_s", lambda p=program, g=given: p.compile(*g) and None)
         programs[name] = program
     yield line
-    inputs = _draw(Inputs.shapes(options.clips, config))
+    inputs = _draw(batch_shapes(options.clips, config))
     seeds = jnp.arange(options.clips, dtype=jnp.uint32)
     needed = options.clips * options.steps * _forward_flops(config)
     for attempt in range(options.repeats):

@@ -127,7 +127,7 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
         """The task, but for noise and noise levels, which are the batch's."""
 
         def loss(self, networks: Networks, batch: Any, keys: jax.Array) -> tuple[jax.Array, dict]:
-            condition = condition_of(networks, batch)
+            condition = condition_of(networks, batch, self.model)
 
             def velocity(x: jax.Array, t: jax.Array) -> jax.Array:
                 channels = config.layout.assemble(x, condition)

@@ -40,7 +40,7 @@ class Routing(Denoising):
         self, networks: Networks, batch: Mapping[str, Array], keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout and routing."""
-        condition = self.dropout.apply(condition_of(networks, batch), keys[:, 0])
+        condition = self.dropout.apply(condition_of(networks, batch, self.model), keys[:, 0])
         target, dit = batch["target"], networks.dit
         channels = self.model.layout.condition_channels(condition, target)
         context = dit.prepare(channels, condition.text, condition.image)

@@ -22,7 +22,7 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.generation.encoding import Inputs, encode_condition
+from egosim_jax.generation.encoding import encode_condition, pack
 from egosim_jax.generation.generator import Generator, denoise
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.config import WanDiTConfig
@@ -143,11 +143,12 @@ def triplet():
 def encoded_by_theirs(theirs, inputs):
     """Text, image and the condition's channels, all channel-first."""
     with torch.no_grad():
-        mask = torch.tensor(inputs.ids_mask.astype(np.int64))
-        text = theirs["text"](torch.tensor(inputs.ids.astype(np.int64)), mask).last_hidden_state
-        pixels = torch.tensor(rearrange(inputs.pixels, "b h w c -> b c h w"))
+        mask = torch.tensor(inputs["ids_mask"].astype(np.int64))
+        text = theirs["text"](torch.tensor(inputs["ids"].astype(np.int64)), mask).last_hidden_state
+        pixels = torch.tensor(rearrange(inputs["pixels"], "b h w c -> b c h w"))
         image = theirs["image"](pixels, output_hidden_states=True).hidden_states[-2]
-        prior = torch.tensor(rearrange(inputs.prior / 127.5 - 1, "b f h w c -> b c f h w")).float()
+        video = rearrange(inputs["prior"] / 127.5 - 1, "b f h w c -> b c f h w")
+        prior = torch.tensor(video).float()
         latents = theirs["vae"].encode(prior).latent_dist.mode()
     mean, std = (
         torch.tensor(values).reshape(1, -1, 1, 1, 1)
@@ -157,7 +158,7 @@ def encoded_by_theirs(theirs, inputs):
 
 
 def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, triplet):
-    inputs = Inputs.of([triplet], CONFIG)
+    inputs = pack([triplet], CONFIG)
     generator = Generator(CONFIG, converted)
     noise = np.asarray(generator.noise([3]))
     condition = jax.jit(encode_condition)(converted, inputs)
@@ -187,7 +188,7 @@ def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, trip
 
 
 def test_the_conditions_are_those_of_diffusers(converted, theirs, triplet):
-    inputs = Inputs.of([triplet], CONFIG)
+    inputs = pack([triplet], CONFIG)
     condition = jax.jit(encode_condition)(converted, inputs)
     text, image, latents, *_ = encoded_by_theirs(theirs, inputs)
     for have, want in (

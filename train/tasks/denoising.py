@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
@@ -23,6 +22,7 @@ from egosim_jax.conditioning.posterior import STD, draw
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
+from egosim_jax.generation.encoding import encode_condition
 from egosim_jax.models import lora
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError
@@ -117,8 +117,8 @@ class Denoising:
             batch = drawn(batch, keys[:, 1])
         if self.navigation:
             batch = without_hands(batch, keys[:, 0], self.navigation)
-        zeros = self.model.zero_image(len(batch["target"]))
-        condition = self.dropout.apply(condition_of(networks, batch, zeros), keys[:, 0])
+        condition = condition_of(networks, batch, self.model)
+        condition = self.dropout.apply(condition, keys[:, 0])
         process, target = self.model.process, batch["target"]
         denoise = _denoise(self.model, networks, condition, target)
         weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
@@ -131,7 +131,7 @@ class Denoising:
         The noise is fixed by the number of the record, in whatever batch it is.
         """
         target = batch["target"]
-        condition = condition_of(networks, batch, self.model.zero_image(len(target)))
+        condition = condition_of(networks, batch, self.model)
         denoise = _denoise(self.model, networks, condition, target)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), batch["record"])
         noise = jax.vmap(lambda key: jax.random.normal(key, target.shape[1:]))(keys)
@@ -178,29 +178,11 @@ def without_hands(batch: Batch, keys: Key[Array, " b"], rate: float) -> Batch:
     }
 
 
-def condition_of(networks: Networks, batch: Batch, zeros: np.ndarray | None = None) -> Condition:
-    """Return the condition of a cached batch, under encoders that are trained or cached.
-
-    `zeros` are the image tokens of a model without an encoder that has them.
-    """
-    if networks.text is None:
-        text, null_text = batch["text"], batch.get("null_text")
-    else:
-        text = networks.text(batch["ids"], batch["ids_mask"])
-        null = "null_ids" in batch
-        null_text = networks.text(batch["null_ids"], batch["null_mask"]) if null else None
-    if networks.image is None:
-        image: Any = batch.get("image", None if zeros is None else jnp.asarray(zeros))
-    else:
-        image = networks.image(batch["pixels"])
-    return Condition(
-        mask=batch.get("mask"),
-        prior=batch.get("prior"),
-        hands=batch.get("hands"),
-        text=text,
-        null_text=null_text,
-        image=image,
-    )
+def condition_of(networks: Networks, batch: Batch, model: ModelConfig) -> Condition:
+    """Return the condition of a batch of latents records, encoded by the networks in training."""
+    zeros = model.zero_image(len(batch["target"]))
+    image = {} if zeros is None else {"image": jnp.asarray(zeros)}
+    return encode_condition(networks, {**image, **batch})
 
 
 def loss_weights(

@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.conditioning.layout import DWM_WAN
 from egosim_jax.conditioning.posterior import EncodingNoise
-from egosim_jax.generation.encoding import Inputs
+from egosim_jax.generation.encoding import pack
 from egosim_jax.generation.generator import Generator
 from egosim_jax.testing import random_triplet, tiny_model
 from tests import shown
@@ -75,7 +75,7 @@ def test_noise_of_hands_and_of_the_prior_do_not_depend_on_each_other(clip):
 
 def test_image_tokens_without_an_encoder_are_zeros_unless_a_clip_has_others(clip):
     zeros = np.zeros((3, DIT.image_dim), np.float32)
-    np.testing.assert_array_equal(Inputs.of([clip], TOKENS).image, zeros[None])
+    np.testing.assert_array_equal(pack([clip], TOKENS)["image"], zeros[None])
     without = latents(clip, "hands", model=TOKENS)
     given = latents(replace(clip, tokens=zeros), "hands", model=TOKENS)
     np.testing.assert_array_equal(without, given)

@@ -14,7 +14,7 @@ from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
 from egosim_jax.generation.compiled import CompiledFn
-from egosim_jax.generation.encoding import Inputs, encode_condition
+from egosim_jax.generation.encoding import encode_condition, pack
 from egosim_jax.generation.generator import Generator, NonFiniteError, denoise
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
@@ -50,7 +50,7 @@ def test_a_batch_of_four_equals_four_batches_of_one(networks, triplets):
 
     def latents(batch: list[Triplet], seeds: list[int]) -> np.ndarray:
         noise = Generator(CONFIG, networks).noise(seeds)
-        return np.asarray(walk(encode(Inputs.of(batch, CONFIG)), noise))
+        return np.asarray(walk(encode(pack(batch, CONFIG)), noise))
 
     together = latents(triplets, [3, 1, 4, 1])
     alone = np.concatenate(
@@ -102,7 +102,7 @@ def test_a_solver_that_does_not_fit_the_process_is_refused():
 
 def test_each_condition_changes_the_latents(networks, triplets):
     """Text, image, prior, hands and mask all reach the denoiser."""
-    condition = CompiledFn(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
+    condition = CompiledFn(encode_condition, networks)(pack(triplets[:1], CONFIG))
     noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.latent_shape, 16))
     run = jax.jit(lambda condition: denoise(networks.dit, condition, noise, CONFIG))
     full = run(condition)
@@ -112,7 +112,7 @@ def test_each_condition_changes_the_latents(networks, triplets):
 
 
 def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, triplets):
-    condition = CompiledFn(encode_condition, networks)(Inputs.of(triplets[:1], CONFIG))
+    condition = CompiledFn(encode_condition, networks)(pack(triplets[:1], CONFIG))
     noise = jax.random.normal(jax.random.key(0), (1, *CONFIG.latent_shape, 16))
 
     def at(scale: float) -> Callable[..., jax.Array]:

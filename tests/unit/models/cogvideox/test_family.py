@@ -14,7 +14,7 @@ from egosim_jax.conditioning.layout import DWM
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion import Guidance
 from egosim_jax.generation.compiled import CompiledFn
-from egosim_jax.generation.encoding import Inputs, encode_condition
+from egosim_jax.generation.encoding import encode_condition, pack
 from egosim_jax.generation.generator import Generator
 from egosim_jax.testing import random_triplet
 from egosim_jax.train.encode import Encoding, example_shapes
@@ -32,7 +32,7 @@ def networks():
 
 @pytest.fixture(scope="module")
 def condition(networks):
-    inputs = Inputs.of([random_triplet(TINY.video, seed, observed=True) for seed in range(2)], TINY)
+    inputs = pack([random_triplet(TINY.video, seed, observed=True) for seed in range(2)], TINY)
     return CompiledFn(encode_condition, networks)(inputs)
 
 
@@ -76,7 +76,7 @@ def test_cached_clips_hold_the_empty_prompt_that_training_drops_to(networks):
     batch = {name: jnp.asarray(a)[None] for name, a in record.items()}
     task = Denoising(model=TINY, dropout=ConditionDropout(text=1.0))
     trained = Networks(dit=networks.dit)
-    dropped = task.dropout.apply(condition_of(trained, batch), jax.random.key(0))
+    dropped = task.dropout.apply(condition_of(trained, batch, TINY), jax.random.key(0))
     np.testing.assert_array_equal(dropped.text[0], record["null_text"])
     loss, _ = task.loss(trained, batch, task.keys(jax.random.key(0), 1))
     assert np.isfinite(loss)
