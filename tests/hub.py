@@ -41,6 +41,12 @@ class Hub:
             siblings.append(about | ({"lfs": lfs} if len(data) > LARGE else {}))
         return {"id": self.repository, "sha": self.commit, "siblings": siblings}
 
+    def tree(self):
+        return [
+            {"type": "file", "path": file["rfilename"], "size": file["size"], "oid": file["blobId"]}
+            for file in self.info()["siblings"]
+        ]
+
 
 def _handler(hub):
     class Handler(BaseHTTPRequestHandler):
@@ -62,7 +68,7 @@ def _handler(hub):
         def do_GET(self):
             hub.requests.append((self.command, self.path, self.headers.get("Range")))
             api = re.match(
-                rf"/api/models/{hub.repository}(?:/revision/([^?]+))?(?:\?|$)", self.path
+                rf"/api/models/{hub.repository}(?:/(?:revision|tree)/([^?]+))?(?:\?|$)", self.path
             )
             file = re.match(rf"/{hub.repository}/resolve/([^/]+)/(.+)$", self.path)
             wanted = (api or file) and (api or file)[1]
@@ -70,7 +76,7 @@ def _handler(hub):
                 error = "RevisionNotFound" if api or file else "RepoNotFound"
                 self._send(404, head=[("X-Error-Code", error)])
             elif api:
-                body = json.dumps(hub.info()).encode()
+                body = json.dumps(hub.tree() if "/tree/" in self.path else hub.info()).encode()
                 self._send(200, body, [("Content-Type", "application/json")])
             else:
                 self._file(file[2])

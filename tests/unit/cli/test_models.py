@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.cli.models import Fetch
-from egosim_jax.convert.commands import ToTorch
+from egosim_jax.convert.commands import ToTorch, Weights
 from egosim_jax.io import hub
 from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.runtime.command import ExitCode
@@ -118,31 +118,29 @@ def test_a_fetch_that_was_killed_after_the_record_removes_the_download(served):
 
 def test_an_interrupted_fetch_keeps_its_complete_networks(served, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(hub, "as_record", interrupt_after_download())
+        patch.setattr(Weights, "run", interrupted_after(Weights.run))
         with pytest.raises(KeyboardInterrupt):
             Fetch(name="debug").run()
-    folder, listing = hub.fetched_folder("debug"), hub.list_files(configs.release("debug"))
+    folder, (_, sizes) = hub.fetched_folder("debug"), hub.list_files(configs.release("debug"))
     networks = sorted(folder.glob("*.safetensors"))
     before = [file.stat().st_ino for file in networks]
     there = sum(f.stat().st_size for f in networks)
-    assert hub.bytes_needed(listing, folder) <= max(listing.bytes - there, 0)
+    size = sum(sizes.values())
+    assert hub.bytes_needed(size, folder) <= max(size - there, 0)
     assert main(["models", "fetch", "debug"]) == ExitCode.DONE
     assert [file.stat().st_ino for file in networks] == before
     assert hub.is_fetched(folder)
     assert not list(folder.glob("*.log"))
 
 
-def interrupt_after_download():
-    """Return an `as_record` that is interrupted when all networks are converted."""
-    real, calls = hub.as_record, []
+def interrupted_after(convert):
+    """Return a conversion that is interrupted when all networks are converted."""
 
-    def as_record(*args):
-        calls.append(args)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*args)
+    def run(*args, **options):
+        convert(*args, **options)
+        raise KeyboardInterrupt
 
-    return as_record
+    return run
 
 
 def test_networks_out_of_a_wheel_are_listed_and_shown_before_they_are_fetched(

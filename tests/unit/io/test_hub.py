@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from huggingface_hub.errors import OfflineModeIsEnabled
 
 from egosim_jax.io import hub
 from egosim_jax.io.untrusted.bounded import read_json
@@ -36,11 +37,11 @@ def served(tmp_path, monkeypatch):
 
 
 def fetch(release, folder):
-    return hub.download(release, hub.list_files(release), folder)
+    return hub.download(hub.list_files(release)[0], folder)
 
 
 def test_only_the_files_of_the_release_are_downloaded_and_their_hashes_recorded(served, tmp_path):
-    hashes = fetch(RELEASE, tmp_path / "here")
+    hashes = fetch(RELEASE, tmp_path / "here").files
     names = {p.name for p in (tmp_path / "here").iterdir() if not p.name.startswith(".")}
     assert names == {"weights.bin", "tokenizer"}
     data = (served.folder / "weights.bin").read_bytes()
@@ -48,7 +49,7 @@ def test_only_the_files_of_the_release_are_downloaded_and_their_hashes_recorded(
     assert hashes["weights.bin"] == hashlib.sha256(data).hexdigest()
     record = read_json(hub.record_path(RELEASE.name))
     assert record["revision"] == COMMIT
-    assert record["files"]["tokenizer/tokenizer.json"]["bytes"] == 2
+    assert record["files"]["tokenizer/tokenizer.json"] == hashlib.sha256(b"{}").hexdigest()
 
 
 def test_a_download_that_was_cut_off_continues_after_its_bytes(served, tmp_path):
@@ -66,16 +67,16 @@ def test_a_second_fetch_downloads_nothing(served, tmp_path):
 
 
 def test_a_damaged_file_is_removed_and_named(served, tmp_path):
-    listing = hub.list_files(RELEASE)
-    hub.download(RELEASE, listing, tmp_path / "here")
+    release, _ = hub.list_files(RELEASE)
+    hub.download(release, tmp_path / "here")
     path = tmp_path / "here" / "weights.bin"
     data = bytearray(path.read_bytes())
     data[7] ^= 1
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"weights\.bin has SHA-256 [0-9a-f]{64}; expected"):
-        hub.download(RELEASE, listing, tmp_path / "here")
+        hub.download(release, tmp_path / "here")
     assert not path.exists()
-    hub.download(RELEASE, listing, tmp_path / "here")
+    hub.download(release, tmp_path / "here")
     assert path.read_bytes() == (served.folder / "weights.bin").read_bytes()
 
 
@@ -91,7 +92,7 @@ def test_the_first_fetch_pins_the_commit(served, tmp_path):
     with pytest.raises(InputError, match="cannot be downloaded"):
         fetch(RELEASE, tmp_path / "there")
     hub.record_path(RELEASE.name).unlink()
-    assert hub.list_files(RELEASE).revision == "f" * 40
+    assert hub.list_files(RELEASE)[0].revision == "f" * 40
 
 
 def test_a_file_that_the_first_fetch_hashed_must_stay_the_same(served, tmp_path):
@@ -112,6 +113,20 @@ def test_a_hub_that_cannot_be_reached_is_one_message(served):
     with pytest.raises(InputError, match="someone/else cannot be downloaded") as refused:
         hub.list_files(release)
     assert "\n" not in str(refused.value)
+
+
+def test_a_hub_that_fails_after_its_listing_leaves_no_incomplete_download(
+    served, tmp_path, monkeypatch
+):
+    def fail(*args, **options):
+        raise OfflineModeIsEnabled("the network is gone")
+
+    release, _ = hub.list_files(RELEASE)
+    (tmp_path / "here" / "tokenizer").mkdir(parents=True)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_tree", fail)
+    with pytest.raises(InputError, match=r"cannot be downloaded.*Run the same command again"):
+        hub.download(release, tmp_path / "here")
+    assert not hub.record_path(RELEASE.name).exists()
 
 
 @pytest.mark.parametrize("name", ["../weights.bin", "/etc/weights.bin", "a/.hidden/weights.bin"])
@@ -163,12 +178,9 @@ def test_text_of_the_hub_is_escaped_and_cut_in_messages(served, monkeypatch):
 
 
 def test_blocks_of_an_incomplete_network_count_as_disk_space_that_is_there(tmp_path):
-    listing = hub.Listing(
-        revision=COMMIT, files=(hub.RemoteFile(path="a", bytes=10**6, sha256=None),)
-    )
     with (tmp_path / "dit.safetensors.part").open("wb") as file:
         file.write(bytes(100_000))
         file.truncate(10**6)
     (tmp_path / "dit.safetensors.part.log").touch()
-    needed = hub.bytes_needed(listing, tmp_path)
+    needed = hub.bytes_needed(10**6, tmp_path)
     assert 1_890_000 < needed <= 1_900_000
