@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 
+from egosim_jax.perception.hands.litert import HandNetworks
 from egosim_jax.perception.hands.palms import make_anchors
 
 PALM = [0, 1, 2, 5, 9, 13, 17]
@@ -35,9 +36,9 @@ def paint(hands, *, right=True, hidden=(), shape=(240, 320)):
     return frames
 
 
-def _joints(picture):
-    """Return the joints that a picture shows, in pixels from edge to edge, or None."""
-    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+def _joints(image):
+    """Return the joints that an image shows, in pixels from edge to edge, or None."""
+    red, green, blue = image.astype(int).transpose(2, 0, 1)
     sure = np.isin(green, (_HIDDEN, _VISIBLE)) & np.isin(blue, (150, 250))
     joints = []
     for j in range(21):
@@ -48,28 +49,26 @@ def _joints(picture):
     return np.array(joints), green[sure].max() == _VISIBLE, blue[sure].max() == 250
 
 
-class PaintedHands:
-    """Networks (`detect.HandNetworks`) that see one painted hand in a picture."""
+class PaintedHands(HandNetworks):
+    """Networks that see one painted hand in an image."""
 
-    def palms(self, pictures):
-        """Return a palm at the first anchor for each picture whose hand shows its palm."""
-        boxes = np.zeros((len(pictures), 2016, 18), np.float32)
-        logits = np.full((len(pictures), 2016), -50, np.float32)
-        for i, picture in enumerate(pictures):
-            if (seen := _joints(picture)) is not None and seen[1]:
-                joints = seen[0]
-                keypoints = joints[[0, 5, 9, 13, 17, 1, 2]] - 192 * make_anchors()[0]
-                center = joints[PALM].mean(0) - 192 * make_anchors()[0]
-                size = [np.ptp(joints[PALM]) / 2] * 2
-                boxes[i, 0], logits[i, 0] = [*center, *size, *keypoints.ravel()], 4
+    def __init__(self):
+        pass
+
+    def palms(self, image):
+        """Return a palm at the first anchor if the hand shows its palm."""
+        boxes, logits = np.zeros((2016, 18), np.float32), np.full(2016, -50, np.float32)
+        if (seen := _joints(image)) is not None and seen[1]:
+            joints = seen[0]
+            keypoints = joints[[0, 5, 9, 13, 17, 1, 2]] - 192 * make_anchors()[0]
+            center = joints[PALM].mean(0) - 192 * make_anchors()[0]
+            size = [np.ptp(joints[PALM]) / 2] * 2
+            boxes[0], logits[0] = [*center, *size, *keypoints.ravel()], 4
         return boxes, logits
 
-    def landmarks(self, pictures):
-        """Return the joints in each picture."""
-        joints = np.zeros((len(pictures), 21, 3), np.float32)
-        presence = np.zeros(len(pictures), np.float32)
-        right = np.full(len(pictures), 0.5, np.float32)
-        for i, picture in enumerate(pictures):
-            if (seen := _joints(picture)) is not None:
-                joints[i, :, :2], presence[i], right[i] = seen[0], 0.9, 0.95 if seen[2] else 0.05
-        return joints, presence, right, 0.001 * (joints - joints[:, :1])
+    def landmarks(self, image):
+        """Return the joints in the image."""
+        joints, presence, right = np.zeros((21, 3), np.float32), 0.0, 0.5
+        if (seen := _joints(image)) is not None:
+            joints[:, :2], presence, right = seen[0], 0.9, 0.95 if seen[2] else 0.05
+        return joints, presence, right, np.float32(0.001) * (joints - joints[:1])

@@ -2,7 +2,6 @@
 
 An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
 
-    hands     litert, jax                                 perception.hands, networks.hands
     masks     geometry, sam3=FOLDER, grounded-sam3=FOLDER, grounded-sam2=FOLDER,
               grounded-edgetam=FOLDER                     perception.silhouettes, networks
     cameras   ladder, depth-anything-3=FOLDER             perception.cameras, networks
@@ -75,11 +74,11 @@ class Estimators:
         from egosim_jax.perception.cameras import CameraLadder
         from egosim_jax.perception.cameras.colmap import require_pycolmap
         from egosim_jax.perception.hands import LandmarkHands
-        from egosim_jax.perception.hands.weights import files
+        from egosim_jax.perception.hands.litert import fetch_weights
 
         for part in vars(self).values():
             if isinstance(part, LandmarkHands):
-                files(part.weights, offline=part.offline)
+                fetch_weights(part.weights, offline=part.offline)
             elif isinstance(part, CameraLadder) and part.rung not in ("static", "rotation"):
                 require_pycolmap()
             elif (check := getattr(part, "check_installed", None)) is not None:
@@ -96,8 +95,6 @@ class AnnotateConfig:
     """Shots, windows and quality."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""
-    hands: Literal["litert", "jax"] = "litert"
-    """Program of the hand networks: LiteRT on the CPU, or JAX, in batches on an accelerator."""
     offline: bool = False
     """Refuse to fetch anything."""
     side: Side = "auto"
@@ -200,22 +197,12 @@ class AnnotateConfig:
         kind = _import(_DEPTH[name])
         depth = kind() if folder is None else kind(folder, **where)
         return Estimators(
-            hands=LandmarkHands(
-                weights=self.hand_weights, offline=self.offline, networks=self._hand_networks()
-            ),
+            hands=LandmarkHands(weights=self.hand_weights, offline=self.offline),
             cameras=cameras,
             depth=cast(DepthEstimator, depth),
             segmenter=segmenter,
             captioner=captioner,
         )
-
-    def _hand_networks(self) -> Any:
-        """Return the networks that replace LiteRT, or None."""
-        if self.hands == "litert":
-            return None
-        from egosim_jax.perception.networks.hands import JaxHandNetworks
-
-        return JaxHandNetworks(self.hand_weights, self.offline)
 
 
 def _find(known: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:

@@ -39,7 +39,7 @@ class Annotate:
             "min_hands", "min_sharpness", "max_black", "min_motion", "max_motion",
             "min_prior_gain",
         ),
-        "hands and masks": ("hand_weights", "hands", "side", "masks", "detector", "phrases"),
+        "hands and masks": ("hand_weights", "side", "masks", "detector", "phrases"),
         "cameras and scene": (
             "focal", "rung", "scale", "camera_height", "state", "renderer",
         ),
@@ -75,8 +75,6 @@ class Annotate:
     """Smallest PSNR of the prior in decibels, compared with that of the first frame repeated."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""
-    hands: Literal["litert", "jax"] = "litert"
-    """Program of the hand networks: LiteRT on the CPU, or JAX, in batches on an accelerator."""
     offline: bool = False
     """Fetch nothing: refuse if something is missing."""
     side: Literal["auto", "left", "right"] = "auto"
@@ -201,7 +199,6 @@ class Annotate:
             sampling=Sampling(size=size, fps=fps, num_frames=count),
             cutting=Cutting(clips=self.clips, quality=quality),
             hand_weights=self.hand_weights,
-            hands=self.hands,
             offline=self.offline,
             side=self.side,
             masks=self.masks,

@@ -111,7 +111,7 @@ class Fetch:
 
 def _wheels() -> dict[str, WheelFiles]:
     """Return the files that are taken out of wheels, by name."""
-    from egosim_jax.perception.hands.weights import MEDIAPIPE
+    from egosim_jax.perception.hands.litert import MEDIAPIPE
 
     return {MEDIAPIPE.name: MEDIAPIPE}
 

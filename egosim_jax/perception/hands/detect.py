@@ -1,63 +1,40 @@
 """Candidates of hands in every frame: detected palms, and hands followed from frame to frame.
 
-Both networks see one batch per round, over all frames: first the palms of all tiles, then the
-keypoints in the regions of all palms, then those in the regions that keypoints of a frame predict
-for the frames next to it, in both directions of time, until no new hand is found. A hand is thus
-found in frames in which its palm is not, before and after those in which it is. At last every hand
-is seen once more in the region that its keypoints give, which is narrower than a palm's.
+The first round over all frames detects the palms in all tiles, the second one the keypoints in the
+regions of these palms. Each further round follows new hands into the frames before and after
+theirs, where the keypoints predict a region, until it finds no hand. A hand is thus also found in
+frames that do not show its palm. Finally, each hand is seen again in the region that its keypoints
+predict, which is narrower than a palm's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, no_type_check, runtime_checkable
+from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
+from egosim_jax.perception.hands.litert import HandNetworks
 from egosim_jax.perception.hands.palms import Palms, cut_tile, decode_palms, make_tiles
 from egosim_jax.perception.hands.regions import (
     Regions,
     crop_region,
-    joints_in_picture,
+    joints_in_image,
     regions_of_joints,
     regions_of_palms,
     turned_back,
 )
 
-BATCH = 64
-"""Number of pictures that are given to a network at once."""
 _PALM = [0, 1, 2, 5, 9, 13, 17]
 _KNUCKLES = [5, 9, 13, 17]
 _BENT = [7, 8, 11, 12, 15, 16, 19, 20]
 _FOREARM_NATS = 10
-"""Log odds of a right hand per picture width that a forearm enters to the right of the middle."""
+"""Log odds of a right hand per image width that a forearm enters to the right of the middle."""
 _BEND_NATS = 10
 """Log odds of a right hand per length of the palm that its fingers bend to their side of it."""
 _OTHER_REGIONS = [(turn, scale) for turn in (-0.5, -0.25, 0.25, 0.5) for scale in (1.0, 1.4)]
 """Turns in radians, and scales, of the regions in which a hand of the other side is searched."""
-
-
-@runtime_checkable
-class HandNetworks(Protocol):
-    """Palm detector and landmark network of MediaPipe Hands."""
-
-    def palms(
-        self, pictures: UInt8[np.ndarray, "b 192 192 3"]
-    ) -> tuple[Float32[np.ndarray, "b 2016 18"], Float32[np.ndarray, "b 2016"]]:
-        """Return boxes with keypoints relative to the anchors, and logits."""
-        ...
-
-    def landmarks(
-        self, pictures: UInt8[np.ndarray, "b 224 224 3"]
-    ) -> tuple[
-        Float32[np.ndarray, "b 21 3"],
-        Float32[np.ndarray, " b"],
-        Float32[np.ndarray, " b"],
-        Float32[np.ndarray, "b 21 3"],
-    ]:
-        """Return keypoints in crop pixels, presence, probability of a right hand, and meters."""
-        ...
 
 
 @no_type_check
@@ -76,9 +53,9 @@ class Candidates:
     right: Float[np.ndarray, " n"]
     """Probability that it is a right hand, as the network says."""
     bend_right: Float[np.ndarray, " n"]
-    """Probability that its joints are those of a right hand, by how its fingers bend."""
+    """Probability that its joints are a right hand's, by how its fingers bend."""
     forearm_right: Float[np.ndarray, " n"]
-    """Probability that it is a right hand, by where its forearm enters the picture."""
+    """Probability that it is a right hand, by where its forearm enters the image."""
     palm: Float[np.ndarray, " n"]
     """Confidence from 0 to 1 that its palm was detected where its joints say."""
     again: Bool[np.ndarray, " n"]
@@ -103,7 +80,7 @@ class Candidates:
 
     @property
     def seems_right(self) -> Bool[np.ndarray, " n"]:
-        """True for hands whose joints are more likely those of a right one."""
+        """True for hands whose joints are more likely a right hand's."""
         return (self.right + self.bend_right) / 2 > 0.5
 
     @property
@@ -129,10 +106,10 @@ def relative_distance(
 def right_by_forearm(
     joints_px: Float[np.ndarray, "n 21 2"], height: int, width: int
 ) -> Float[np.ndarray, " n"]:
-    """Return the probability of right hands by where their forearms enter the wearer's picture.
+    """Return the probability of right hands by where their forearms enter the wearer's image.
 
-    A forearm continues the line from the knuckles to the wrist. That of a right hand crosses the
-    edge of the picture to the right of the middle; one that crosses the upper edge says nothing.
+    A forearm continues the line from the knuckles to the wrist. A right forearm crosses the edge of
+    the image to the right of the middle. One that crosses the upper edge gives no evidence.
     """
     wrist, size = joints_px[:, 0], np.array([width, height])
     along = wrist - joints_px[:, _KNUCKLES].mean(1)
@@ -240,16 +217,10 @@ def _find_palms(
     """Return the palms of the frames that are searched."""
     tiles = make_tiles(*frames.shape[1:3])
     palms = []
-    step = max(BATCH // len(tiles), 1)
-    for start in range(0, len(searched), step):
-        batch = searched[start : start + step]
-        pictures = np.stack([cut_tile(frames[f], tile) for f in batch for tile in tiles])
-        raw_boxes, logits = networks.palms(pictures)
-        for i in range(0, len(pictures), len(tiles)):
-            of_frame = slice(i, i + len(tiles))
-            palms.append(
-                decode_palms(raw_boxes[of_frame], logits[of_frame], tiles, min_score=min_palm)
-            )
+    for frame in searched:
+        outputs = [networks.palms(cut_tile(frames[frame], tile)) for tile in tiles]
+        boxes, logits = (np.stack(values) for values in zip(*outputs, strict=True))
+        palms.append(decode_palms(boxes, logits, tiles, min_score=min_palm))
     return palms
 
 
@@ -260,21 +231,15 @@ def _find_joints(
     regions: Regions,
     min_presence: float,
 ) -> Candidates:
-    """Return the hands in regions of frames, those that the network is confident of."""
-    parts = [(np.zeros((0, 21, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 21, 3)))]
-    for start in range(0, len(numbers), BATCH):
-        batch = range(start, min(start + BATCH, len(numbers)))
-        parts.append(
-            networks.landmarks(
-                np.stack([crop_region(frames[numbers[i]], regions, i) for i in batch])
-            )
-        )
-    crop, presence, right, meters = (
-        np.concatenate(p).astype(float) for p in zip(*parts, strict=True)
-    )
+    """Return the hands that the network is confident to see in regions of frames."""
+    crop, meters = np.zeros((2, len(numbers), 21, 3))
+    presence, right = np.zeros((2, len(numbers)))
+    for i, frame in enumerate(numbers):
+        image = crop_region(frames[frame], regions, i)
+        crop[i], presence[i], right[i], meters[i] = networks.landmarks(image)
     found = Candidates(
         frame=numbers,
-        joints_px=joints_in_picture(regions, crop[..., :2]),
+        joints_px=joints_in_image(regions, crop[..., :2]),
         joints_hand_m=turned_back(regions, meters),
         presence=presence,
         right=right,
@@ -293,7 +258,7 @@ def _refined(
     min_presence: float,
     same_hand: float,
 ) -> Candidates:
-    """Return candidates as the mean of what is found in their first region and in their own."""
+    """Return candidates averaged with the same hand as found in the region of its keypoints."""
     own = _find_joints(frames, networks, found.frame, regions_of_joints(found.joints_px), 0.0)
     same = relative_distance(own.joints_px, found.joints_px) <= same_hand
     sure = np.flatnonzero(same & (own.presence >= min_presence))

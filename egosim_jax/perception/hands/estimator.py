@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.perception.estimates import LEFT, RIGHT, HandTracks
-from egosim_jax.perception.hands import weights as hand_weights
-from egosim_jax.perception.hands.detect import (
-    Candidates,
-    HandNetworks,
-    find_candidates,
-    find_other_side,
-)
-from egosim_jax.perception.hands.litert import LiteRtNetworks
+from egosim_jax.perception.hands.detect import Candidates, find_candidates, find_other_side
+from egosim_jax.perception.hands.litert import HandNetworks, fetch_weights
 from egosim_jax.perception.hands.track import (
     TrackConfig,
     choose_tracks,
@@ -59,7 +54,7 @@ class LandmarkHands:
     """Maximum number of frames of a gap that is interpolated, and marked as such."""
     tracking: TrackConfig = field(default_factory=TrackConfig)
     networks: HandNetworks | None = None
-    """Networks to use instead of LiteRT on the CPU, such as the JAX program's."""
+    """Networks to use; None for those of `weights`."""
 
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
         """Return the hands of a video."""
@@ -69,21 +64,34 @@ class LandmarkHands:
         return replace(tracks, joints_px=(tracks.joints_px + 0.5) / scale - 0.5)
 
     def candidates(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Candidates:
-        """Return the possible hands of all frames, with those in gloves where there are no others.
+        """Return the possible hands of all frames, searched at the size they have.
 
-        Chosen hands whose joints are those of the other side are searched once more.
-
-        Frames are searched at the size they have.
+        Frames without a hand are searched again for gloves. Chosen hands whose joints seem to be of
+        the other side are searched again for their own side.
         """
-        found = self._candidates(frames)
+        search = partial(
+            find_candidates,
+            networks=self._networks,
+            min_palm=self.min_palm,
+            min_presence=self.min_presence,
+            same_hand=self.same_hand,
+        )
+        found = search(frames)
         if self.gloves and (empty := np.all(self._choose(found, len(frames)) < 0, axis=1)).any():
-            gloved = self._candidates(paint_skin(frames), wanted=empty)
+            gloved = search(paint_skin(frames), wanted=empty)
             found = found.join(gloved.take(gloved.presence >= self.min_gloved))
         path = self._choose(found, len(frames))
         for side in (LEFT, RIGHT):
             hands = found.take(path[path[:, side] >= 0, side])
-            other = hands.take(hands.seems_right != (side == RIGHT))
-            found = found.join(self._other_side(frames, other, right=side == RIGHT))
+            other = find_other_side(
+                frames,
+                self._networks,
+                hands.take(hands.seems_right != (side == RIGHT)),
+                right=side == RIGHT,
+                min_presence=self.min_presence,
+                same_hand=self.same_hand / 2,
+            )
+            found = found.join(other)
         return found.take(np.argsort(found.frame, kind="stable"))
 
     def tracks(self, found: Candidates, frames: int) -> HandTracks:
@@ -95,28 +103,8 @@ class LandmarkHands:
     def _networks(self) -> HandNetworks:
         if self.networks is not None:
             return self.networks
-        palms, landmarks = hand_weights.files(self.weights, offline=self.offline)
-        return LiteRtNetworks(palms, landmarks, threads=self.threads)
-
-    def _candidates(self, frames: np.ndarray, wanted: np.ndarray | None = None) -> Candidates:
-        return find_candidates(
-            frames,
-            self._networks,
-            min_palm=self.min_palm,
-            min_presence=self.min_presence,
-            same_hand=self.same_hand,
-            wanted=wanted,
-        )
-
-    def _other_side(self, frames: np.ndarray, hands: Candidates, *, right: bool) -> Candidates:
-        return find_other_side(
-            frames,
-            self._networks,
-            hands,
-            right=right,
-            min_presence=self.min_presence,
-            same_hand=self.same_hand / 2,
-        )
+        palms, landmarks = fetch_weights(self.weights, offline=self.offline)
+        return HandNetworks(palms, landmarks, threads=self.threads)
 
     def _choose(self, found: Candidates, frames: int) -> np.ndarray:
         return choose_tracks(found, frames, self.tracking, same_hand=self.same_hand)
@@ -143,23 +131,24 @@ def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w
 def _as_tracks(
     found: Candidates, path: np.ndarray, *, max_gap: int, max_motion: float
 ) -> HandTracks:
-    """Return the chosen candidates, smoothed, with short gaps filled; NaN where there is none."""
-    joints_px = np.full((*path.shape, 21, 2), np.nan)
-    joints_hand_m = np.full((*path.shape, 21, 3), np.nan)
-    presence = np.zeros(path.shape)
+    """Return the chosen candidates, smoothed, with short gaps filled; NaN where one is missing."""
     there = path >= 0
-    joints_px[there] = found.joints_px[path[there]]
-    joints_hand_m[there] = found.joints_hand_m[path[there]]
-    presence[there] = found.presence[path[there]]
-    mirrored = np.zeros(path.shape, bool)
-    mirrored[there] = (found.seems_right[path] != (np.arange(2) == RIGHT))[there]
+
+    def along_path(values: np.ndarray, missing: Any) -> np.ndarray:
+        result = np.full((*path.shape, *values.shape[1:]), missing)
+        result[there] = values[path[there]]
+        return result
+
+    joints_px = along_path(found.joints_px, np.nan)
+    joints_hand_m = along_path(found.joints_hand_m, np.nan)
     gaps = find_gaps(joints_px, most=max_gap, max_motion=max_motion)
     joints_px = fill_gaps(joints_px, gaps)
     weights = smoothing(joints_px, max_motion=max_motion / 2)
+    right = np.arange(2) == RIGHT
     return HandTracks(
         joints_px=smooth(joints_px, weights),
         joints_hand_m=smooth(fill_gaps(joints_hand_m, gaps), weights),
-        presence=presence,
+        presence=along_path(found.presence, 0.0),
         filled=gaps,
-        mirrored=mirrored,
+        mirrored=along_path(found.seems_right, right) != right,
     )

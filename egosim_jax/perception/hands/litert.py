@@ -1,4 +1,7 @@
-"""MediaPipe's hand networks on the CPU, by LiteRT."""
+"""MediaPipe's hand networks: their weights, out of a pinned wheel, and LiteRT, which runs them.
+
+The license of the weights (Apache-2.0) is kept with them.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +12,72 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.wheels import WheelFiles, check_files, fetch_wheel_files
 from egosim_jax.types import InputError
 
+PALMS, LANDMARKS = "palm_detection_full.tflite", "hand_landmark_full.tflite"
+MEDIAPIPE = WheelFiles(
+    name="hands",
+    requirement="mediapipe==0.10.14",
+    sha256="a807328339e7356fda0bb14df12fedbf1d33bdf81649c5f8666b0026b1cc30b4",
+    about="palm detection and hand landmarks of MediaPipe, Apache-2.0",
+    tags=(
+        "--implementation=cp",
+        "--python-version=3.11",
+        "--abi=cp311",
+        "--platform=manylinux_2_17_x86_64",
+    ),
+    files={
+        "mediapipe/modules/palm_detection/palm_detection_full.tflite": (
+            "1b14e9422c6ad006cde6581a46c8b90dd573c07ab7f3934b5589e7cea3f89a54"
+        ),
+        "mediapipe/modules/hand_landmark/hand_landmark_full.tflite": (
+            "11c272b891e1a99ab034208e23937a8008388cf11ed2a9d776ed3d01d0ba00e3"
+        ),
+        "mediapipe-0.10.14.dist-info/LICENSE": (
+            "8707eef0533987efc5b155d64761eeb6e20793f50b9bd1a68dad1cf4719d0ed8"
+        ),
+    },
+)
+"""The two networks and their license."""
 
-class LiteRtNetworks:
-    """Palm detector and landmark network (`detect.HandNetworks`), one picture at a time."""
+
+def fetch_weights(folder: Path | None = None, *, offline: bool = False) -> tuple[Path, Path]:
+    """Return the verified files of the palm detector and the landmark network.
+
+    They are in `folder` or, if None, in the user's cache. The first use fetches them to the cache.
+    """
+    if folder is None:
+        folder = fetch_wheel_files(MEDIAPIPE, offline=offline)
+    else:
+        check_files(MEDIAPIPE, folder)
+    return folder / PALMS, folder / LANDMARKS
+
+
+class HandNetworks:
+    """Palm detector and landmark network on the CPU, one image at a time."""
 
     def __init__(self, palms: Path, landmarks: Path, *, threads: int):
-        self._palms = _interpreter(palms, threads)
-        self._landmarks = _interpreter(landmarks, threads)
+        self._palms = _load(palms, threads)
+        self._landmarks = _load(landmarks, threads)
 
     def palms(
-        self, pictures: UInt8[np.ndarray, "b 192 192 3"]
-    ) -> tuple[Float32[np.ndarray, "b 2016 18"], Float32[np.ndarray, "b 2016"]]:
+        self, image: UInt8[np.ndarray, "192 192 3"]
+    ) -> tuple[Float32[np.ndarray, "2016 18"], Float32[np.ndarray, " 2016"]]:
         """Return boxes with keypoints relative to the anchors, and logits."""
-        boxes, logits = _run(self._palms, pictures)
-        return boxes, logits[..., 0]
+        boxes, logits = _run(self._palms, image)
+        return boxes, logits[:, 0]
 
     def landmarks(
-        self, pictures: UInt8[np.ndarray, "b 224 224 3"]
-    ) -> tuple[
-        Float32[np.ndarray, "b 21 3"],
-        Float32[np.ndarray, " b"],
-        Float32[np.ndarray, " b"],
-        Float32[np.ndarray, "b 21 3"],
-    ]:
+        self, image: UInt8[np.ndarray, "224 224 3"]
+    ) -> tuple[Float32[np.ndarray, "21 3"], float, float, Float32[np.ndarray, "21 3"]]:
         """Return keypoints in crop pixels, presence, probability of a right hand, and meters."""
-        joints, presence, right, meters = _run(self._landmarks, pictures)
-        return joints.reshape(-1, 21, 3), presence[:, 0], right[:, 0], meters.reshape(-1, 21, 3)
+        joints, presence, right, meters = _run(self._landmarks, image)
+        return joints.reshape(21, 3), presence.item(), right.item(), meters.reshape(21, 3)
 
 
-def _interpreter(path: Path, threads: int) -> Any:
+def _load(path: Path, threads: int) -> Any:
+    """Return LiteRT's interpreter of a file."""
     try:
         from ai_edge_litert.interpreter import Interpreter
     except ModuleNotFoundError as error:
@@ -55,13 +93,9 @@ def _interpreter(path: Path, threads: int) -> Any:
     return interpreter
 
 
-def _run(interpreter: Any, pictures: np.ndarray) -> list[np.ndarray]:
-    """Return the outputs for pictures in uint8, in the order of the model's outputs."""
+def _run(interpreter: Any, image: np.ndarray) -> list[np.ndarray]:
+    """Return the outputs for an image in uint8, in the order of the model's outputs."""
     inputs, outputs = interpreter.get_input_details(), interpreter.get_output_details()
-    results: list[list[np.ndarray]] = [[] for _ in outputs]
-    for picture in pictures:
-        interpreter.set_tensor(inputs[0]["index"], picture[None].astype(np.float32) / 255)
-        interpreter.invoke()
-        for result, output in zip(results, outputs, strict=True):
-            result.append(interpreter.get_tensor(output["index"]))
-    return [np.concatenate(result) for result in results]
+    interpreter.set_tensor(inputs[0]["index"], image[None].astype(np.float32) / 255)
+    interpreter.invoke()
+    return [interpreter.get_tensor(output["index"])[0] for output in outputs]

@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from egosim_jax.perception.hands.regions import PALM_KEYPOINTS
-
 INPUT = 192
 """Height and width of the detector's input in pixels."""
+PALM_KEYPOINTS = 7
+"""Number of keypoints of a detected palm: wrist, four knuckles, two of the thumb."""
 _GRIDS = ((24, 2), (12, 6))
+_POSITIONS = [0, *range(2, 2 + PALM_KEYPOINTS)]
+"""Rows of a detection that are positions: its center and keypoints. Row 1 is its size."""
 _MAX_LOGIT = 100.0
 
 
@@ -57,7 +59,7 @@ def make_anchors() -> Float32[np.ndarray, "2016 2"]:
 
 
 def make_tiles(height: int, width: int) -> list[Tile]:
-    """Return the tiles of a frame: one that holds it all, and squares along its longer side."""
+    """Return the tiles of a frame: one around all of it, and squares along its longer side."""
     long, short = max(height, width), min(height, width)
     tiles = [Tile((width - long) // 2, (height - long) // 2, long)]
     if long > 1.2 * short:
@@ -98,9 +100,9 @@ def decode_palms(
     for box, tile_score, tile in zip(boxes, score, tiles, strict=True):
         kept = tile_score >= min_score
         values = box[kept].reshape(-1, 2 + PALM_KEYPOINTS, 2).astype(np.float64) / INPUT
-        values[:, [0, *range(2, 2 + PALM_KEYPOINTS)]] += anchors[kept, None]
+        values[:, _POSITIONS] += anchors[kept, None]
         values *= tile.size_px
-        values[:, [0, *range(2, 2 + PALM_KEYPOINTS)]] += np.array([tile.left_px, tile.top_px]) - 0.5
+        values[:, _POSITIONS] += np.array([tile.left_px, tile.top_px]) - 0.5
         found_boxes.append(values)
         found_scores.append(tile_score[kept])
     return suppress_duplicates(np.concatenate(found_boxes), np.concatenate(found_scores))

@@ -13,8 +13,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-PALM_KEYPOINTS = 7
-"""Number of keypoints of a detected palm: wrist, four knuckles, two of the thumb."""
 CROP = 224
 """Height and width of the landmark network's input in pixels."""
 _SIZED_BY = np.array([0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18])
@@ -23,14 +21,14 @@ _SIZED_BY = np.array([0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18])
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Regions:
-    """Turned squares in pictures."""
+    """Rotated squares in images."""
 
     center_px: Float[np.ndarray, "n 2"]
     """Columns and rows of the centers in pixels."""
     size_px: Float[np.ndarray, " n"]
     """Lengths of the sides in pixels."""
     angle: Float[np.ndarray, " n"]
-    """Angles in radians by which a crop is turned clockwise into the picture."""
+    """Clockwise rotation in radians from the crop to the image."""
 
 
 def regions_of_palms(
@@ -56,10 +54,10 @@ def regions_of_joints(joints_px: Float[np.ndarray, "n 21 2"]) -> Regions:
 def crop_region(
     frame: UInt8[np.ndarray, "h w 3"], regions: Regions, index: int
 ) -> UInt8[np.ndarray, "224 224 3"]:
-    """Cut one region out of a frame, upright; zero outside the picture."""
-    to_picture = regions.size_px[index] / CROP * _turn(regions.angle[index : index + 1])[0]
-    center = regions.center_px[index] - to_picture @ np.full(2, (CROP - 1) / 2)
-    matrix = np.concatenate([to_picture, center[:, None]], axis=1)
+    """Cut one region out of a frame, upright; zero outside the image."""
+    to_image = regions.size_px[index] / CROP * _turn(regions.angle[index : index + 1])[0]
+    center = regions.center_px[index] - to_image @ np.full(2, (CROP - 1) / 2)
+    matrix = np.concatenate([to_image, center[:, None]], axis=1)
     return cv2.warpAffine(
         frame,
         matrix,
@@ -69,10 +67,10 @@ def crop_region(
     )
 
 
-def joints_in_picture(
+def joints_in_image(
     regions: Regions, joints_crop: Float[np.ndarray, "n 21 2"]
 ) -> Float[np.ndarray, "n 21 2"]:
-    """Return keypoints in pixels of the picture from those in the crop, 0 to 224 edge to edge."""
+    """Return keypoints in image pixels from crop pixels, which are 0 to 224 from edge to edge."""
     inside = (joints_crop / CROP - 0.5) * regions.size_px[:, None, None]
     return regions.center_px[:, None] + np.einsum("nij,nkj->nki", _turn(regions.angle), inside)
 
@@ -80,19 +78,19 @@ def joints_in_picture(
 def turned_back(
     regions: Regions, joints_m: Float[np.ndarray, "n 21 3"]
 ) -> Float[np.ndarray, "n 21 3"]:
-    """Return keypoints in camera axes from those in the axes of the upright crop."""
+    """Return keypoints in camera axes from keypoints in the axes of the upright crop."""
     turned = np.einsum("nij,nkj->nki", _turn(regions.angle), joints_m[..., :2])
     return np.concatenate([turned, joints_m[..., 2:]], axis=-1)
 
 
 def _upright(wrist_px: np.ndarray, knuckle_px: np.ndarray) -> np.ndarray:
-    """Return the clockwise angle from up, in the picture, of the direction wrist to knuckle."""
+    """Return the clockwise angle in the image from up to the direction wrist to knuckle."""
     right, down = (knuckle_px - wrist_px).T
     return np.arctan2(right, -down)
 
 
 def _turn(angle: np.ndarray) -> np.ndarray:
-    """Return matrices `n 2 2` that turn clockwise in a picture, whose rows go down."""
+    """Return matrices `n 2 2` that rotate clockwise in an image, whose rows go down."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
 

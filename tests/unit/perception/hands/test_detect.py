@@ -21,7 +21,7 @@ from egosim_jax.perception.hands.palms import (
 from egosim_jax.perception.hands.regions import (
     Regions,
     crop_region,
-    joints_in_picture,
+    joints_in_image,
     regions_of_joints,
     regions_of_palms,
     turned_back,
@@ -45,10 +45,10 @@ def test_tiles_hold_all_of_a_frame_and_squares_along_it():
 
 
 def test_a_tile_is_padded_with_black():
-    picture = cut_tile(np.full((96, 192, 3), 200, np.uint8), Tile(0, -48, 192))
-    assert (picture[:48] == 0).all()
-    assert (picture[144:] == 0).all()
-    assert (picture[48:144] == 200).all()
+    image = cut_tile(np.full((96, 192, 3), 200, np.uint8), Tile(0, -48, 192))
+    assert (image[:48] == 0).all()
+    assert (image[144:] == 0).all()
+    assert (image[48:144] == 200).all()
 
 
 def test_a_palm_is_decoded_to_pixels_of_the_frame():
@@ -104,12 +104,12 @@ def test_a_point_of_the_frame_is_where_its_crop_has_it():
     row, column = np.mgrid[:224, :224]
     inside = np.array([(crop * column).sum(), (crop * row).sum()]) / crop.sum() + 0.5
     joints = np.tile(inside, (1, 21, 1))
-    np.testing.assert_allclose(joints_in_picture(regions, joints)[0, 0], [181, 71], atol=0.1)
+    np.testing.assert_allclose(joints_in_image(regions, joints)[0, 0], [181, 71], atol=0.1)
 
 
 def test_meters_are_turned_with_the_region_and_keep_their_depth():
     regions = Regions(center_px=np.zeros((1, 2)), size_px=np.ones(1), angle=np.array([np.pi / 2]))
-    joints = np.tile([0.0, -0.1, 0.03], (1, 21, 1))  # up in the crop is right in the picture
+    joints = np.tile([0.0, -0.1, 0.03], (1, 21, 1))  # up in the crop is right in the image
     np.testing.assert_allclose(turned_back(regions, joints)[0, 0], [0.1, 0, 0.03], atol=1e-9)
 
 
