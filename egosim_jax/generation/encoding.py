@@ -37,7 +37,7 @@ Batch = Mapping[str, Any]
     mask                 packed mask, uint8 `b f h w m`
     ids ids_mask         tokens of the prompts `b n`; encoded: `text`, `b n d`
     null_ids null_mask   tokens of `ModelConfig.unconditional_prompt`; encoded: `null_text`
-    pixels               first frames as CLIP takes them, float32 `b s s 3`; encoded: `image` `b m e`
+    pixels               first frames for CLIP, float32 `b s s 3`; encoded: `image`, `b m e`
     seeds                seeds of the model's `encoding_noise`, uint32 `b`
 """
 
