@@ -14,11 +14,11 @@ import tyro
 from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
 from egosim_jax.convert.outputs import apart, write_file, write_sharded
 from egosim_jax.convert.pipeline import pipeline_files
-from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch
+from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch, widening_of
 from egosim_jax.convert.stream import Weight, in_memory, in_rows
 from egosim_jax.convert.tables import table_of
 from egosim_jax.convert.tokenizer import tokenizer_files
-from egosim_jax.convert.widen import Widening, WidenMode, widening_of
+from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.mapped import OURS, Tensor
 from egosim_jax.io.run import write_json

@@ -13,7 +13,7 @@ from egosim_jax.convert.detect import DetectedNetwork
 from egosim_jax.convert.rules import Leaf, Rule, assign, shape_only
 from egosim_jax.convert.stream import Weight, stored_as
 from egosim_jax.convert.tables import table_of, weight_shapes
-from egosim_jax.convert.widen import Widening
+from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import WeightsError, mismatches
 from egosim_jax.types import InputError
@@ -134,6 +134,23 @@ def merged(
         pieces = tuple(partial(piece, path, layer) for layer in layers)
         weights.append(Weight(name=path, shape=tensor.shape, dtype=tensor.dtype, pieces=pieces))
     return weights
+
+
+def widening_of(config: ModelConfig, mode: WidenMode) -> Widening:
+    """Return the widening from a model's base. Raises `InputError` if it has no narrower one."""
+    table = table_of(config.dit)
+    base = table.base
+    if base is None:
+        raise InputError(f"{config.name} has no base model to widen. (--widen)")
+    missing = [part for part, _ in base.parts if part not in config.layout]
+    if missing or base.channels >= config.layout.channels:
+        raise InputError(
+            f"{config.name} cannot be widened from a base model of {base.parts}: its layout "
+            f"{config.layout.parts} must have all of these parts and more. (--widen, --only dit)"
+        )
+    if mode == "copy":
+        base = replace(base, mask_one=config.layout.mask_one, mask_scale=config.layout.mask_scale)
+    return Widening(base=base, layout=config.layout, input_layer=table.input_layer)
 
 
 def fits(found: DetectedNetwork, config: ModelConfig) -> bool:

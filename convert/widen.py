@@ -15,12 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from egosim_jax.convert.stream import Weight
-from egosim_jax.convert.tables import table_of
-from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.conditioning.layout import ChannelLayout
-    from egosim_jax.configs.model import ModelConfig
 
 WidenMode = Literal["copy", "polarity"]
 """Encoding of the base model's mask: the same as the model's, or that of the base's layout."""
@@ -83,20 +80,3 @@ class Widening:
     ) -> np.ndarray:
         mask = read_kernel()[self.base.slice("mask")].astype(np.float64)
         return read().astype(np.float64) + self.mask[0] * mask.sum(axis=tuple(range(mask.ndim - 1)))
-
-
-def widening_of(config: ModelConfig, mode: WidenMode) -> Widening:
-    """Return the widening from a model's base. Raises `InputError` if it has no narrower one."""
-    table = table_of(config.dit)
-    base = table.base
-    if base is None:
-        raise InputError(f"{config.name} has no base model to widen. (--widen)")
-    missing = [part for part, _ in base.parts if part not in config.layout]
-    if missing or base.channels >= config.layout.channels:
-        raise InputError(
-            f"{config.name} cannot be widened from a base model of {base.parts}: its layout "
-            f"{config.layout.parts} must have all of these parts and more. (--widen, --only dit)"
-        )
-    if mode == "copy":
-        base = replace(base, mask_one=config.layout.mask_one, mask_scale=config.layout.mask_scale)
-    return Widening(base=base, layout=config.layout, input_layer=table.input_layer)

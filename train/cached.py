@@ -19,8 +19,8 @@ import numpy as np
 from egosim_jax.conditioning.posterior import STD
 from egosim_jax.conditioning.video import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
+from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.clips import load_triplet
-from egosim_jax.data.metadata import ClipFiles
 from egosim_jax.data.moments import (
     MAX_DIFFERENT_STD,
     cache_of,

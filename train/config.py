@@ -1,15 +1,13 @@
-"""Settings of a training: hyper-parameters, optimizer, the base of all recipes.
+"""Settings of a training: hyper-parameters and optimizer.
 
 The optimizer is optax's: a learning-rate schedule, gradient clipping, and AdamW or Muon.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +15,9 @@ import optax
 from flax import nnx
 from optax.contrib import MuonDimensionNumbers, muon
 
-from egosim_jax.io.executables import share_with_jax
 from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.metric_writers import EXTRAS, check_installed
 from egosim_jax.types import InputError, check_counts, check_seed
-
-if TYPE_CHECKING:
-    from egosim_jax.train.update import Stage
 
 WeightsDtype = Literal["float32", "bfloat16", "float16"]
 """Dtypes of the weights that a training writes."""
@@ -159,55 +153,6 @@ def numerics_only(value: Any, path: str) -> Iterator[str]:
         yield from (f"{path}.{name}" for name in getattr(value, "numerics_only", ()))
         for part in fields(value):
             yield from numerics_only(getattr(value, part.name), f"{path}.{part.name}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recipe(ABC):
-    """A training that one command runs, in one or several stages."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    preflight: str | None = None
-    """Machine to compile for instead of training, such as h200:8, v5p:2x2x2 or cpu:1.
-
-    It need not be present. Reports whether each stage's update fits, and needs no other option."""
-    json: bool = False
-    """With --preflight: print JSON."""
-    search: bool = True
-    """With --preflight: also compile other settings for the same batch, which takes minutes."""
-
-    def run(self) -> int:
-        """Train, or run the preflight, and return the exit code."""
-        if self.preflight is None:
-            for option, given in {"--json": self.json, "--no-search": not self.search}.items():
-                if given:
-                    raise InputError(
-                        f"{option} has no effect without --preflight: give it, or leave this out."
-                    )
-            for stage in self.stages().values():
-                stage.training.check_packages()
-            share_with_jax()
-            return self.train()
-        from egosim_jax.preflight.targets import compile_offline
-        from egosim_jax.train.preflight import preflight
-
-        compile_offline()
-        return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
-
-    def require(self, *names: str) -> list[Path]:
-        """Return paths that only a training needs. Raises `InputError` if one is not given."""
-        if missing := [name for name in names if getattr(self, name) is None]:
-            options = ", ".join(f"--{name}" for name in missing)
-            raise InputError(f"Missing {options}: required to train. Only --preflight needs none.")
-        return [getattr(self, name) for name in names]
-
-    @abstractmethod
-    def train(self) -> int:
-        """Train to the end, resuming an interrupted run, and return the exit code."""
-
-    @abstractmethod
-    def stages(self) -> Mapping[str, Stage]:
-        """Return the trainings by the names of the recipe's options."""
 
 
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.runtime.command import ExitCode, HelpGroups
-from egosim_jax.train.config import Recipe, TrainConfig
+from egosim_jax.train.config import TrainConfig
+from egosim_jax.train.recipe_base import Recipe
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
 

@@ -21,14 +21,15 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.models.layers import Products
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
-from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
+from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process, stop_if_preempted
+from egosim_jax.train.recipe_base import Recipe
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig
-    from egosim_jax.data.metadata import ClipFiles
+    from egosim_jax.data.clip_files import ClipFiles
     from egosim_jax.models.wan.vae import WanVAE
 
 ENCODE_BATCH = 8

@@ -6,9 +6,10 @@ import difflib
 from dataclasses import replace
 
 from egosim_jax.conditioning.dropout import ConditionDropout
-from egosim_jax.train.config import OptimizerConfig, Recipe, TrainConfig
+from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.fine_tuning import FineTuning
 from egosim_jax.train.from_scratch import FromClips, FromTabletop
+from egosim_jax.train.recipe_base import Recipe
 from egosim_jax.train.refining import RefineVAE
 from egosim_jax.types import InputError
 

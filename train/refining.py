@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax import configs
 from egosim_jax.runtime.command import ExitCode, HelpGroups
-from egosim_jax.train.config import Recipe, TrainConfig, WeightsDtype, resume_mutable
+from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process
+from egosim_jax.train.recipe_base import Recipe
 from egosim_jax.train.update import Stage
 
 if TYPE_CHECKING:

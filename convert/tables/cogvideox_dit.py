@@ -20,7 +20,8 @@ from egosim_jax.convert.tables import (
     Table,
 )
 from egosim_jax.diffusion.process import VariancePreserving
-from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.layers import PATCH
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from egosim_jax.convert.tables import (
     Table,
 )
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

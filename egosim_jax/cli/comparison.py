@@ -11,7 +11,7 @@ from egosim_jax.runtime.command import HelpGroups
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.data.metadata import ClipFiles
+    from egosim_jax.data.clip_files import ClipFiles
     from egosim_jax.evaluation.measures import Measure
     from egosim_jax.evaluation.methods import Folder, Method
     from egosim_jax.evaluation.result import Evaluation

@@ -14,7 +14,7 @@ from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
 from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
-from egosim_jax.data.metadata import Prompts
+from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_counts

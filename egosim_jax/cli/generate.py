@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from egosim_jax.data.metadata import Prompts
+from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.data.metadata import Prompts
+from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, check_counts

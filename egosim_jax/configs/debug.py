@@ -4,7 +4,7 @@ import dataclasses
 
 from egosim_jax.configs.real_tiny import CONFIG as REAL_TINY
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.types import VideoSpec
 
 CONFIG = dataclasses.replace(

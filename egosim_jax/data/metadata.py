@@ -19,12 +19,13 @@ from __future__ import annotations
 import csv
 import difflib
 import io
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from egosim_jax.data.clip_files import MAX_CLIPS, ClipFiles, Problems, Prompts
+from egosim_jax.data.dwm import read_list
+from egosim_jax.data.ids import SAFE_IDS, is_safe_id
 from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes, read_lines
 from egosim_jax.types import InputError, check_counts
 
@@ -34,50 +35,10 @@ TARGET = "video"
 """Column of the recorded video."""
 MASK_NAME, HANDS_NAME, IMAGE_NAME = "pc_mask_video.mp4", "hand_kp_video.mp4", "hand_inpaint.png"
 """Default file names, in the folder of the prior."""
-Prompts = Literal["prompts_rewrite", "prompts"]
-"""Captions of a list of DWM: rewritten ones, or the original ones where there are none; or these.
-"""
 MAX_BYTES = 1 << 28
 """Maximum size of a metadata file in bytes."""
-MAX_CLIPS = 400_000
-"""Maximum number of rows."""
 MAX_COLUMNS = 256
 """Maximum number of columns."""
-_SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
-SAFE_IDS = "letters, digits, '.', '_' and '-', and '/' between folders without dots"
-"""Rule of a safe clip id, for messages."""
-
-
-def is_safe_id(video_id: str) -> bool:
-    """Return True if an id may name output files, in subfolders if it has slashes.
-
-    Folders have no dots, so that an id cannot collide with the file of another one.
-    """
-    return len(video_id) <= 200 and _SAFE_ID.fullmatch(video_id) is not None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClipFiles:
-    """The files of a clip: one row of the metadata."""
-
-    video_id: str
-    """Unique id, which names the outputs."""
-    prompt: str
-    """Caption of the clip."""
-    prior: Path
-    """Video of the rendered scene."""
-    mask: Path | None
-    """Video of the mask: white where the prior shows nothing; None: it shows everything."""
-    hands: Path
-    """Video of the hand skeletons."""
-    first_frame: Path
-    """Path of the image for CLIP."""
-    target: Path | None
-    """Recorded video, if the metadata names one."""
-    extra: Mapping[str, str]
-    """Cells of further columns by column."""
-    row: str
-    """File and line of the row, for messages."""
 
 
 def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
@@ -88,8 +49,6 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
     reads as the text "nan"), cells beyond the header, unsafe and duplicate ids.
     """
     if path.suffix == ".txt":
-        from egosim_jax.data.dwm import read_list
-
         return read_list(path, prompts=prompts)
     if prompts != "prompts_rewrite":
         raise InputError(
@@ -164,27 +123,6 @@ def select(
 def _some(values: Sequence[str]) -> str:
     shown = ", ".join(quote_text(value) for value in values[:20])
     return shown + (f" and {len(values) - 20:,} more" if len(values) > 20 else "")
-
-
-class Problems:
-    """First problems of a possibly long list, and their number."""
-
-    def __init__(self, most: int = 10):
-        self._most, self._shown, self._count = most, list[str](), 0
-
-    def add(self, problems: Iterable[str]) -> None:
-        """Count problems, and keep them if they are among the first."""
-        for problem in problems:
-            self._count += 1
-            if self._count <= self._most:
-                self._shown.append(problem)
-
-    def refuse(self, what: str) -> None:
-        """Raise `InputError` if there is any problem."""
-        if self._count > self._most:
-            self._shown.append(f"and {self._count - self._most:,} more")
-        if self._count:
-            raise InputError(f"{what}: {'; '.join(self._shown)}.")
 
 
 def _row_problems(row: Mapping[str, str], first_seen: Mapping[str, int]) -> Iterator[str]:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.clips import check_clip, encoded_first_frame, load_triplet
-from egosim_jax.data.metadata import ClipFiles, check_presence
+from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import Resampling, decode_record, video_shape

@@ -26,7 +26,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32
 
-from egosim_jax.data.metadata import SAFE_IDS, is_safe_id
+from egosim_jax.data.ids import SAFE_IDS, is_safe_id
 from egosim_jax.data.recorded_files import (
     DESCRIPTION,
     DepthFiles,

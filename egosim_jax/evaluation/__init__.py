@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.evaluation.files import write_files
 from egosim_jax.evaluation.measures import standard
 from egosim_jax.evaluation.methods import BASELINES, Folder

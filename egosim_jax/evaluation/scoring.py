@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from egosim_jax.data.metadata import ClipFiles
+from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.windows import Window, read_results
 from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at

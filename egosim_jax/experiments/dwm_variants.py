@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT, DWM, ChannelLayout
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.geometry import invert, transform
-from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
 from egosim_jax.models.cogvideox.motion import MotionDiTConfig
 from egosim_jax.worlds.tabletop import TabletopClip
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax import configs
-from egosim_jax.data.metadata import ClipFiles, read_metadata
+from egosim_jax.data.clip_files import ClipFiles
+from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import read_results, windows_of
 from egosim_jax.evaluation import evaluate

@@ -157,6 +157,13 @@ class RMSNorm(nnx.Module):
         return x * jax.lax.optimization_barrier(inverse) * self.scale[...].astype(jnp.float32)
 
 
+def modulate(
+    x: Float[Array, "b n d"], shift: Float[Array, "b _ d"], scale: Float[Array, "b _ d"]
+) -> Float[Array, "b n d"]:
+    """Scale and shift normalized tokens."""
+    return x * (1 + scale) + shift
+
+
 def init_sharded(make: Callable[..., Any], *args: Any, out_shardings: Any = None) -> Any:
     """Run an initializer as one compiled program, with sharded outputs.
 

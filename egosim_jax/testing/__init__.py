@@ -24,7 +24,7 @@ from egosim_jax.data.metadata import MASK_NAME
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.video import write_video
 from egosim_jax.io.weights import hashes
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.train.encode import example_shapes
 from egosim_jax.types import Triplet, VideoSpec
 

@@ -69,8 +69,7 @@ def programs() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
 
     from egosim_jax.convert.tables import wan_dit as table
     from egosim_jax.io.weights import fill
-    from egosim_jax.models.wan.config import WanDiTConfig
-    from egosim_jax.models.wan.dit import WanDiT
+    from egosim_jax.models.wan.dit import WanDiT, WanDiTConfig
     from tests.translation import translate
 
     torch.set_num_threads(THREADS)

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, Int, Key
 from egosim_jax.configs.model import Networks
 from egosim_jax.models import remat
 from egosim_jax.models.layers import scan_blocks
-from egosim_jax.models.wan.config import PATCH
 from egosim_jax.models.wan.dit import DiTContext, WanDiT
+from egosim_jax.models.wan.layers import PATCH
 from egosim_jax.train.tasks.denoising import Denoising, condition_of, loss_weights
 from egosim_jax.train.update import Metrics
 

@@ -25,7 +25,7 @@ from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.generation.encoding import encode_condition, pack
 from egosim_jax.generation.generator import Generator, denoise
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import Triplet, VideoSpec

@@ -11,8 +11,7 @@ from flax import nnx
 
 from egosim_jax.convert.tables import wan_dit as table
 from egosim_jax.io.weights import fill
-from egosim_jax.models.wan.config import WanDiTConfig
-from egosim_jax.models.wan.dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT, WanDiTConfig
 from tests.translation import translate, translate_back
 
 TOLERANCE = 1e-6

@@ -14,7 +14,7 @@ from egosim_jax import configs
 from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.models.layers import init_sharded
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.tasks.denoising import Denoising

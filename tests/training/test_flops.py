@@ -9,8 +9,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.models.wan.config import WanDiTConfig
-from egosim_jax.models.wan.dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT, WanDiTConfig
 from egosim_jax.preflight.targets import peak
 from egosim_jax.train.monitor import Clock
 from egosim_jax.train.tasks.denoising import Denoising

@@ -2,22 +2,14 @@
 
 Noisy latents of 16 channels and a condition of 17 (mask and masked video) or 33 channels (DWM:
 mask, static scene, hands) are split into patches of 1 x 2 x 2 cells. Text and video are one stream
-of tokens, text first, all of which attend to all, padding included. With shift, scale and gate from
-the time embedding, one triple for the tokens of the text and one for those of the video, a block is
-
-    x <- x + gate_a · Attention((1 + scale_a) · LN(x) + shift_a)
-    x <- x + gate_m · MLP((1 + scale_m) · LN(x) + shift_m)
-
-with a layer norm of the queries and keys of each head, and rotary positions of the video's tokens.
-
-Norms, modulation, gates and rotations are float32; matrix products and the residual stream are in
-the config's `dtype`, or the factors of the blocks' products alone in bfloat16 (`products`). (Yang
-et al. 2024, CogVideoX; section 4.1 of DWM for the input channels.)
+of tokens, text first, all of which attend to all, padding included. It passes through the blocks of
+`layers`. (Yang et al. 2024, CogVideoX; section 4.1 of DWM for the input channels.)
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 from typing import Any, ClassVar, no_type_check
 
 import jax
@@ -27,18 +19,73 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
-from egosim_jax.models import remat, rope
-from egosim_jax.models.attention import attention
-from egosim_jax.models.cogvideox.config import PATCH, CogVideoXDiTConfig
-from egosim_jax.models.layers import LayerNorm, Linear, scan_blocks, stack, zeros
+from egosim_jax.models import Flops, remat, rope
+from egosim_jax.models.cogvideox.layers import (
+    PATCH,
+    Block,
+    CogVideoXDiTSizes,
+    Modulation,
+    TimeEmbedding,
+)
+from egosim_jax.models.layers import LayerNorm, Linear, modulate, scan_blocks, stack, zeros
 from egosim_jax.models.patch import PatchEmbedding, check_condition
-from egosim_jax.models.remat import name_projection
-from egosim_jax.models.sinusoid import time_sinusoid
 from egosim_jax.sharding import constrain
 from egosim_jax.types import InputError
 
 TOKENS = ("batch", "tokens", None)
 """Logical axes of the residual stream."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CogVideoXDiTConfig(CogVideoXDiTSizes):
+    """Config of the transformer; the defaults are CogVideoX-Fun V1.1 5B InP's."""
+
+    table: ClassVar[str] = "egosim_jax.convert.tables.cogvideox_dit"
+    """Module of the conversion table."""
+    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "products", "attention", "remat")
+    """Fields that change only how values are computed, which a resumed training may change."""
+    remat_levels: ClassVar[tuple[str, ...]] = remat.LEVELS
+    """Values of `remat`, by the memory that they take, ascending."""
+    lora_targets: ClassVar[tuple[str, ...]] = tuple(f"blocks.attn.{name}" for name in "qkvo")
+    """Patterns of the linear layers that a LoRA adapts."""
+    also_train: ClassVar[tuple[str, ...]] = ("patch.*",)
+    """Patterns of the weights that are trained in full along with a LoRA."""
+
+    def build(self, *, rngs: nnx.Rngs) -> CogVideoXDiT:
+        """Build the network with random weights."""
+        return CogVideoXDiT(self, rngs=rngs)
+
+    def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
+        """Count a forward pass of one sample, of so many latent cells and text tokens.
+
+        With N tokens of width d, text's included, an MLP of width f, a time embedding of width e
+        and L blocks, it has
+
+            attention    L (8 N d^2 + 4 N^2 d)
+            MLP          L 4 N d f
+            modulation   L 24 e d
+
+        and the embeddings and the head. Norms and activations do not count; `image` is ignored.
+        """
+        d, e, depth = self.dim, self.time_dim, self.layers
+        video = prod(latents) // PATCH**2
+        n = video + text
+        block = 8 * n * d**2 + 4 * n * d * self.ffn_dim + 24 * e * d
+        embeddings = 2 * video * PATCH**2 * (self.in_channels + self.out_channels) * d
+        embeddings += 2 * text * self.text_dim * d + 2 * (d * e + e**2) + 4 * e * d
+        return Flops(
+            weights=float(depth * block + embeddings), attention=float(depth * 4 * n * n * d)
+        )
+
+    @property
+    def patch(self) -> tuple[int, int, int]:
+        """Latent frames, rows and columns of a token."""
+        return 1, PATCH, PATCH
+
+    @property
+    def image_dim(self) -> int | None:
+        """Width of the image encoder's tokens; None: the model has no image branch."""
+        return None
 
 
 @no_type_check
@@ -73,125 +120,6 @@ def grid_positions(
         np.linspace(top, (top + height) * (rows - 1) / rows, rows),
         np.linspace(left, (left + width) * (columns - 1) / columns, columns),
     )
-
-
-class Modulation(nnx.Module):
-    """Layer norm with `n` vectors from the time embedding."""
-
-    def __init__(self, config: CogVideoXDiTConfig, n: int, *, rngs: nnx.Rngs):
-        self.norm = LayerNorm(config.dim, eps=config.eps)
-        self.linear = Linear(
-            config.time_dim, n * config.dim, axes=(None, "embed"), dtype=config.dtype, rngs=rngs
-        )
-        self.n = n
-
-    def vectors(self, time: Any) -> Float[Array, "n b m d"]:
-        """Return the vectors from the time embedding `b e`, one for all tokens, in float32."""
-        y = self.linear(jax.nn.silu(time)).astype(jnp.float32)
-        return rearrange(y, "b (n d) -> n b 1 d", n=self.n)
-
-
-def modulate(
-    x: Float[Array, "b n d"], shift: Float[Array, "b _ d"], scale: Float[Array, "b _ d"]
-) -> Float[Array, "b n d"]:
-    """Scale and shift normalized tokens."""
-    return x * (1 + scale) + shift
-
-
-class Attention(nnx.Module):
-    """Self-attention of the tokens of text and video."""
-
-    def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
-        sizes = (config.dim, config.dim)
-        self.config = config
-
-        def linear(axes: tuple[str, str]) -> Linear:
-            return Linear(
-                *sizes, axes=axes, dtype=config.dtype, products=config.products, rngs=rngs
-            )
-
-        self.q = linear(("embed", "heads"))
-        self.k = linear(("embed", "heads"))
-        self.v = linear(("embed", "heads"))
-        self.o = linear(("heads", "embed"))
-        self.norm_q = LayerNorm(config.head_dim, eps=config.qk_eps, axes=(None,))
-        self.norm_k = LayerNorm(config.head_dim, eps=config.qk_eps, axes=(None,))
-
-    def __call__(
-        self, x: Float[Array, "b n d"], rotation: Float[Array, "n k 2"]
-    ) -> Float[Array, "b n d"]:
-        """Attend from all tokens to all tokens."""
-        q, k, v = (
-            rearrange(name_projection(linear(x)), "b n (h k) -> b n h k", h=self.config.heads)
-            for linear in (self.q, self.k, self.v)
-        )
-        q, k = (
-            rope.rotate(norm(heads), rotation)
-            for norm, heads in ((self.norm_q, q), (self.norm_k, k))
-        )
-        q, k, v = (heads.astype(self.config.attention_dtype) for heads in (q, k, v))
-        y = attention(q, k, v, kernel=self.config.attention, over="heads")
-        return name_projection(self.o(rearrange(y, "b n h k -> b n (h k)")))
-
-
-class MLP(nnx.Module):
-    """Linear, GELU in its tanh form, linear."""
-
-    def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
-        numerics: Any = {"dtype": config.dtype, "products": config.products}
-        dim, hidden = config.dim, config.ffn_dim
-        self.up = Linear(dim, hidden, axes=("embed", "mlp"), **numerics, rngs=rngs)
-        self.down = Linear(hidden, dim, axes=("mlp", "embed"), **numerics, rngs=rngs)
-
-    def __call__(self, x: Float[Array, "b n d"]) -> Float[Array, "b n d"]:
-        """Map every token by itself."""
-        return self.down(jax.nn.gelu(self.up(x), approximate=True))
-
-
-class Block(nnx.Module):
-    """Transformer block: attention and MLP on the residual stream of text and video."""
-
-    def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
-        self.modulation_a = Modulation(config, 6, rngs=rngs)
-        self.attn = Attention(config, rngs=rngs)
-        self.modulation_m = Modulation(config, 6, rngs=rngs)
-        self.mlp = MLP(config, rngs=rngs)
-
-    def __call__(
-        self,
-        x: Float[Array, "b n d"],
-        time: Any,
-        rotation: Float[Array, "n k 2"],
-        is_text: Float[Array, "1 n 1"],
-    ) -> Float[Array, "b n d"]:
-        """Update the residual stream; sums are taken in float32 and kept in x's dtype.
-
-        `time` is what the modulations see, the time embedding `b e`.
-        """
-        for modulation, layer in (
-            (self.modulation_a, lambda y: self.attn(y, rotation)),
-            (self.modulation_m, self.mlp),
-        ):
-            video, text = jnp.split(modulation.vectors(time), 2)
-            shift, scale, gate = jnp.where(is_text > 0, text, video)
-            y = layer(modulate(modulation.norm(x), shift, scale))
-            x = (x + gate * y).astype(x.dtype)
-        return x
-
-
-class TimeEmbedding(nnx.Module):
-    """Embedding of timesteps in float32."""
-
-    def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
-        self.dim = config.dim
-        dim, hidden, dtype = config.dim, config.time_dim, config.dtype
-        self.up = Linear(dim, hidden, axes=("embed", None), dtype=dtype, rngs=rngs)
-        self.down = Linear(hidden, hidden, axes=(None, None), dtype=dtype, rngs=rngs)
-
-    def __call__(self, t: Float[Array, " b"]) -> Float[Array, "b e"]:
-        """Embed timesteps in [0, 1000]."""
-        hidden = jax.nn.silu(self.up(time_sinusoid(t, self.dim)))
-        return self.down(hidden).astype(jnp.float32)
 
 
 class CogVideoXDiT(nnx.Module):

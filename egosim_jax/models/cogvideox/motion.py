@@ -20,15 +20,8 @@ from flax import nnx
 from jaxtyping import Array, Float, Int
 
 from egosim_jax.models import Flops
-from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
-from egosim_jax.models.cogvideox.dit import (
-    MLP,
-    Attention,
-    Block,
-    CogVideoXContext,
-    CogVideoXDiT,
-    Modulation,
-)
+from egosim_jax.models.cogvideox.dit import CogVideoXContext, CogVideoXDiT, CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.layers import MLP, Attention, Block, Modulation
 from egosim_jax.models.layers import LayerNorm, Linear, zeros
 from egosim_jax.types import InputError, check_counts
 

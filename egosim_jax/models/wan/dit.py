@@ -12,7 +12,8 @@ depend on text and image only. `denoise` is what a solver calls at each step.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from math import prod
+from typing import ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +21,19 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
-from egosim_jax.models import remat, rope
+from egosim_jax.models import Flops, remat, rope
 from egosim_jax.models.layers import scan_blocks, stack
 from egosim_jax.models.patch import PatchEmbedding, check_condition
-from egosim_jax.models.wan.config import PATCH, WanDiTConfig
 from egosim_jax.models.wan.layers import (
     MLP,
+    PATCH,
     Block,
     CrossAttention,
     Head,
     ImageEmbedding,
     KeysValues,
     TimeEmbedding,
+    WanDiTSizes,
     gelu_tanh,
     normal,
 )
@@ -40,6 +42,56 @@ from egosim_jax.types import InputError
 
 TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
 """Logical axes of the residual stream, and of what is the same for all tokens."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WanDiTConfig(WanDiTSizes):
+    """Config of the transformer; the defaults are EgoSim's 14B."""
+
+    table: ClassVar[str] = "egosim_jax.convert.tables.wan_dit"
+    """Module of the conversion table."""
+    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "products", "attention", "remat")
+    """Fields that change only how values are computed, which a resumed training may change."""
+    remat_levels: ClassVar[tuple[str, ...]] = remat.LEVELS
+    """Values of `remat`, by the memory that they take, ascending."""
+    lora_targets: ClassVar[tuple[str, ...]] = ("blocks.*",)
+    """Patterns of the linear layers that a LoRA adapts."""
+    also_train: ClassVar[tuple[str, ...]] = ()
+    """Patterns of the weights that are trained in full along with a LoRA."""
+
+    def build(self, *, rngs: nnx.Rngs) -> WanDiT:
+        """Build the network with random weights."""
+        return WanDiT(self, rngs=rngs)
+
+    def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
+        """Count a forward pass of one sample, of so many latent cells, text and image tokens.
+
+        With N tokens of width d, an MLP of width f, T text and I image tokens and L blocks, it has
+
+            self-attention    L (8 N d^2 + 4 N^2 d)
+            cross-attention   L (4 N d^2 + 4 (T + I) d^2 + 4 N (T + I) d)
+            MLP               L 4 N d f
+
+        and the embeddings and the head. Norms and activations do not count.
+        """
+        d, f, depth = self.dim, self.ffn_dim, self.layers
+        n = prod(latents) // PATCH**2
+        image = image if self.image_dim is not None else 0
+        block = 12 * n * d**2 + 4 * (text + image) * d**2 + 4 * n * d * f
+        embeddings = 2 * n * PATCH**2 * (self.in_channels + self.out_channels) * d
+        embeddings += 2 * text * (self.text_dim * d + d**2)
+        embeddings += 2 * (self.freq_dim * d + 7 * d**2)
+        if self.image_dim is not None:
+            embeddings += 2 * image * (self.image_dim**2 + self.image_dim * d)
+        return Flops(
+            weights=float(depth * block + embeddings),
+            attention=float(depth * 4 * n * (n + text + image) * d),
+        )
+
+    @property
+    def patch(self) -> tuple[int, int, int]:
+        """Latent frames, rows and columns of a token."""
+        return 1, PATCH, PATCH
 
 
 @no_type_check

@@ -17,6 +17,7 @@ the config's `dtype`, or the products' factors alone in bfloat16 (`products`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Literal
 
@@ -28,11 +29,22 @@ from jaxtyping import Array, Float
 
 from egosim_jax.models import rope
 from egosim_jax.models.attention import Kernel, attention
-from egosim_jax.models.layers import Axes, Initializer, LayerNorm, Linear, RMSNorm, zeros
-from egosim_jax.models.remat import name_projection
+from egosim_jax.models.layers import (
+    Axes,
+    Initializer,
+    LayerNorm,
+    Linear,
+    Products,
+    RMSNorm,
+    modulate,
+    zeros,
+)
+from egosim_jax.models.remat import Level, name_projection
 from egosim_jax.models.sinusoid import time_sinusoid
-from egosim_jax.models.wan.config import PATCH, WanDiTConfig
+from egosim_jax.types import InputError, check_counts
 
+PATCH = 2
+"""Latent rows and columns of a token; a token has one latent frame."""
 IMAGE_NORM_EPS = 1e-5
 """Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
 
@@ -45,15 +57,75 @@ gelu_tanh = partial(jax.nn.gelu, approximate=True)
 gelu_erf = partial(jax.nn.gelu, approximate=False)
 
 
-def modulate(
-    x: Float[Array, "b n d"], shift: Float[Array, "b 1 d"], scale: Float[Array, "b 1 d"]
-) -> Float[Array, "b n d"]:
-    """Scale and shift normalized tokens."""
-    return x * (1 + scale) + shift
+@dataclass(frozen=True, kw_only=True)
+class WanDiTSizes:
+    """Sizes and numerics of the transformer; the defaults are EgoSim's 14B."""
+
+    in_channels: int = 52
+    """Channels of the noisy latents and the condition together."""
+    out_channels: int = 16
+    """Channels of the noisy latents and the velocity."""
+    dim: int = 5120
+    """Width of a token's embedding, in channels."""
+    ffn_dim: int = 13824
+    """Hidden width of the MLP."""
+    heads: int = 40
+    """Attention heads, each of dim / heads."""
+    layers: int = 40
+    """Number of transformer blocks."""
+    text_dim: int = 4096
+    """Width of the text encoder's tokens."""
+    image_dim: int | None = 1280
+    """Width of the image encoder's tokens; None for a model without the image branch."""
+    freq_dim: int = 256
+    """Width of the time sinusoid."""
+    eps: float = 1e-6
+    """Epsilon of the norms."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Compute dtype of matrix products and the residual stream."""
+    products: Products | None = None
+    """Dtype of the factors of matrix products, attention's included; None: that of the others.
+
+    With bfloat16 sums and all else stay in `dtype`."""
+    attention: Kernel = "auto"
+    """Attention kernel of the transformer."""
+    remat: Level = "none"
+    """Activations that the backward pass recomputes."""
+
+    def __post_init__(self) -> None:
+        """Check that the sizes fit each other and the kernel fits the dtype."""
+        sizes = ("out_channels", "dim", "ffn_dim", "heads", "layers", "text_dim", "freq_dim")
+        check_counts({name: getattr(self, name) for name in sizes})
+        if self.in_channels < self.out_channels:
+            raise InputError(
+                f"in_channels {self.in_channels} must hold the {self.out_channels} noisy channels "
+                "(out_channels) and those of the condition."
+            )
+        if self.dim % self.heads or self.head_dim % 2 or self.head_dim < 6:
+            raise InputError(
+                f"dim {self.dim} does not split into {self.heads} heads: a head needs an even size "
+                "of at least 6, so that frames, rows and columns each turn a pair. Change heads."
+            )
+        if self.freq_dim % 2:
+            raise InputError(f"freq_dim must be even (cosines and sines), not {self.freq_dim}.")
+        if self.attention in ("cudnn", "hopper") and self.dtype == "float32":
+            raise InputError(
+                f'The {self.attention} attention kernel needs dtype "bfloat16", not "float32".'
+            )
+
+    @property
+    def head_dim(self) -> int:
+        """Size of an attention head."""
+        return self.dim // self.heads
+
+    @property
+    def attention_dtype(self) -> str:
+        """Dtype of queries, keys and values."""
+        return self.products or self.dtype
 
 
 def linear(
-    config: WanDiTConfig,
+    config: WanDiTSizes,
     sizes: tuple[int, int],
     axes: Axes,
     rngs: nnx.Rngs,
@@ -81,7 +153,7 @@ class MLP(nnx.Module):
 
     def __init__(
         self,
-        config: WanDiTConfig,
+        config: WanDiTSizes,
         sizes: tuple[int, int, int],
         activation: Activation,
         *,
@@ -100,7 +172,7 @@ class MLP(nnx.Module):
 class TimeEmbedding(nnx.Module):
     """Embedding of timesteps: one vector for the head and six for the blocks, in float32."""
 
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         sizes = (config.freq_dim, config.dim, config.dim)
         self.freq_dim = config.freq_dim
         self.mlp = MLP(config, sizes, jax.nn.silu, init=normal, rngs=rngs)
@@ -118,7 +190,7 @@ class TimeEmbedding(nnx.Module):
 class ImageEmbedding(nnx.Module):
     """Projection of the image encoder's tokens to the model's width."""
 
-    def __init__(self, config: WanDiTConfig, width: int, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, width: int, *, rngs: nnx.Rngs):
         self.norm_in = LayerNorm(width, eps=IMAGE_NORM_EPS)
         self.mlp = MLP(config, (width, width, config.dim), gelu_erf, rngs=rngs)
         self.norm_out = LayerNorm(config.dim, eps=IMAGE_NORM_EPS)
@@ -131,7 +203,7 @@ class ImageEmbedding(nnx.Module):
 class KeyValue(nnx.Module):
     """Projections to keys, normalized over the full width, and to values, by head."""
 
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         sizes, axes = (config.dim, config.dim), ("embed", "heads")
         self.heads, self.dtype = config.heads, jnp.dtype(config.attention_dtype)
         self.k = linear(config, sizes, axes, rngs)
@@ -157,7 +229,7 @@ class KeyValue(nnx.Module):
 class Attention(KeyValue):
     """Base of self- and cross-attention."""
 
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         super().__init__(config, rngs=rngs)
         sizes = (config.dim, config.dim)
         self.kernel: Kernel = config.attention
@@ -196,7 +268,7 @@ class SelfAttention(Attention):
 class CrossAttention(Attention):
     """Cross-attention to the text and, in models that have the branch, to the image."""
 
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         super().__init__(config, rngs=rngs)
         self.image = None if config.image_dim is None else KeyValue(config, rngs=rngs)
 
@@ -217,7 +289,7 @@ class CrossAttention(Attention):
 class Block(nnx.Module):
     """Transformer block: self-attention, cross-attention and MLP on the residual stream."""
 
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         sizes = (config.dim, config.ffn_dim, config.dim)
         self.norm = LayerNorm(config.dim, eps=config.eps, affine=False)
         self.self_attn = SelfAttention(config, rngs=rngs)
@@ -246,7 +318,7 @@ class Block(nnx.Module):
 class Head(nnx.Module):
     """Projection of tokens to velocity patches, in the order (row, column, channel)."""
 
-    def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
+    def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         sizes = (config.dim, config.out_channels * PATCH**2)
         self.norm = LayerNorm(config.dim, eps=config.eps, affine=False)
         self.modulation = modulation_table(2, config.dim, rngs)

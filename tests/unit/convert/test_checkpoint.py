@@ -18,7 +18,7 @@ from egosim_jax.convert.plan import merged
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import read_metadata, read_safetensors
 from egosim_jax.io.weights import hashes
-from egosim_jax.models.cogvideox.config import CogVideoXDiTConfig
+from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.lora import Delta, Value, apply
 from egosim_jax.types import InputError

@@ -10,7 +10,7 @@ import numpy as np
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.sharding import MeshConfig, make_mesh
 from egosim_jax.testing import random_triplet
 from egosim_jax.types import InputError, VideoSpec

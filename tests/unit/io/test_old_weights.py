@@ -10,7 +10,7 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.io.weights import hashes
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
-from egosim_jax.models.wan.config import WanDiTConfig
+from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import VideoSpec

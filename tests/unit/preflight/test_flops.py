@@ -9,8 +9,7 @@ from flax import nnx
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
 from egosim_jax.models.attention import attention, keep_attention
-from egosim_jax.models.wan.config import WanDiTConfig
-from egosim_jax.models.wan.dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT, WanDiTConfig
 from egosim_jax.preflight.flops import count
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from egosim_jax.models.wan.config import WanDiTConfig
-from egosim_jax.models.wan.dit import WanDiT
+from egosim_jax.models.wan.dit import WanDiT, WanDiTConfig
 from egosim_jax.types import InputError
 
 TINY = WanDiTConfig(dim=48, heads=2, ffn_dim=64, layers=2, text_dim=20, image_dim=12)
