@@ -20,9 +20,9 @@ from egosim_jax.convert.tables import table_of
 from egosim_jax.convert.tokenizer import tokenizer_files
 from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.io.atomic import atomic_folder, lock_folder
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.mapped import OURS, Tensor
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
 from egosim_jax.runtime import command
 from egosim_jax.runtime.progress import track

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import Table, tables_of
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.mapped import Tensor
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import numpy as np
 
 from egosim_jax.convert.lora import IN_FULL, locations_by_name
 from egosim_jax.convert.tables import CheckpointNaming, Table, table_of
+from egosim_jax.io.bounded import listing
 from egosim_jax.io.mapped import Tensor
-from egosim_jax.io.untrusted.bounded import listing
 from egosim_jax.models import NetworkConfig
 from egosim_jax.models.lora import Change, Delta, Value
 from egosim_jax.types import InputError

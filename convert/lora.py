@@ -30,8 +30,8 @@ from egosim_jax.convert.lora_settings import Settings, finite, settings_of
 from egosim_jax.convert.rules import Rule, shape_only
 from egosim_jax.convert.source import PTH, Source, sources
 from egosim_jax.convert.tables import table_of, weight_shapes
+from egosim_jax.io.bounded import listing, quote_path, quote_text
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
-from egosim_jax.io.untrusted.bounded import listing, quote_path, quote_text
 from egosim_jax.models.lora import (
     BASE,
     MAX_RANK,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.io.untrusted.bounded import parse_json, quote, quote_path, read_json
+from egosim_jax.io.bounded import parse_json, quote, quote_path, read_json
 from egosim_jax.types import InputError
 
 ADAPTER, ADAPTER_ENTRY = "adapter_config.json", "lora_adapter_metadata"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from egosim_jax.convert.source import INDEX
 from egosim_jax.convert.stream import Weight, write
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.runtime.progress import track_bytes
 from egosim_jax.types import InputError
 

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.mapped import Tensor, read_safetensors
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.io.untrusted.pth import read_pth
 from egosim_jax.types import InputError
 

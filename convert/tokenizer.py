@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from egosim_jax.io.untrusted.bounded import quote_path, read_bytes
+from egosim_jax.io.bounded import quote_path, read_bytes
 from egosim_jax.types import InputError
 
 TOKENIZER_FILES = (

@@ -32,10 +32,10 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.io import parts, weights
+from egosim_jax.io.bounded import quote_path, read_bytes, read_json
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.mapped import digest, read_safetensors
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted.bounded import quote_path, read_bytes, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.runtime.command import CommandExit, ExitCode, run_with_exit_codes

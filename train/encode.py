@@ -43,9 +43,9 @@ from egosim_jax.data.static import check_static
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import Batch, batch_shapes, pack
 from egosim_jax.generation.generator import batches, targets_of
+from egosim_jax.io.bounded import listing, quote
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted.bounded import listing, quote
 from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
 from egosim_jax.sharding import check_batch, shard_params

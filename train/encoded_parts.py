@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import read_json
 
 Window = tuple[int, int]
 """Record number and first frame of a window."""

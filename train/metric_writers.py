@@ -12,9 +12,9 @@ from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.atomic import append_line
+from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.renamed import upgrade_metrics
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted.bounded import read_lines
 from egosim_jax.types import InputError
 
 

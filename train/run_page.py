@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from egosim_jax.io.bounded import read_bytes, read_json, read_lines
 from egosim_jax.io.renamed import upgrade, upgrade_metrics
 from egosim_jax.io.run import CONFIG, ENVIRONMENT, write_text
-from egosim_jax.io.untrusted.bounded import read_bytes, read_json, read_lines
 from egosim_jax.types import InputError
 
 PAGE, METRICS, TIMES = "index.html", "metrics.jsonl", "times.json"

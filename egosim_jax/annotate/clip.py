@@ -32,9 +32,9 @@ from egosim_jax.data.clips import write_clip
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import write_json, write_text
-from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.runtime.command import system_failure
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError

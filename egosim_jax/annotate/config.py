@@ -20,7 +20,7 @@ from typing import Any, Literal, cast, get_args
 
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.prepare import Cutting, check_length
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 from egosim_jax.perception.estimates import (
     CameraEstimator,
     Captioner,

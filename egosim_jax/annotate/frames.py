@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.types import WAN_GRID, InputError, check_counts
 
 MAX_FPS = 60

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.annotate.clip import SHEET
+from egosim_jax.io.bounded import read_bytes
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted.bounded import read_bytes
 
 PAGE = "index.html"
 MAX_PICTURES = 500

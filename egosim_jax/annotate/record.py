@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int32, UInt8
 from egosim_jax.annotate.frames import Plan
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.untrusted.bounded import parse_json, quote_path, quote_text
+from egosim_jax.io.bounded import parse_json, quote_path, quote_text
 from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
 from egosim_jax.perception.estimates import (
     CameraEstimate,

@@ -31,9 +31,9 @@ from egosim_jax.annotate.gallery import write_page
 from egosim_jax.annotate.prepare import scan, windows
 from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.data.clips import write_table
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.runtime.processes import run_in_processes
 from egosim_jax.types import InputError

@@ -8,8 +8,8 @@ import numpy as np
 
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.data.transforms import resize_image, resize_video
+from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.images import read_image
-from egosim_jax.io.untrusted.bounded import quote_path, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import read_video
 from egosim_jax.simulation.episode import Episode

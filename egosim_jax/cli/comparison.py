@@ -115,7 +115,7 @@ class Options:
             yield Features(VideoMae(self.fvd, device=self.device))
 
     def _depth_network(self, folder: Path) -> DepthEstimator:
-        from egosim_jax.io.untrusted.bounded import read_json
+        from egosim_jax.io.bounded import read_json
         from egosim_jax.perception.networks import DepthAnything, DepthAnything3
 
         config = folder / "config.json"

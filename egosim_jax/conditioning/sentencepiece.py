@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egosim_jax.io.untrusted.bounded import quote_path, read_bytes
+from egosim_jax.io.bounded import quote_path, read_bytes
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from array_record.python.array_record_module import ArrayRecordReader
 from egosim_jax.data.ids import is_safe_id
 from egosim_jax.data.manifest import ArrayInfo, Manifest, ShardInfo, file_problems, read_manifest
 from egosim_jax.data.records import Record, RecordError, from_bytes
+from egosim_jax.io.bounded import quote
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import decode_image
-from egosim_jax.io.untrusted.bounded import quote
 from egosim_jax.io.video import decode_video
 from egosim_jax.types import InputError, VideoGrid
 

@@ -34,10 +34,10 @@ from egosim_jax.data.transforms import (
     resize_mask,
 )
 from egosim_jax.io.atomic import atomic_write, lock_folder
+from egosim_jax.io.bounded import listing, quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.decoding import Damage, Decoding
 from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted.bounded import listing, quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.video import VideoInfo, probe_video, read_video, write_video
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 

@@ -26,8 +26,8 @@ from egosim_jax.data.clip_files import MAX_CLIPS, ClipFiles, Problems, Prompts
 from egosim_jax.data.ids import SAFE_IDS, is_safe_id
 from egosim_jax.data.readers import inside, make_id
 from egosim_jax.data.static import check_observed
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.run import write_text
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError, Triplet
 

@@ -27,8 +27,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import Action, InputError
 
 IMAGE, STATE, ACTION = "observation.images.ego", "observation.state", "action"

@@ -32,7 +32,7 @@ from absl import flags
 from egosim_jax.data.manifest import Manifest
 from egosim_jax.data.mixing import Mixture
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.io.untrusted.bounded import listing
+from egosim_jax.io.bounded import listing
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from egosim_jax.data.records import DTYPES, current_name
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec
 
 RecordKind = Literal["videos", "frames", "latents"]

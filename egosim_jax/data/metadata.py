@@ -26,7 +26,7 @@ from typing import Any
 from egosim_jax.data.clip_files import MAX_CLIPS, ClipFiles, Problems, Prompts
 from egosim_jax.data.dwm import read_list
 from egosim_jax.data.ids import SAFE_IDS, is_safe_id
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes, read_lines
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes, read_lines
 from egosim_jax.types import InputError, check_counts
 
 REQUIRED = ("ego_prior_video", "prompt")

@@ -18,8 +18,8 @@ from typing import Any
 from egosim_jax.data.manifest import MANIFEST, Manifest
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.io.bounded import listing, quote, quote_path, read_json
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import listing, quote, quote_path, read_json
 from egosim_jax.types import InputError
 
 MIXTURE = "mixture.json"

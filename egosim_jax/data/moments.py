@@ -15,7 +15,7 @@ import numpy as np
 from einops import rearrange
 from jaxtyping import Float32
 
-from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.untrusted.pth import read_pth, write_pth
 from egosim_jax.types import InputError
 

@@ -16,8 +16,8 @@ from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import Resampling, decode_record, video_shape
 from egosim_jax.io.atomic import lock_folder
+from egosim_jax.io.bounded import listing, read_bytes
 from egosim_jax.io.decoding import Decoding
-from egosim_jax.io.untrusted.bounded import listing, read_bytes
 from egosim_jax.io.video import probe_encoded
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.io.untrusted.bounded import quote, quote_text
+from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
 DESCRIPTION = "recording.json"

@@ -36,11 +36,11 @@ from egosim_jax.data.recorded_files import (
 )
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.depth_images import read_depth_image
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
 from egosim_jax.io.segments import read_segment
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import Video
 from egosim_jax.types import (

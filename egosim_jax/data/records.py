@@ -14,8 +14,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from egosim_jax.io.bounded import parse_json, quote_text
 from egosim_jax.io.mapped import CODES
-from egosim_jax.io.untrusted.bounded import parse_json, quote_text
 from egosim_jax.types import InputError
 
 _DTYPES = {code: CODES[code] for code in ("BOOL", "U8", "I32", "I64", "F16", "BF16", "F32")}

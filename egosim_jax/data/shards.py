@@ -39,8 +39,8 @@ from egosim_jax.data.manifest import (
 )
 from egosim_jax.data.records import DTYPES, Record, RecordError, from_bytes, to_bytes
 from egosim_jax.io.atomic import LOCK, atomic_folder
+from egosim_jax.io.bounded import listing, quote_text
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted.bounded import listing, quote_text
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec
 
 _OPTIONS = "group_size:1,uncompressed"

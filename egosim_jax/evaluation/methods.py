@@ -19,7 +19,7 @@ from egosim_jax.data.ids import is_safe_id
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.metrics.image import fit_colors
-from egosim_jax.io.untrusted.bounded import quote_path, quote_text
+from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError
 

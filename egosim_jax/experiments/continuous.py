@@ -14,8 +14,8 @@ from egosim_jax.experiments.config import Continuous
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.perception import registry
 from egosim_jax.runtime.progress import track
 from egosim_jax.simulation.rollout import Rollout

@@ -32,8 +32,8 @@ from egosim_jax.experiments.scenes import (
 )
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.run import open_folder, write_json
-from egosim_jax.io.untrusted.bounded import read_lines
 from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
 from egosim_jax.train import loop

@@ -20,8 +20,8 @@ from egosim_jax.experiments.config import Policies
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generation.generator import Generator, batches
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import Perception, registry
 from egosim_jax.runtime.progress import track

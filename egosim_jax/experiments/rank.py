@@ -14,8 +14,8 @@ from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import conditions_of
 from egosim_jax.generation.generator import Generator
 from egosim_jax.generation.rank import by_picture
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import read_json
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet

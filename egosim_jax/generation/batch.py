@@ -29,10 +29,10 @@ from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
 from egosim_jax.generation.generator import Generator, NonFiniteError, batches
 from egosim_jax.io.atomic import append_line
+from egosim_jax.io.bounded import listing, quote
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.digest import sha256_within
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted.bounded import listing, quote
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, parts

@@ -20,8 +20,8 @@ from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.metrics.lpips import Lpips, frame_distances
 from egosim_jax.evaluation.metrics.report import mean_and_spread, print_table
 from egosim_jax.generation.batch import BatchJob
+from egosim_jax.io.bounded import listing
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import listing
 from egosim_jax.io.video import read_video
 from egosim_jax.perception.networks.xclip import XClip
 from egosim_jax.types import InputError

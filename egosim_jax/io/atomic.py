@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.io.untrusted.bounded import quote_path, read_json
+from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.types import InputError
 
 TEMPORARY = ".tmp"

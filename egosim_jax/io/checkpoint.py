@@ -22,10 +22,10 @@ from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
 from egosim_jax.io.atomic import TEMPORARY
+from egosim_jax.io.bounded import listing, quote_text, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.renamed import STATE as STATE_NAMES
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import listing, quote_text, read_json
 from egosim_jax.types import InputError
 
 STATE, DATA = "state", "data"

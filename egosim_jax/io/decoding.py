@@ -26,9 +26,9 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import Interpolation
 from av.video.stream import VideoStream
 
+from egosim_jax.io.bounded import open_regular, quote_path, refusing
 from egosim_jax.io.boxes import check_boxes
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
-from egosim_jax.io.untrusted.bounded import open_regular, quote_path, refusing
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000

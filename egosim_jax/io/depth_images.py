@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image
 
+from egosim_jax.io.bounded import quote_path, quote_text, read_bytes
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
-from egosim_jax.io.untrusted.bounded import quote_path, quote_text, read_bytes
 from egosim_jax.types import InputError
 
 MAX_BYTES = 1 << 28

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from egosim_jax.io.untrusted.bounded import open_regular
+from egosim_jax.io.bounded import open_regular
 
 
 def sha256(path: Path) -> str:

@@ -25,7 +25,7 @@ from typing import Any
 
 import jax
 
-from egosim_jax.io.untrusted.private import PrivateCache
+from egosim_jax.io.private import PrivateCache
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")

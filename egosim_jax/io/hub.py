@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Literal
 
 from egosim_jax.io.atomic import LOG, PART, lock_folder
+from egosim_jax.io.bounded import listing, quote, quote_text, read_json
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.private import cache_folder
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import listing, quote, quote_text, read_json
-from egosim_jax.io.untrusted.private import cache_folder
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 

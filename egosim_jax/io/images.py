@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from egosim_jax.io.untrusted.bounded import quote_path, read_bytes, refusing
+from egosim_jax.io.bounded import quote_path, read_bytes, refusing
 from egosim_jax.types import InputError
 
 MAX_IMAGE_PIXELS = 2**25

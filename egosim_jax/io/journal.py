@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from egosim_jax.io.atomic import append_line
+from egosim_jax.io.bounded import listing, quote, read_lines
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted.bounded import listing, quote, read_lines
 from egosim_jax.types import InputError
 
 T = TypeVar("T")

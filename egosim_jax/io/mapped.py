@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import ml_dtypes
 import numpy as np
 
-from egosim_jax.io.untrusted.bounded import (
+from egosim_jax.io.bounded import (
     MAX_JSON_BYTES,
     open_regular,
     parse_json,

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.atomic import atomic_folder, atomic_write
+from egosim_jax.io.bounded import quote, quote_path, read_bytes, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import digest
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_bytes, read_json
 from egosim_jax.types import InputError
 
 DESCRIPTION = "parts.json"

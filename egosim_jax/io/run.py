@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
+from egosim_jax.io.bounded import listing, quote, quote_text, read_json
 from egosim_jax.io.renamed import upgrade
-from egosim_jax.io.untrusted.bounded import listing, quote, quote_text, read_json
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"

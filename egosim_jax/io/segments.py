@@ -14,6 +14,7 @@ import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
 
+from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.boxes import MAX_SAMPLES
 from egosim_jax.io.decoding import (
     MAX_FRAMES,
@@ -30,7 +31,6 @@ from egosim_jax.io.decoding import (
     to_rgb,
     upright,
 )
-from egosim_jax.io.untrusted.bounded import quote_path, quote_text
 from egosim_jax.io.video import Video, VideoInfo
 from egosim_jax.types import InputError, check_counts
 

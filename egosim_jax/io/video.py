@@ -23,6 +23,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.decoding import (
     ACCURATE,
     MAX_FRAMES,
@@ -41,7 +42,6 @@ from egosim_jax.io.decoding import (
     to_rgb,
     upright,
 )
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError
 
 _SMPTE170M, _LIMITED_RANGE = 6, 1

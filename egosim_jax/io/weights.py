@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import listing, quote_path
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import (
     HASH,
@@ -27,7 +28,6 @@ from egosim_jax.io.mapped import (
     read_metadata,
     read_safetensors,
 )
-from egosim_jax.io.untrusted.bounded import listing, quote_path
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted.bounded import quote_path, quote_text
-from egosim_jax.io.untrusted.private import cache_folder
+from egosim_jax.io.private import cache_folder
 from egosim_jax.types import InputError
 
 _DOWNLOAD = ("download", "--no-deps", "--only-binary=:all:")

@@ -22,8 +22,8 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
+from egosim_jax.io.bounded import listing
 from egosim_jax.io.mapped import OURS
-from egosim_jax.io.untrusted.bounded import listing
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.untrusted.bounded import parse_json, quote_path, quote_text
+from egosim_jax.io.bounded import parse_json, quote_path, quote_text
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.types import Cameras, InputError, Perceived
 

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from egosim_jax.io.bounded import open_regular, quote, quote_text, read_bytes
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted.bounded import open_regular, quote, quote_text, read_bytes
 from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
 from egosim_jax.perception.registry import register

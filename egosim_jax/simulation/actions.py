@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from egosim_jax.geometry import invert, pixels_of, transform
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.untrusted.bounded import quote, read_json
+from egosim_jax.io.bounded import quote, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state.depth import DEPTH_M
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState

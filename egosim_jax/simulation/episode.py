@@ -35,9 +35,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax.io.atomic import atomic_folder, atomic_write, check_replaceable
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_image
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes, read_json
 from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.simulation.actions import check_action, load_action, save_action

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.untrusted.bounded import open_regular, quote, quote_path, quote_text
+from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_HEADER = 1 << 16

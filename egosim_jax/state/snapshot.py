@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_folder, check_replaceable
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state.ply import read_points, write_points
 from egosim_jax.types import InputError, SceneState

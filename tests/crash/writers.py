@@ -36,11 +36,11 @@ from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.io import executables, weights
 from egosim_jax.io.atomic import append_line
+from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted.bounded import read_lines
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.state import snapshot

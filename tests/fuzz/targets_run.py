@@ -14,7 +14,7 @@ import numpy as np
 
 from egosim_jax.io import run
 from egosim_jax.io.journal import Journal
-from egosim_jax.io.untrusted.private import PrivateCache
+from egosim_jax.io.private import PrivateCache
 from egosim_jax.perception import archive
 from egosim_jax.state import snapshot
 from egosim_jax.types import Cameras, InputError, Perceived, SceneState

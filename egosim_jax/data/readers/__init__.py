@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 from egosim_jax.types import InputError
 
 

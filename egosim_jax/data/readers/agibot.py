@@ -43,8 +43,8 @@ from egosim_jax.data.readers.rotations import from_quaternions
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.segments import probe_long_video, read_segment
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.io.untrusted.isolated import read_hdf5
 from egosim_jax.io.video import VideoInfo, write_frames
 from egosim_jax.types import Cameras, InputError

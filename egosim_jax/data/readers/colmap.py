@@ -29,8 +29,8 @@ from egosim_jax.data.readers.pictures import (
 )
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.images import read_image
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.types import InputError
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.readers.rotations import make_poses
 from egosim_jax.geometry import invert
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.types import InputError
 
 MAX_BYTES = 1 << 30

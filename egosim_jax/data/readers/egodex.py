@@ -31,8 +31,8 @@ from jaxtyping import Float
 from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.recording import Recording
+from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted.bounded import quote, quote_path
 from egosim_jax.io.untrusted.isolated import read_hdf5
 from egosim_jax.types import Cameras, InputError
 

@@ -29,8 +29,8 @@ from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert
+from egosim_jax.io.bounded import quote_path, read_bytes
 from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted.bounded import quote_path, read_bytes
 from egosim_jax.types import Cameras, InputError
 
 VIDEOS = ("video_16fps.mp4", "video.mp4")

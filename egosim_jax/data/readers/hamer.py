@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import transform
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.types import Cameras, InputError
 
 FOCAL = 5000 / 256

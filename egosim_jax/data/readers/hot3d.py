@@ -34,8 +34,8 @@ from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.data.readers.rotations import make_poses
 from egosim_jax.data.readers.umetrack import FINGERS, HINGES, HandModel
 from egosim_jax.data.recording import Recording
+from egosim_jax.io.bounded import open_regular, parse_json, quote, quote_path, quote_text
 from egosim_jax.io.images import decode_image
-from egosim_jax.io.untrusted.bounded import open_regular, parse_json, quote, quote_path, quote_text
 from egosim_jax.io.video import write_frames
 from egosim_jax.types import Cameras, InputError
 

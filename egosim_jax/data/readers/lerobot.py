@@ -25,8 +25,7 @@ import tyro
 
 from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
 from egosim_jax.data.recording import MAX_FRAMES, Recording
-from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted.bounded import (
+from egosim_jax.io.bounded import (
     listing,
     quote,
     quote_path,
@@ -34,6 +33,7 @@ from egosim_jax.io.untrusted.bounded import (
     read_json,
     read_lines,
 )
+from egosim_jax.io.segments import probe_long_video
 from egosim_jax.io.untrusted.isolated import read_parquet
 from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import InputError

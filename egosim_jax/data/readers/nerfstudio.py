@@ -25,8 +25,8 @@ from egosim_jax.data.readers.pictures import MAX_PICTURES, PictureVideo, write_p
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.images import read_image
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.types import InputError
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")

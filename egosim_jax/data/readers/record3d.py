@@ -39,8 +39,7 @@ from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.images import decode_image
-from egosim_jax.io.untrusted.bounded import (
+from egosim_jax.io.bounded import (
     open_regular,
     parse_json,
     quote,
@@ -48,6 +47,7 @@ from egosim_jax.io.untrusted.bounded import (
     quote_text,
     read_bytes,
 )
+from egosim_jax.io.images import decode_image
 from egosim_jax.io.untrusted.npz import DAMAGE
 from egosim_jax.types import InputError
 

@@ -20,8 +20,8 @@ import tyro
 
 from egosim_jax.data.readers import Entry, find_files, inside, make_id
 from egosim_jax.data.recording import Recording
+from egosim_jax.io.bounded import listing, quote_path, quote_text, read_bytes
 from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted.bounded import listing, quote_path, quote_text, read_bytes
 from egosim_jax.types import InputError
 
 VIDEO_COLUMNS = ("video", "video_path", "file", "file_name", "filename", "path", "name")

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from egosim_jax.geometry import hinge_rotation
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 from egosim_jax.types import InputError
 
 FINGERS, HINGES, BONES, LANDMARKS = 5, 4, 17, 21

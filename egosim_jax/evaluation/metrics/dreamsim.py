@@ -34,9 +34,9 @@ from jaxtyping import Array, Float, UInt8
 from PIL import Image
 
 from egosim_jax.evaluation.metrics.batches import Batches
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import Tensor, read_safetensors
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.io.untrusted.pth import read_pth
 from egosim_jax.types import InputError
 

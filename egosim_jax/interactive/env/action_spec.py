@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.placed import with_places
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import Side, joints_of
 

@@ -18,7 +18,7 @@ from egosim_jax.data.lerobot_writer import HANDS, INTRINSICS, POSES, SCENE
 from egosim_jax.data.readers.lerobot import read_info, read_rows, read_tasks
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.interactive.env.start import Start
-from egosim_jax.io.untrusted.bounded import quote, quote_path
+from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState, VideoSpec
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from egosim_jax.interactive.env.action_spec import ActionSpec, numbers
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 from egosim_jax.types import InputError
 
 

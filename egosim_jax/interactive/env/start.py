@@ -19,9 +19,9 @@ from PIL import Image
 
 from egosim_jax.interactive.env.placed import load_placed, save_placed
 from egosim_jax.io.atomic import atomic_folder
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.images import read_image
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
 from egosim_jax.simulation.episode import MAX_CLIPS, Episode
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState, VideoSpec

@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 
 from egosim_jax.interactive.play.moves import Deed, Pose, drive, intent_of, perform, reach
 from egosim_jax.interactive.play.played import Frames, Moment, Played
-from egosim_jax.io.untrusted.bounded import quote_text
+from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import REACH_M

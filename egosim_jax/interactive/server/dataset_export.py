@@ -13,7 +13,7 @@ from egosim_jax.data.shards import ShardWriter
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import view_of
 from egosim_jax.interactive.server.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
-from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.rendering import get
 from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.rerun_log import Recording

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
 
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 from egosim_jax.types import InputError
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")

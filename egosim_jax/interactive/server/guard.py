@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.io.untrusted.bounded import quote
+from egosim_jax.io.bounded import quote
 
 OPEN_PATHS = ("/healthz", "/readyz")
 """Paths that need no token."""

@@ -26,8 +26,8 @@ from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.server import make_app
 from egosim_jax.interactive.server.service import FIELDS, is_streamed, open_service, refusal
 from egosim_jax.interactive.server.store import Limits
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.io.run import write_json
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.types import InputError, check_counts
 
 PARTS = "parts.json"

@@ -29,7 +29,7 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.guard import Guard, is_loopback, response, too_large, too_slow
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.service import Service
-from egosim_jax.io.untrusted.bounded import quote, quote_text
+from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
 DRAIN_S = 300.0

@@ -27,8 +27,8 @@ from egosim_jax.interactive.server.errors import RequestError, as_request_error
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.io.bounded import quote
 from egosim_jax.io.executables import share_with_jax
-from egosim_jax.io.untrusted.bounded import quote
 from egosim_jax.types import InputError
 
 T = TypeVar("T")

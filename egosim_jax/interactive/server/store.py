@@ -34,7 +34,7 @@ from egosim_jax.interactive.server.session import (
     request_hash,
 )
 from egosim_jax.io.atomic import lock_folder
-from egosim_jax.io.untrusted.bounded import quote, quote_path
+from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, check_counts
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.untrusted.bounded import quote, quote_text
+from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
 MAX_BYTES = 16 << 20

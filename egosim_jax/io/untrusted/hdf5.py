@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.untrusted.bounded import open_regular, quote, quote_path, quote_text
+from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 31

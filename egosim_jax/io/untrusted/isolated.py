@@ -24,7 +24,7 @@ from typing import IO, Any, cast, no_type_check
 import numpy as np
 from jaxtyping import Float64
 
-from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.types import InputError
 
 Shape = tuple[int | None, ...]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.io.untrusted.bounded import open_regular, quote, quote_path, quote_text
+from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.io.untrusted.bounded import open_regular, quote_path, quote_text
+from egosim_jax.io.bounded import open_regular, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 32

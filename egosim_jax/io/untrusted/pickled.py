@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
+from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.io.mapped import MAX_TENSORS, RefusedError, check_name
-from egosim_jax.io.untrusted.bounded import quote, quote_text
 
 MAX_PICKLE, MAX_STEPS, DEEPEST = 16 << 20, 1 << 20, 64
 """Limits: bytes and operations of the pickle, depth of nested containers."""

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.mapped import MAX_AXES, RefusedError, check_sizes, digest, strides_of
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.untrusted.pickled import ACTIONS, Interpreter, Name, Opaque, flatten
 from egosim_jax.types import InputError
 

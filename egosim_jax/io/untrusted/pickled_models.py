@@ -20,8 +20,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.mapped import RefusedError
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.untrusted.pickled import Name, Opaque
 from egosim_jax.io.untrusted.pickled_arrays import MAX_BYTES, NumPyInterpreter, PickledArray
 from egosim_jax.types import InputError

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import quote, quote_path, quote_text
 from egosim_jax.io.mapped import (
     CODES,
     MAX_AXES,
@@ -28,7 +29,6 @@ from egosim_jax.io.mapped import (
     map_file,
     strides_of,
 )
-from egosim_jax.io.untrusted.bounded import quote, quote_path, quote_text
 from egosim_jax.io.untrusted.pickled import Interpreter, Name, Opaque, flatten
 from egosim_jax.io.untrusted.torch_zip import read_entries
 from egosim_jax.types import InputError

@@ -10,8 +10,8 @@ import struct
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from egosim_jax.io.bounded import quote
 from egosim_jax.io.mapped import RefusedError
-from egosim_jax.io.untrusted.bounded import quote
 
 MAX_ENTRIES = 1 << 17
 """Entries of an archive."""

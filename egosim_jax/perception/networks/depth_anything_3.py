@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from egosim_jax.geometry import invert
-from egosim_jax.io.untrusted.bounded import quote, quote_path
+from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.perception.cameras.path import complete_path
 from egosim_jax.perception.depth.triangulate import triangulate_frames
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict

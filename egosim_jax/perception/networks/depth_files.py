@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import invert
-from egosim_jax.io.untrusted.bounded import open_regular, quote_path, quote_text
+from egosim_jax.io.bounded import open_regular, quote_path, quote_text
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict
 from egosim_jax.types import Cameras, InputError
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 from egosim_jax.perception.networks.pixels import normalize, resize_levels, to_images

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
 

@@ -16,8 +16,8 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.records import from_bytes, to_bytes
 from egosim_jax.data.shards import ShardWriter, gather
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted.bounded import quote_path
 from egosim_jax.runtime.processes import run_in_processes
 from egosim_jax.types import (
     WAN_GRID,

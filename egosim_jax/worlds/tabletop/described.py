@@ -24,7 +24,7 @@ import numpy as np
 
 from egosim_jax.geometry import rotation_z
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.untrusted.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.types import InputError, check_seed
 from egosim_jax.worlds.tabletop.bodies import (
     COLORS,

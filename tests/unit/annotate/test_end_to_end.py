@@ -10,7 +10,7 @@ from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.data.clips import check_clip
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.geometry import umeyama
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import read_video
 from tests.unit.annotate.stubs import StubHands, write

@@ -10,7 +10,7 @@ from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state import snapshot
 from tests.unit.annotate.stubs import DEPTH, config, mean_hand, textured_video, write

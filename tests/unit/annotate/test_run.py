@@ -17,7 +17,7 @@ from egosim_jax.annotate.prepare import Cutting, Quality
 from egosim_jax.annotate.sources import find_sources
 from egosim_jax.data.clips import check_clip
 from egosim_jax.data.metadata import read_metadata
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import read_video
 from egosim_jax.state import snapshot

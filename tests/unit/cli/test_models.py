@@ -13,7 +13,7 @@ from egosim_jax.cli.__main__ import main
 from egosim_jax.cli.models import Fetch
 from egosim_jax.convert.commands import ToTorch, Weights
 from egosim_jax.io import hub
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError

@@ -18,9 +18,8 @@ from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
 from egosim_jax.generation.stream import Streamer
-from egosim_jax.io import executables
+from egosim_jax.io import executables, private
 from egosim_jax.io.executables import cached_compile
-from egosim_jax.io.untrusted import private
 
 GIVEN = (jax.ShapeDtypeStruct((3,), jnp.float32),)
 WIDE = jax.ShapeDtypeStruct((64, 64), jnp.float32)

@@ -9,7 +9,7 @@ import pytest
 from huggingface_hub.errors import OfflineModeIsEnabled
 
 from egosim_jax.io import hub
-from egosim_jax.io.untrusted.bounded import read_json
+from egosim_jax.io.bounded import read_json
 from egosim_jax.types import InputError
 from tests.hub import COMMIT, Hub, serve
 

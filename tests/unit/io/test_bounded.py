@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from egosim_jax.io.untrusted.bounded import (
+from egosim_jax.io.bounded import (
     MAX_QUOTED,
     open_regular,
     parse_json,
