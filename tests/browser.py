@@ -64,7 +64,7 @@ class Page:
             || [...document.querySelectorAll('input')].some(e => e.value.includes({text!r}))""")
 
     def screenshot(self, path=None, **clip):
-        """Return a picture of the page, or of the rectangle `x`, `y`, `width`, `height` of it."""
+        """Return an image of the page, or of the rectangle `x`, `y`, `width`, `height` of it."""
         given = {"clip": {**clip, "scale": 1}} if clip else {}
         data = base64.b64decode(self.call("Page.captureScreenshot", **given)["data"])
         if path is not None:
@@ -77,8 +77,8 @@ class Page:
             .filter(e => e.src.startsWith('blob:'))
             .map(e => e.getBoundingClientRect()).map(r => [r.x, r.y, r.width, r.height])""")
 
-    def pictures(self):
-        """Return a picture of each image element that is shown, from the top down."""
+    def images(self):
+        """Return an image of each image element that is shown, from the top down."""
         names = ("x", "y", "width", "height")
         return [self.screenshot(**dict(zip(names, box, strict=True))) for box in self.boxes()]
 

@@ -5,7 +5,7 @@
   equally spaced; a variable frame rate is refused (`sources`).
 - Size: that of the video, reduced to at most 832 pixels on its longer side and cropped at the
   borders to multiples of 16. Another size crops what its aspect ratio does not hold; one that would
-  lose more than 40 % of the picture, as landscape from portrait, is refused.
+  lose more than 40 % of the image, as landscape from portrait, is refused.
 - Length: all frames, cut to 4k+1. More than 601 need `--clips` or `--num-frames`.
 - HDR (PQ or HLG) is refused: converted to 8 bits without its tone curve, it would be pale.
 """
@@ -31,7 +31,7 @@ MAX_CLIP_FRAMES, MIN_CLIP_FRAMES = 601, 9
 LONGEST_PX = 832
 """Longer side of clips without a given size, at most, in pixels."""
 MIN_KEPT = 0.6
-"""Smallest fraction of the picture that a crop may keep."""
+"""Smallest fraction of the image that a crop may keep."""
 CHUNK = 300
 """Frames of a video that are decoded at a time."""
 
@@ -75,7 +75,7 @@ class Plan:
     scale: float
     """Pixels of the clip per pixel of the video."""
     offset_px: tuple[float, float]
-    """Column and row, in the resized picture, of the clip's first pixel."""
+    """Column and row, in the resized image, of the clip's first pixel."""
 
     @no_type_check
     def indices(self, start: int, stop: int) -> Int[np.ndarray, " f"]:
@@ -136,7 +136,7 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     if kept < MIN_KEPT:
         raise InputError(
             f"{name} is {info.width}x{info.height}: {width}x{height} would keep {kept:.0%} of the "
-            f"picture, less than {MIN_KEPT:.0%}. Choose a size of a similar shape, for instance "
+            f"image, less than {MIN_KEPT:.0%}. Choose a size of a similar shape, for instance "
             f"{' '.join(map(str, _own_size(info)))}. (--size)"
         )
     rest = round(info.width * scale) - width, round(info.height * scale) - height

@@ -14,8 +14,8 @@ from egosim_jax.io.bounded import read_bytes
 from egosim_jax.io.run import write_text
 
 PAGE = "index.html"
-MAX_PICTURES = 500
-"""Clips whose pictures are on the page; the others are listed only."""
+MAX_IMAGES = 500
+"""Maximum number of clips shown with their images; the others are only listed."""
 MAX_SHEET_BYTES = 1 << 24
 _HEAD = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>Annotated clips</title>
@@ -36,28 +36,28 @@ def write_page(out: Path, report: Mapping[str, Any]) -> None:
     parts = [
         _HEAD,
         f"<h1>{counts['done']} clips, {counts['refused']} refused, {counts['failed']} failed</h1>",
-        "<p>Pictures, from top to bottom: prior, mask (white: not observed), hands, video.</p>",
+        "<p>Images, from top to bottom: prior, mask (white: not observed), hands, video.</p>",
     ]
     for name, video in report["videos"].items():
         if "problem" in video:
             parts.append(_section("failed", name, video["problem"], None, {}))
     for number, about in enumerate(report["annotations"]):
         sheet = out / about["video_id"] / SHEET
-        picture = sheet if number < MAX_PICTURES and sheet.exists() else None
+        drawn = sheet if number < MAX_IMAGES and sheet.exists() else None
         title = f"{about['video_id']}: {about['status']}"
         text = about.get("reason") or about.get("row", {}).get("prompt", "")
         shown = ("quality", "hands", "cameras", "depth", "scale", "plate", "prior", "caption")
         figures = {name: about[name] for name in shown if name in about}
-        parts.append(_section(about["status"], title, text, picture, figures))
+        parts.append(_section(about["status"], title, text, drawn, figures))
     write_text(out / PAGE, "\n".join(parts) + "\n</html>\n")
 
 
 def _section(
-    status: str, title: str, text: str, picture: Path | None, figures: Mapping[str, Any]
+    status: str, title: str, text: str, drawn: Path | None, figures: Mapping[str, Any]
 ) -> str:
     image = ""
-    if picture is not None:
-        data = base64.b64encode(read_bytes(picture, limit=MAX_SHEET_BYTES)).decode()
+    if drawn is not None:
+        data = base64.b64encode(read_bytes(drawn, limit=MAX_SHEET_BYTES)).decode()
         image = f'<img alt="{html.escape(title)}" src="data:image/jpeg;base64,{data}">'
     table = "\n".join(f"{name}: {json.dumps(value)}" for name, value in figures.items())
     return (

@@ -1,9 +1,9 @@
 """Shots, windows and quality of a recorded video, measured on thumbnails in one pass.
 
-A shot ends where the picture changes by more than `cut_difference` gray levels and three times as
+A shot ends where the image changes by more than `cut_difference` gray levels and three times as
 much as in the frames around (adaptive content detection, as in PySceneDetect); black frames belong
 to no shot. A clip is a window of one shot. It is refused if it is black, blurred, still, or shaken,
-each with the figure that decided; the figures are fractions of the picture's width, so that they
+each with the figure that decided; the figures are fractions of the image's width, so that they
 hold for any size. Whether hands are visible is known after the first stage (`stages`).
 """
 
@@ -46,9 +46,9 @@ class Quality:
     max_black: float = 0.0
     """Largest fraction of black frames, darker than 16 of 255."""
     min_motion: float = 0.005
-    """Smallest motion of what moves fastest (95 %), in widths of the picture per second."""
+    """Smallest motion of what moves fastest (95 %), in widths of the image per second."""
     max_motion: float = 1.5
-    """Largest motion of the picture as a whole (median), in widths of the picture per second."""
+    """Largest motion of the image as a whole (median), in widths of the image per second."""
     min_prior_gain_db: float = -2.0
     """Smallest PSNR of the prior, compared with that of the first frame repeated, in decibels."""
 
@@ -75,7 +75,7 @@ class Cutting:
     clips: bool = False
     """Cut videos into clips; else a video is one clip, which a cut makes unusable."""
     cut_difference: float = 15.0
-    """Smallest change of the picture at a cut, in gray levels."""
+    """Smallest change of the image at a cut, in gray levels."""
     quality: Quality = field(default_factory=Quality)
     """Rules that a clip must satisfy."""
 
@@ -92,7 +92,7 @@ class Scan:
     sharpness: Float[np.ndarray, " f"]
     """Variance of the Laplacian in squared gray levels."""
     motion: Float[np.ndarray, "f 2"]
-    """Optical flow from the frame before, median and 95 %, in widths of the picture per second."""
+    """Optical flow from the frame before, median and 95 %, in widths of the image per second."""
 
     @property
     def black(self) -> Bool[np.ndarray, " f"]:

@@ -31,7 +31,7 @@ from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import SceneState, Triplet
 
 PLATE_MARGIN = 1 / 80
-"""Width in pictures of the border around drawn hands that is replaced, too."""
+"""Width in images of the border around drawn hands that is replaced, too."""
 FRAMES_AT_ONCE = 64
 """Frames that are rendered together."""
 POINT_PX = 2

@@ -81,7 +81,7 @@ def nearest_frames(count: int, have: float, want: float) -> np.ndarray:
 def resized_intrinsics(
     intrinsics_px: np.ndarray, size: tuple[int, ...], video: VideoSpec
 ) -> np.ndarray:
-    """Return intrinsics of pictures that were resized along each axis."""
+    """Return intrinsics of images that were resized along each axis."""
     scale = np.array([video.width / size[1], video.height / size[0]])
     resized = intrinsics_px.copy()
     resized[:2] *= scale[:, None]

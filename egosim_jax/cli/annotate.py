@@ -68,9 +68,9 @@ class Annotate:
     max_black: float = 0.0
     """Largest fraction of black frames."""
     min_motion: float = 0.005
-    """Smallest motion of what moves fastest, in widths of the picture per second."""
+    """Smallest motion of what moves fastest, in widths of the image per second."""
     max_motion: float = 1.5
-    """Largest motion of the camera, in widths of the picture per second."""
+    """Largest motion of the camera, in widths of the image per second."""
     min_prior_gain: float = -2.0
     """Smallest PSNR of the prior in decibels, compared with that of the first frame repeated."""
     hand_weights: Path | None = None

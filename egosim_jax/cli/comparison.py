@@ -58,7 +58,7 @@ class Options:
     device: str = "auto"
     """Device of these networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     page_clips: int = 8
-    """Most clips of each group that the page shows; 0: neither page nor picture."""
+    """Most clips of each group that the page shows; 0: neither page nor image."""
 
     def read_clips(self) -> list[ClipFiles]:
         """Read the selected rows of the metadata."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from egosim_jax.simulation import episode as episodes
     from egosim_jax.types import Action, Cameras, SceneState
 
-PICTURES = 6
+IMAGES = 6
 """Frames of each video on a contact sheet."""
 
 
@@ -245,7 +245,7 @@ class ShowEpisode:
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or .zip of the episode."""
     out: Path | None = None
-    """Picture to write; NAME.png in the current folder if not given."""
+    """Image to write; NAME.png in the current folder if not given."""
     renderer: RendererName = "jax"
     """Renderer of the view and the hands."""
 
@@ -256,7 +256,7 @@ class ShowEpisode:
 
         episode = Episode.load(self.path)
         last = episode.shape[0] - 1
-        moments = [last * k // (PICTURES - 1) for k in range(PICTURES)]
+        moments = [last * k // (IMAGES - 1) for k in range(IMAGES)]
         truths = episode.ground_truth or (None,) * len(episode.actions)
         sheet = []
         for number, (action, truth) in enumerate(

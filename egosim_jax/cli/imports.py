@@ -111,7 +111,7 @@ class Import:
     """Import recordings of a dataset or a capture: cameras, hands, depth and captions, as known.
 
     Writes a folder per recording, which `egosim data annotate` reads; videos stay where they are,
-    and pictures become one. What cannot be read is reported and skipped (exit code 3). The same
+    and images become one. What cannot be read is reported and skipped (exit code 3). The same
     command resumes. Prints the folder.
     """
 

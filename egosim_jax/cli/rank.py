@@ -11,9 +11,9 @@ from egosim_jax.types import InputError, check_counts, check_seed
 
 @dataclass(frozen=True, kw_only=True)
 class Rank:
-    """Generate candidate actions and rank them by a picture or a text of the goal.
+    """Generate candidate actions and rank them by an image or a text of the goal.
 
-    By the picture, the score is the negative LPIPS of the last frame (extra `metrics`); by the
+    By the image, the score is the negative LPIPS of the last frame (extra `metrics`); by the
     text, the similarity of the video by X-CLIP (extra `networks`). Writes the clips of each seed to
     OUT/SEED, and OUT/ranking.json; prints the ranking, best first.
     """
@@ -25,7 +25,7 @@ class Rank:
     out: Path
     """Folder to write to; the same command resumes."""
     goal_image: Path | None = None
-    """Picture of the goal, of the shape of the model's clips."""
+    """Image of the goal, of the shape of the model's clips."""
     goal_text: str | None = None
     """Text that describes the goal."""
     xclip: Path | None = None
@@ -62,19 +62,19 @@ class Rank:
         check_seed(self.seed + self.seeds)
         if (self.goal_image is None) == (self.goal_text is None):
             raise InputError(
-                "Candidates are ranked by one goal: either a picture or a text of it, not "
+                "Candidates are ranked by one goal: either an image or a text of it, not "
                 f"{'both' if self.goal_text else 'neither'}. (--goal-image, --goal-text)"
             )
         if self.goal_image is not None and self.xclip is not None:
             raise InputError(
-                "A picture is compared by LPIPS, not by X-CLIP: omit the network, or give a text "
+                "An image is compared by LPIPS, not by X-CLIP: omit the network, or give a text "
                 "of the goal. (--xclip, --goal-image)"
             )
         config = configs.get(self.config)
         if self.goal_image is not None:
             goal, measure = str(self.goal_image), "-LPIPS of the last frame to the goal"
             video = config.video
-            score = rank.by_picture(read_image(self.goal_image), (video.height, video.width))
+            score = rank.by_image(read_image(self.goal_image), (video.height, video.width))
         else:
             goal, measure = str(self.goal_text), "similarity of the video to the goal"
             score = rank.by_text(goal, self.xclip)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.types import Action, GroundTruth, SceneState
 
-PICTURES = 6
+IMAGES = 6
 """Frames of each video on the contact sheet."""
 CLIPS = 3
 """Clips of the tabletop world if `--clips` is not given."""
@@ -221,7 +221,7 @@ class _Outputs:
         if recording is not None:
             recording.close(state)
         last = self.episode.shape[0] - 1
-        moments = [last * k // (PICTURES - 1) for k in range(PICTURES)]
+        moments = [last * k // (IMAGES - 1) for k in range(IMAGES)]
         draw_sheet(sheet, folder / "contact_sheet.png", moments=moments)
         return report
 

@@ -34,7 +34,7 @@ class View:
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or file to view."""
     out: Path | None = None
-    """Picture or page to write; by default NAME.png here, or index.html in a training's folder."""
+    """Image or page to write; by default NAME.png here, or index.html in a training's folder."""
     up: Up | None = None
     """Axis of the world that points up; z in the tabletop world and -y elsewhere if not given."""
     host: str = "127.0.0.1"

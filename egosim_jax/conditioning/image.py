@@ -1,11 +1,11 @@
 """Preprocessing of the first frame for the CLIP image encoder.
 
-Wan 2.1 takes a picture in [-1, 1], resizes it to the encoder's square, maps it to [0, 1] and
+Wan 2.1 takes an image in [-1, 1], resizes it to the encoder's square, maps it to [0, 1] and
 normalizes it with CLIP's statistics:
 
     pixels = (x / 2 + 1/2 - mean) / std
 
-The EgoSim release hands over a picture in [0, 1] instead, so that its encoder saw only the upper
+The EgoSim release hands over an image in [0, 1] instead, so that its encoder saw only the upper
 half of the range, in training too; `image_range="unit"` reproduces that, "signed" is Wan's.
 
 The resize is bicubic without antialiasing, on a grid of cells (not of corners), as torch's

@@ -1,6 +1,6 @@
 """Import of recordings: what a reader finds is written as folders that annotation reads.
 
-    DIR/<recording_id>/recording.json, arrays.npz, and for pictures also video.mp4 and depth/
+    DIR/<recording_id>/recording.json, arrays.npz, and for images also video.mp4 and depth/
 
 A recording is done when its recording.json exists, so that an interrupted import resumes; it is
 made again if it is damaged. What another source or other options made is refused.

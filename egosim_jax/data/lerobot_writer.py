@@ -184,10 +184,10 @@ def _write_episode(
     statistics: dict[str, _Statistics],
     fps: int,
 ) -> None:
-    number, pictures, prompts, steps = len(totals.episodes), [], [], []
+    number, images, prompts, steps = len(totals.episodes), [], [], []
     for frame, prompt, step in _steps(clips, totals):
         statistics[IMAGE].add(frame.reshape(-1, 3) / 255)
-        pictures.append({"bytes": _png(frame), "path": None})
+        images.append({"bytes": _png(frame), "path": None})
         prompts.append(prompt)
         totals.tasks.setdefault(prompt, len(totals.tasks))
         steps.append(step)
@@ -197,7 +197,7 @@ def _write_episode(
         statistics.setdefault(name, _Statistics((size,))).add(values.astype(float))
     count, first = len(steps), totals.frames
     columns = {
-        IMAGE: pictures,
+        IMAGE: images,
         **{name: list(values) for name, values in vectors.items()},
         "timestamp": (np.arange(count) / fps).astype(np.float32),
         "frame_index": np.arange(count),
@@ -226,9 +226,9 @@ def _write_table(path: Path, columns: dict[str, Any]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    picture = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+    image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
     short, long = pa.list_(pa.float32()), pa.list_(pa.float64())
-    types = {IMAGE: picture, STATE: short, ACTION: short, "timestamp": pa.float32(),
+    types = {IMAGE: image, STATE: short, ACTION: short, "timestamp": pa.float32(),
              HANDS: long, POSES: long, INTRINSICS: long}  # fmt: skip
     arrays = {
         name: pa.array(values, types.get(name, pa.int64() if name in COUNTERS else None))
@@ -266,7 +266,7 @@ def _write_meta(
         name: {"dtype": "float64", "shape": [totals.vectors[name]], "names": None}
         for name in (HANDS, POSES, INTRINSICS)
     }
-    picture = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
+    image = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
     own = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
     info = {
         "codebase_version": "v3.0",
@@ -282,7 +282,7 @@ def _write_meta(
         "data_path": PATH,
         "video_path": None,
         "features": {
-            IMAGE: picture,
+            IMAGE: image,
             STATE: vector,
             ACTION: vector,
             **exact,

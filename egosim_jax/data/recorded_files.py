@@ -15,7 +15,7 @@ DESCRIPTION = "recording.json"
 
 @dataclass(frozen=True, kw_only=True)
 class DepthFiles:
-    """Measured depth: one file per frame, of the picture's aspect but maybe another size."""
+    """Measured depth: one file per frame, of the image's aspect but maybe another size."""
 
     paths: tuple[Path | None, ...]
     """PNG of 16 bits or npy of each frame; None where a frame has none."""

@@ -180,7 +180,7 @@ class Recording:
         return Video(frames=video.frames, fps=self.fps)
 
     def read_depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
-        """Return measured depth in meters at the picture's size, infinite where unknown, or None.
+        """Return measured depth in meters at the image's size, infinite where unknown, or None.
 
         A smaller map is enlarged by repeating the nearest value, so that edges stay sharp.
         """

@@ -1,4 +1,4 @@
-"""Files of an evaluation: JSON, CSV, LaTeX, and a picture of the scores.
+"""Files of an evaluation: JSON, CSV, LaTeX, and an image of the scores.
 
 metrics.jsonl   one line per clip, with the scores of each method
 report.json     definitions, protocol, summaries, paired differences, published figures
@@ -34,7 +34,7 @@ ARROWS = {"higher": "↑", "lower": "↓"}
 
 
 def write_files(evaluation: Evaluation, out: Path) -> None:
-    """Write all files of an evaluation but the picture to a folder."""
+    """Write all files of an evaluation but the image to a folder."""
     lines: dict[str, dict] = {}
     for row in evaluation.rows:
         window = row.window

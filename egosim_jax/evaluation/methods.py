@@ -26,7 +26,7 @@ from egosim_jax.types import InputError
 MAX_BORDER_PX = 8
 """Most rows or columns by which a video may exceed the wanted size and is cropped to its center."""
 FIT = (
-    "Pillow LANCZOS, the picture stretched to the size of the comparison; a video that exceeds it "
+    "Pillow LANCZOS, the image stretched to the size of the comparison; a video that exceeds it "
     f"by at most {MAX_BORDER_PX} rows and columns has a border, and is cropped to its center"
 )
 
@@ -179,7 +179,7 @@ def read_at(
 ) -> UInt8[np.ndarray, "f h w 3"]:
     """Read frames from `start`, fitted to a shape. Raises `InputError` if there are too few.
 
-    With `border`, a narrow border around the picture is cut off.
+    With `border`, a narrow border around the image is cut off.
     """
     fit = partial(_fit, height=shape.height, width=shape.width, border=border)
     frames = read_video(path, start=start, stop=start + shape.frames, each=fit).frames

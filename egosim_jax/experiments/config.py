@@ -12,7 +12,7 @@ class ModelExperiment:
     """Settings of every experiment with a trained model."""
 
     out: Path
-    """Folder of the report and the pictures of the experiment."""
+    """Folder of the report and the images of the experiment."""
     first_scene: int
     """Seed of the first scene."""
     config: str = "tabletop"
@@ -174,7 +174,7 @@ class Embodiment:
 
 @dataclass(frozen=True, kw_only=True)
 class Rank(ModelExperiment):
-    """Rank candidate actions by a picture of the goal, and compare with what they truly reach.
+    """Rank candidate actions by an image of the goal, and compare with what they truly reach.
 
     Each goal is the last frame of one of several actions in a held-out scene. Prints how often the
     ranking by generated videos finds that action, and the rank correlation with the ranking by true

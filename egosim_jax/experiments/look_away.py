@@ -51,7 +51,7 @@ OUTSIDE_DEGREES = 35.0
 FRAMES_BACK = 4
 """Last frames of the last clip, which are scored."""
 NEAR_PERCENT = 5.0
-"""Farthest a kept object may be from its true place in the picture, in percent of the width."""
+"""Farthest a kept object may be from its true place in the image, in percent of the width."""
 TRUE = "ground truth, classical"
 """Row of the ground-truth frames and of the state that classical perception makes of them."""
 SHEET_SCENES = 3
@@ -63,7 +63,7 @@ MEASURES = {
     "state_accuracy": ("state accuracy %", "{:.0f}"),
 }
 DEFINITIONS = {
-    "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the picture's width of its true "
+    "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the image's width of its true "
     f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
     "object_error": "distance of the centroid of the object, segmented by color among the colors "
     "of all bodies, from that of its ground-truth ids, in percent of the width, median over those "
@@ -231,7 +231,7 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
         clips=tuple(clips),
         target=target,
         before=np.stack(
-            [picture.ids == number for picture in film_scenes([script.scene] * FRAMES_BACK, back)]
+            [image.ids == number for image in film_scenes([script.scene] * FRAMES_BACK, back)]
         ),
         background=np.stack(
             [p.colors for p in film_scenes([world.scene] * FRAMES_BACK, back, without=target)]

@@ -101,24 +101,22 @@ class Task:
         pose[:3, 3] = np.asarray(script.intent.goal_m)
         arms = self.last_arms(action)
         there = film_scenes([self._with(pose)] * LAST_FRAMES, last, arms=arms)
-        goal = np.stack([picture.ids == number for picture in there])
+        goal = np.stack([image.ids == number for image in there])
         bare = film_scenes([script.scene] * LAST_FRAMES, last, without=name)
-        background = np.stack([picture.colors for picture in bare])
+        background = np.stack([image.colors for image in bare])
         paints = paints_of(place(script.scene, arms[-1]))
         errors = region.centroid_errors(region.find(number, frames, background, paints), goal)
         if not len(errors):
             return {"success": 0.0}
-        depth = np.median(np.stack([picture.depth_m for picture in there])[goal])
+        depth = np.median(np.stack([image.depth_m for image in there])[goal])
         error = float(np.median(errors) * depth / last.intrinsics_px[0, 0])
         return {"success": float(error <= WITHIN_M[0]), "error_m": error}
 
     def last_frames(self, action: Action) -> UInt8[np.ndarray, "f h w 3"]:
         """Return the last frames of the ground truth of an action."""
         scenes, _ = World(scene=self.script.scene).move(action)
-        pictures = film_scenes(
-            scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action)
-        )
-        return np.stack([picture.colors for picture in pictures])
+        images = film_scenes(scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action))
+        return np.stack([image.colors for image in images])
 
     @property
     def last_cameras(self) -> Cameras:

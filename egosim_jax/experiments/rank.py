@@ -13,7 +13,7 @@ from egosim_jax.experiments.config import Rank
 from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import conditions_of
 from egosim_jax.generation.generator import Generator
-from egosim_jax.generation.rank import by_picture
+from egosim_jax.generation.rank import by_image
 from egosim_jax.io.bounded import read_json
 from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track
@@ -67,7 +67,7 @@ def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
     best = seed % len(clips)
     triplets = [_triplet(clip, generator) for clip in clips]
     goal = clips[best].frames[-1]
-    score = by_picture(goal, goal.shape[:2])
+    score = by_image(goal, goal.shape[:2])
     generated = [
         [score(clip.frames) for clip in generator.generate(triplets, [n + repeat for n in noise])]
         for noise, repeat in (

@@ -1,7 +1,7 @@
 """Ranking of candidate actions by the goal that their generated videos reach.
 
 Each candidate is generated with several seeds. Its score is a mean over them: the negative LPIPS of
-the last frame to a picture of the goal, or the similarity of the video to a text, by X-CLIP. The
+the last frame to an image of the goal, or the similarity of the video to a text, by X-CLIP. The
 best candidate has the highest score. (Kim et al. 2026, Dexterous World Models, action evaluation.)
 """
 
@@ -29,7 +29,7 @@ from egosim_jax.types import InputError
 Score = Callable[[UInt8[np.ndarray, "f h w 3"]], float]
 """Function that scores a video; higher is better."""
 STRETCH = 0.02
-"""Most by which the ratio of width to height of a picture may differ from that of the clips."""
+"""Most by which the ratio of width to height of an image may differ from that of the clips."""
 MEASURES = {"score": ("score", "{:.4f}"), "rank": ("rank", "{:.0f}")}
 
 
@@ -50,22 +50,22 @@ class Ranked:
         return float(np.mean(self.scores))
 
 
-def by_picture(goal: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Score:
-    """Return the score of a video whose last frame shall look like a picture (LPIPS of AlexNet).
+def by_image(goal: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Score:
+    """Return the score of a video whose last frame shall look like an image (LPIPS of AlexNet).
 
-    The picture is resized to `size`, rows and columns of the videos. Raises `InputError` if it has
+    The image is resized to `size`, rows and columns of the videos. Raises `InputError` if it has
     another shape than they, so that resizing would stretch it, or LPIPS is not installed.
     """
     (rows, columns), (height, width) = goal.shape[:2], size
     if abs(columns * height / (rows * width) - 1) > STRETCH:
         raise InputError(
-            f"The picture of the goal has {columns}x{rows} pixels and would be stretched to the "
+            f"The image of the goal has {columns}x{rows} pixels and would be stretched to the "
             f"{width}x{height} of the clips: crop it to their shape. (--goal-image)"
         )
-    network, picture = Lpips.load("alex"), resize_image(goal, height, width)[None]
+    network, image = Lpips.load("alex"), resize_image(goal, height, width)[None]
 
     def score(video: UInt8[np.ndarray, "f h w 3"]) -> float:
-        return -float(frame_distances(network, video[-1:], picture)[0])
+        return -float(frame_distances(network, video[-1:], image)[0])
 
     return score
 
@@ -76,7 +76,7 @@ def by_text(goal: str, folder: Path | None) -> Score:
         raise InputError(
             f"Videos cannot be compared with the text {goal!r} without a network: that takes a "
             "folder of an X-CLIP model. Download microsoft/xclip-base-patch32 and name its folder, "
-            "or give a picture of the goal (--goal-image). (--xclip)"
+            "or give an image of the goal (--goal-image). (--xclip)"
         )
     network = XClip(folder)
     network.check_installed()

@@ -128,37 +128,37 @@ def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list
         return stream.decode(packet)
 
 
-def read_pictures(container: InputContainer, name: str, max_frames: int) -> Iterator[VideoFrame]:
+def read_frames(container: InputContainer, name: str, max_frames: int) -> Iterator[VideoFrame]:
     """Yield decoded frames. Raises `DamagedError` where the video is damaged."""
     stream, size = container.streams.video[0], None
     shown = given = 0
     for packet in read_packets(container, name, max_frames):
         shown += packet is not None and not packet.is_discard
-        for picture in decode_packet(stream, packet, name):
-            size = size or (picture.height, picture.width)
-            if picture.is_corrupt or size != (picture.height, picture.width):
+        for frame in decode_packet(stream, packet, name):
+            size = size or (frame.height, frame.width)
+            if frame.is_corrupt or size != (frame.height, frame.width):
                 raise DamagedError(f"{name} is damaged at frame {given}.")
             given += 1
             check_size(name, given, size[0] * size[1], max_frames)
-            yield picture
+            yield frame
     if given != shown:
         raise DamagedError(f"{name} is damaged: {given} of its {shown} frames can be decoded.")
 
 
-def to_rgb(picture: VideoFrame, decoding: Decoding) -> np.ndarray:
+def to_rgb(frame: VideoFrame, decoding: Decoding) -> np.ndarray:
     """Return a decoded frame as upright RGB `h w 3`."""
-    picture_rgb = picture.reformat(format="rgb24", interpolation=_SCALERS[decoding])
-    return upright(picture, picture_rgb.to_ndarray())
+    frame_rgb = frame.reformat(format="rgb24", interpolation=_SCALERS[decoding])
+    return upright(frame, frame_rgb.to_ndarray())
 
 
-def upright(picture: VideoFrame, pixels: np.ndarray) -> np.ndarray:
+def upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
     """Rotate and mirror frames by the display matrix (a b u, c d v, x y w).
 
     A point (x, y) is shown at (a x + c y, b x + d y), y downward.
     """
-    if "DISPLAYMATRIX" not in picture.side_data:
+    if "DISPLAYMATRIX" not in frame.side_data:
         return pixels
-    a, b, _, c, d, *_ = np.frombuffer(bytes(picture.side_data["DISPLAYMATRIX"]), np.int32)
+    a, b, _, c, d, *_ = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32)
     if (a or d) and (b or c):
         raise InputError("the video is rotated by an angle that is not a multiple of 90°.")
     if b or c:

@@ -53,8 +53,8 @@ def probe_long_video(path: Path) -> VideoInfo:
     with open_file(path) as file:
         listing = _list(file, name)
         with open_video(file, name, None) as container:
-            picture = next(_pictures(container, name, listing.keys[0][1]))
-            height, width = upright(picture, np.empty((picture.height, picture.width))).shape
+            decoded = next(_frames(container, name, listing.keys[0][1]))
+            height, width = upright(decoded, np.empty((decoded.height, decoded.width))).shape
             stream = container.streams.video[0]
             fps, hdr, unit = frame_rate(stream, name), is_hdr(stream), stream.time_base
     return VideoInfo(
@@ -93,13 +93,13 @@ def read_segment(
         first, last = listing.times[start], listing.times[start + count - 1]
         with open_video(file, name, None) as container:
             key = max((k for k in listing.keys if k[0] <= first), default=listing.keys[0])
-            for picture in _pictures(container, name, key[1]):
-                time = first - 1 if picture.pts is None else picture.pts
+            for decoded in _frames(container, name, key[1]):
+                time = first - 1 if decoded.pts is None else decoded.pts
                 if time < first:
                     continue
                 if time != listing.times[start + len(kept)]:
                     break
-                frame = to_rgb(picture, decoding)
+                frame = to_rgb(decoded, decoding)
                 kept.append(frame if each is None else each(frame))
                 if time >= last:
                     break
@@ -138,16 +138,16 @@ def _unevenness(times: list[int]) -> float:
     return float(np.abs(np.array(times) - even).max())
 
 
-def _pictures(container: InputContainer, name: str, dts: int) -> Iterator[VideoFrame]:
+def _frames(container: InputContainer, name: str, dts: int) -> Iterator[VideoFrame]:
     """Yield decoded frames from a key frame on."""
     stream = container.streams.video[0]
     container.seek(dts, stream=stream, backward=True)
     size, count = None, 0
     for packet in container.demux(stream):
-        for picture in decode_packet(stream, packet if packet.size else None, name):
-            size = size or (picture.height, picture.width)
-            if picture.is_corrupt or size != (picture.height, picture.width):
-                raise DamagedError(f"{name} is damaged at {picture.time} s.")
+        for decoded in decode_packet(stream, packet if packet.size else None, name):
+            size = size or (decoded.height, decoded.width)
+            if decoded.is_corrupt or size != (decoded.height, decoded.width):
+                raise DamagedError(f"{name} is damaged at {decoded.time} s.")
             count += 1
             check_size(name, count, size[0] * size[1], MAX_FRAMES)
-            yield picture
+            yield decoded

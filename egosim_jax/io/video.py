@@ -37,8 +37,8 @@ from egosim_jax.io.decoding import (
     is_hdr,
     open_file,
     open_video,
+    read_frames,
     read_packets,
-    read_pictures,
     to_rgb,
     upright,
 )
@@ -177,12 +177,12 @@ def _decode(
     start, stop, kept = frames.start, frames.stop, FrameBuffer(name)
     with open_video(file, name, max_frames) as container:
         try:
-            for index, picture in enumerate(read_pictures(container, name, max_frames)):
+            for index, decoded in enumerate(read_frames(container, name, max_frames)):
                 if stop is not None and index >= stop:
                     break
                 if index < start:
                     continue
-                frame = to_rgb(picture, decoding)
+                frame = to_rgb(decoded, decoding)
                 kept.append(frame if each is None else each(frame))
         except DamagedError:
             if damage == "refuse" or not len(kept):
@@ -242,8 +242,8 @@ def write_frames(
         for frame in chain([first], rest):
             if frame.shape != size:
                 raise InputError(
-                    f"Picture {count} has {frame.shape[1]}x{frame.shape[0]} pixels, the first one "
-                    f"{size[1]}x{size[0]}: all pictures of a video must have one size."
+                    f"Frame {count} has {frame.shape[1]}x{frame.shape[0]} pixels, the first one "
+                    f"{size[1]}x{size[0]}: all frames of a video must have one size."
                 )
             count += 1
             yield frame[:height, :width]
@@ -269,12 +269,12 @@ def _encode(
         stream.codec_context.colorspace = _SMPTE170M
         stream.codec_context.color_range = _LIMITED_RANGE
         for frame in frames:
-            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-            picture = picture.reformat(
+            coded = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            coded = coded.reformat(
                 format="yuv420p",
                 interpolation=ACCURATE,
                 dst_colorspace=Colorspace.ITU601,
                 dst_color_range=ColorRange.MPEG,
             )
-            container.mux(stream.encode(picture))
+            container.mux(stream.encode(coded))
         container.mux(stream.encode())

@@ -192,12 +192,12 @@ class ImageEncoderConfig(NetworkConfig, Protocol):
 
     @property
     def image_size(self) -> int:
-        """Rows and columns of the picture in pixels."""
+        """Rows and columns of the image in pixels."""
         ...
 
     @property
     def tokens(self) -> int:
-        """Tokens of a picture."""
+        """Tokens of an image."""
         ...
 
 

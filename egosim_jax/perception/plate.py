@@ -3,7 +3,7 @@
 A pixel that a hand hides in the first frame shows the scene at its depth there. Each is taken from
 the nearest frame in time whose view of that point is free, and which looks alike around it, so that
 what a hand moves later stays where it was: a temporal median would erase it. What no frame shows is
-filled with patches of the rest of the picture (PatchMatch; Barnes et al. 2009), or by Telea's
+filled with patches of the rest of the image (PatchMatch; Barnes et al. 2009), or by Telea's
 method without that library.
 """
 
@@ -25,7 +25,7 @@ PATCH = 5
 RING_PX = 7
 """Width in pixels of the ring around the hidden pixels in which brightness is compared."""
 AROUND = 0.08
-"""Reach in pictures within which visible pixels decide whether another frame shows the same."""
+"""Reach in images within which visible pixels decide whether another frame shows the same."""
 MAX_DIFFERENCE = 40
 """Largest difference in gray levels of pixels that look alike."""
 MIN_AGREEMENT = 0.7

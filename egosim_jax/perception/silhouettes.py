@@ -21,9 +21,9 @@ from egosim_jax.types import Cameras, Kind, check_counts
 PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
 """Joints that move as one rigid body: wrist and knuckles; all of a gripper."""
 ASSUMED_FOCAL = 0.45
-"""Focal length that silhouettes of tracks are drawn with, in widths of the picture.
+"""Focal length that silhouettes of tracks are drawn with, in widths of the image.
 
-Depth is in proportion to it, and so the picture of a hand does not depend on it; that of a forearm
+Depth is in proportion to it, and so the image of a hand does not depend on it; that of a forearm
 hardly does."""
 
 

@@ -1,6 +1,6 @@
 """Rendering of a scene's points, of hands and of meshes along a camera path.
 
-`reference` is in NumPy, `jitted` in JAX; both are a `Renderer` and draw the same pictures. Sources:
+`reference` is in NumPy, `jitted` in JAX; both are a `Renderer` and draw the same images. Sources:
 EgoSim, section 3.2 (rendering of the prior) and the released `render_16fps_aligned.py`; colors and
 sizes of the hands are measured on the published videos.
 """
@@ -30,13 +30,13 @@ class Renderer(Protocol):
     def draw_hands(
         self, joints_m: Float[ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
     ) -> tuple[UInt8[ndarray, "f h w 3"], Float32[ndarray, "f h w"]]:
-        """Draw n hands; return the picture and its depth, black and infinite elsewhere."""
+        """Draw n hands; return the image and its depth, black and infinite elsewhere."""
         ...
 
     def draw_mesh(
         self, mesh: MovingMesh, cameras: Cameras
     ) -> tuple[UInt8[ndarray, "f h w 3"], Float32[ndarray, "f h w"]]:
-        """Draw a shaded mesh; return the picture and its depth, black and infinite elsewhere."""
+        """Draw a shaded mesh; return the image and its depth, black and infinite elsewhere."""
         ...
 
 

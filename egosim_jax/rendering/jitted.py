@@ -1,4 +1,4 @@
-"""Renderer in JAX, which the product uses; it draws the same pictures as `reference`.
+"""Renderer in JAX, which the product uses; it draws the same images as `reference`.
 
 Points: all squares of a given size are the same square moved by integer offsets. So each point is
 written into one cell only, that of its first pixel, and a pixel sees the nearest of p x p
@@ -31,7 +31,7 @@ from egosim_jax.rendering.tiles import (
     Canvas,
     chunks,
     empty_canvas,
-    picture_of,
+    image_of,
     pixel_rays,
     put,
     tiles_of,
@@ -146,7 +146,7 @@ def paint(
     *,
     gamma: bool,
 ) -> UInt8[Array, "f h w 3"]:
-    """Return the picture of the visible points, black where there are none."""
+    """Return the image of the visible points, black where there are none."""
     colors = jnp.asarray(GAMMA)[colors] if gamma else jnp.asarray(colors)
     return jnp.where(index[..., None] < 0, jnp.uint8(0), colors[index])
 
@@ -167,7 +167,7 @@ def unobserved(
 def draw_hands(
     joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Draw n hands; return the picture and its depth, black and infinite where there is no hand."""
+    """Draw n hands; return the image and its depth, black and infinite where there is no hand."""
     tiles = tiles_of(cameras)
     intrinsics = jnp.asarray(cameras.intrinsics_px, jnp.float32)
     frames = []
@@ -180,7 +180,7 @@ def draw_hands(
         for chunk in chunks(shapes, low, high, cameras):
             canvas = _draw_chunk(canvas, **chunk, intrinsics_px=intrinsics, columns=tiles[1])
         frames.append(canvas)
-    return picture_of(frames, cameras)
+    return image_of(frames, cameras)
 
 
 def _shapes_of(

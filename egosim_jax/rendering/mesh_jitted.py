@@ -1,4 +1,4 @@
-"""Renderer of shaded meshes in JAX, which draws the same pictures as `mesh_reference`.
+"""Renderer of shaded meshes in JAX, which draws the same images as `mesh_reference`.
 
 With the corners a, b, c of a triangle in camera coordinates, a ray d from the camera leaves them on
 one side if d . (b x c), d . (c x a) and d . (a x b) have one sign; divided by their sum they are
@@ -22,7 +22,7 @@ from egosim_jax.rendering.tiles import (
     Canvas,
     chunks,
     empty_canvas,
-    picture_of,
+    image_of,
     pixel_rays,
     put,
     tiles_of,
@@ -33,7 +33,7 @@ from egosim_jax.types import Cameras
 def draw_mesh(
     mesh: MovingMesh, cameras: Cameras
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Draw a mesh; return the picture and its depth, black and infinite where there is none."""
+    """Draw a mesh; return the image and its depth, black and infinite where there is none."""
     tiles = tiles_of(cameras)
     intrinsics = jnp.asarray(cameras.intrinsics_px, jnp.float32)
     frames = []
@@ -49,7 +49,7 @@ def draw_mesh(
         for chunk in chunks(shapes, corners.min(axis=1), corners.max(axis=1), cameras):
             canvas = _draw_chunk(canvas, **chunk, intrinsics_px=intrinsics, columns=tiles[1])
         frames.append(canvas)
-    return picture_of(frames, cameras)
+    return image_of(frames, cameras)
 
 
 @partial(jax.jit, static_argnames="columns", donate_argnames="canvas")

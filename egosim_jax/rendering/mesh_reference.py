@@ -14,19 +14,19 @@ from egosim_jax.types import Cameras, InputError
 def draw_mesh(
     mesh: MovingMesh, cameras: Cameras
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Draw a mesh; return the picture and its depth, black and infinite where there is none.
+    """Draw a mesh; return the image and its depth, black and infinite where there is none.
 
     Triangles with a vertex that is not finite are missing. Nothing nearer than 1 cm is drawn.
     """
     shape = len(mesh.vertices_m), cameras.height, cameras.width
-    picture, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, np.inf, np.float32)
+    image, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, np.inf, np.float32)
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     for frame, pose in enumerate(cameras.world_from_camera):
         vertices = transform(invert(pose), mesh.vertices_m[frame])
         given = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
         if given.any():
-            _draw(picture[frame], depth[frame], vertices, mesh, given, rays)
-    return picture, depth
+            _draw(image[frame], depth[frame], vertices, mesh, given, rays)
+    return image, depth
 
 
 def draw_scene(
@@ -37,7 +37,7 @@ def draw_scene(
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"]]:
     """Draw a scene in the colors of its vertices, without light, along a camera path.
 
-    Returns the picture and the mask: 255, and black, where no triangle is seen. Raises `InputError`
+    Returns the image and the mask: 255, and black, where no triangle is seen. Raises `InputError`
     if the first frame shows none.
     """
     import open3d as o3d
@@ -47,7 +47,7 @@ def draw_scene(
         o3d.core.Tensor(vertices_m.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32))
     )
     shape = len(cameras.world_from_camera), cameras.height, cameras.width
-    picture, mask = np.zeros((*shape, 3), np.uint8), np.full(shape, 255, np.uint8)
+    image, mask = np.zeros((*shape, 3), np.uint8), np.full(shape, 255, np.uint8)
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     for frame, pose in enumerate(cameras.world_from_camera):
         ways = rays @ pose[:3, :3].T
@@ -57,18 +57,18 @@ def draw_scene(
         u, v = hits["primitive_uvs"].numpy()[seen].T
         corners = colors[triangles[hits["primitive_ids"].numpy()[seen]]]
         share = np.stack([1 - u - v, u, v], axis=1)
-        picture[frame][seen] = np.rint(np.einsum("nk,nkc->nc", share, corners))
+        image[frame][seen] = np.rint(np.einsum("nk,nkc->nc", share, corners))
         mask[frame][seen] = 0
     if mask[0].all():
         raise InputError(
             f"None of the {len(triangles)} triangles of the scene is seen in the first frame: the "
             "camera must look at the scene, in the same world coordinates."
         )
-    return picture, mask
+    return image, mask
 
 
 def _draw(
-    picture: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
     depth: Float32[np.ndarray, "h w"],
     vertices: Float[np.ndarray, "v 3"],
     mesh: MovingMesh,
@@ -99,4 +99,4 @@ def _draw(
     size = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
     cosine = (normal * towards).sum(axis=1) / np.maximum(size, 1e-12)
     light = AMBIENT + DIFFUSE * np.maximum(cosine, 0)
-    picture[seen] = np.round(255 * np.clip(color * light[:, None], 0, 1))
+    image[seen] = np.round(255 * np.clip(color * light[:, None], 0, 1))

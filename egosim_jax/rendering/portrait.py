@@ -34,13 +34,13 @@ def up_of(state: SceneState) -> Up:
 
 
 def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:
-    """Write a picture of a state from the left, the front and the right, in a row."""
+    """Write an image of a state from the left, the front and the right, in a row."""
     with atomic_write(path) as temporary:
         Image.fromarray(np.concatenate(list(portrait(state, up=up)), axis=1)).save(temporary)
 
 
 def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
-    """Return pictures of a state from the left, the front and the right, slightly from above.
+    """Return images of a state from the left, the front and the right, slightly from above.
 
     The front is where a wearer looks from: along y if z is up, along z if -y is. Points are as
     large as the distance between neighbors.

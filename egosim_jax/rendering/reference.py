@@ -66,7 +66,7 @@ def splat(
 def paint(
     index: Int[np.ndarray, "f h w"], colors: UInt8[np.ndarray, "n 3"], *, gamma: bool
 ) -> UInt8[np.ndarray, "f h w 3"]:
-    """Return the picture of the visible points, black where there are none.
+    """Return the image of the visible points, black where there are none.
 
     `gamma` applies the original renderer's color curve, c -> c^(1/2.2).
     """
@@ -79,7 +79,7 @@ def unobserved(
 ) -> UInt8[np.ndarray, "f h w"]:
     """Return the mask, 255 where no point is seen.
 
-    Training data has masks of points twice as large as those of the picture; a view of the state
+    Training data has masks of points twice as large as those of the image; a view of the state
     has points of one size and a mask whose observed part is widened by a pixel: `dilate`.
     """
     drawn = index >= 0
@@ -119,14 +119,14 @@ def check_visible(index: Int[np.ndarray, "h w"], count: int) -> None:
 def draw_hands(
     joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras, *, kind: Kind
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Draw n hands; return the picture and its depth, black and infinite where there is no hand.
+    """Draw n hands; return the image and its depth, black and infinite where there is no hand.
 
     A hand with a joint that is not finite is missing from that frame. Nothing nearer than 1 cm or
     behind the camera is drawn.
     """
     skeleton = SKELETONS[kind]
     frames, height, width = len(joints_m), cameras.height, cameras.width
-    picture = np.zeros((frames, height, width, 3), np.uint8)
+    image = np.zeros((frames, height, width, 3), np.uint8)
     depth = np.full((frames, height, width), np.inf, np.float32)
     rays = pixel_rays(cameras.intrinsics_px, height=height, width=width)
     for frame, world_from_camera in enumerate(cameras.world_from_camera):
@@ -145,8 +145,8 @@ def draw_hands(
                 met = _meet(rays[window], start, end, radius)
                 nearer = met < depth[frame][window]
                 depth[frame][window][nearer] = met[nearer]
-                picture[frame][window][nearer] = color
-    return picture, depth
+                image[frame][window][nearer] = color
+    return image, depth
 
 
 def _window(

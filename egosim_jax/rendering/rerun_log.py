@@ -38,12 +38,12 @@ class Recording:
         self._rr, self._frame = rr, 0
         self._stream = rr.RecordingStream("egosim", recording_id=name)
         self._stream.save(self._writing.__enter__())
-        pictures = (
+        images = (
             ("view", "/view"),
             ("generated", "/world/camera"),
             ("ground truth", "/ground_truth"),
         )
-        column = rrb.Vertical(*(rrb.Spatial2DView(name=n, origin=o) for n, o in pictures))
+        column = rrb.Vertical(*(rrb.Spatial2DView(name=n, origin=o) for n, o in images))
         scene = rrb.Spatial3DView(name="world", origin="/world")
         self._stream.send_blueprint(rrb.Blueprint(rrb.Horizontal(scene, column)))
         axes = rr.ViewCoordinates
@@ -78,10 +78,10 @@ class Recording:
                     image_plane_distance=0.15,
                 ),
             )
-            log("world/camera", self._picture(frames[frame]))
-            log("view", self._picture(view[frame]))
+            log("world/camera", self._image(frames[frame]))
+            log("view", self._image(view[frame]))
             if ground_truth is not None:
-                log("ground_truth", self._picture(ground_truth[frame]))
+                log("ground_truth", self._image(ground_truth[frame]))
             for number, joints in enumerate(action.joints_m[frame]):
                 log(f"world/hands/{number}", rr.LineStrips3D(joints[bones], radii=BONE_M))
             self._frame += 1
@@ -98,5 +98,5 @@ class Recording:
         points = self._rr.Points3D(state.points_m, colors=state.colors, radii=POINT_M)
         self._stream.log("world/state", points)
 
-    def _picture(self, frame: np.ndarray) -> Any:
+    def _image(self, frame: np.ndarray) -> Any:
         return self._rr.Image(frame).compress(jpeg_quality=JPEG_QUALITY)

@@ -1,6 +1,6 @@
-"""Square tiles of a picture: a shape is drawn only in those that its bounding box meets.
+"""Square tiles of an image: a shape is drawn only in those that its bounding box meets.
 
-So that jax compiles once for pictures of one size, pairs of shape and tile are drawn in chunks of
+So that jax compiles once for images of one size, pairs of shape and tile are drawn in chunks of
 equal length.
 """
 
@@ -21,30 +21,30 @@ TILE_PX, CHUNK = 16, 256
 """Side of a tile in pixels, and pairs of shape and tile that are drawn at a time."""
 
 Canvas = tuple[Float32[Array, "t p p"], UInt8[Array, "t p p 3"]]
-"""Depth and colors of all tiles of a picture."""
+"""Depth and colors of all tiles of an image."""
 
 
 def tiles_of(cameras: Cameras) -> tuple[int, int]:
-    """Return the rows and columns of tiles that cover a picture."""
+    """Return the rows and columns of tiles that cover an image."""
     return -(-cameras.height // TILE_PX), -(-cameras.width // TILE_PX)
 
 
 def empty_canvas(tiles: tuple[int, int]) -> Canvas:
-    """Return a black picture of infinite depth."""
+    """Return a black image of infinite depth."""
     shape = (tiles[0] * tiles[1], TILE_PX, TILE_PX)
     return jnp.full(shape, jnp.inf), jnp.zeros((*shape, 3), jnp.uint8)
 
 
-def picture_of(
+def image_of(
     frames: Sequence[Canvas], cameras: Cameras
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Return the pictures and depths of canvases."""
+    """Return the images and depths of canvases."""
     rows, _ = tiles_of(cameras)
-    depth, picture = (np.stack([np.asarray(frame[k]) for frame in frames]) for k in range(2))
+    depth, image = (np.stack([np.asarray(frame[k]) for frame in frames]) for k in range(2))
     depth = rearrange(depth, "f (r c) i j -> f (r i) (c j)", r=rows)
-    picture = rearrange(picture, "f (r c) i j d -> f (r i) (c j) d", r=rows)
+    image = rearrange(image, "f (r c) i j d -> f (r i) (c j) d", r=rows)
     inside = slice(None), slice(cameras.height), slice(cameras.width)
-    return picture[inside], depth[inside]
+    return image[inside], depth[inside]
 
 
 def chunks(
@@ -91,8 +91,8 @@ def _bounding_tiles(
 ) -> tuple[Int[np.ndarray, "s 2"], Int[np.ndarray, "s 2"]]:
     """Return the first row and column of tiles of each shape, and those after the last.
 
-    They bound the picture of the corners of the box around the shape. A shape that reaches nearer
-    than `NEAR_M` may be anywhere in the picture; one that is nearer as a whole has no tiles.
+    They bound the image of the corners of the box around the shape. A shape that reaches nearer
+    than `NEAR_M` may be anywhere in the image; one that is nearer as a whole has no tiles.
     """
     box = np.stack([low_m, high_m], axis=1)
     near = low_m[:, 2] < NEAR_M
@@ -128,7 +128,7 @@ def put(
     colors: UInt8[Array, "k q r 3"],
 ) -> Canvas:
     """Draw each shape into its tile; of equally near ones the first is seen."""
-    before, picture = canvas
+    before, image = canvas
     count = len(tile)
     nearest = before.at[tile].min(depth)
     seen = (depth <= nearest[tile]) & (depth < before[tile])
@@ -137,4 +137,4 @@ def put(
     shape = jnp.minimum(winner, count - 1)
     rows, columns = (jnp.arange(size) for size in colors.shape[1:3])
     drawn = colors[shape, rows[:, None], columns]
-    return nearest, jnp.where((winner < count)[..., None], drawn, picture)
+    return nearest, jnp.where((winner < count)[..., None], drawn, image)

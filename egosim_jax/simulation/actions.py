@@ -144,7 +144,7 @@ def save_action(path: Path, action: Action) -> None:
 
 
 def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -> Action:
-    """Read an action's cameras and joints; `size` is height and width of its pictures."""
+    """Read an action's cameras and joints; `size` is height and width of its images."""
     names = {"world_from_camera": "float64", "intrinsics_px": "float64"}
     arrays = read_arrays(path, names, others=("joints_m",))
     return Action(

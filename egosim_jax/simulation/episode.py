@@ -91,7 +91,7 @@ class Episode:
         if image is not None and (image.shape != (*shape[1:], 3) or image.dtype != np.uint8):
             raise InputError(
                 f"The first frame is {image.dtype} {image.shape}: it must be uint8 "
-                f"{(*shape[1:], 3)}, as large as the cameras' pictures."
+                f"{(*shape[1:], 3)}, as large as the cameras' images."
             )
         for number, ground_truth in enumerate(self.ground_truth, start=1):
             if ground_truth.frames.shape[:3] != shape:

@@ -21,7 +21,7 @@ from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, is_rigid
 from egosim_jax.types.flow import (
     HAND_SIZE_M,
     JOINTS,
-    NEAR_PICTURE,
+    NEAR_IMAGE,
     REACH_M,
     Action,
     Clip,
@@ -49,7 +49,7 @@ __all__ = [
     "HAND_SIZE_M",
     "JOINTS",
     "MAX_SKEW",
-    "NEAR_PICTURE",
+    "NEAR_IMAGE",
     "REACH_M",
     "WAN_GRID",
     "Action",

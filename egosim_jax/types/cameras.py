@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from egosim_jax.types.settings import InputError
 
 FOCAL_WIDTHS = (0.1, 20.0)
-"""Smallest and largest plausible focal length, in widths of the picture."""
+"""Smallest and largest plausible focal length, in widths of the image."""
 MAX_SKEW = 0.1
 """Largest plausible skew of the pixels, in focal lengths."""
 
@@ -73,7 +73,7 @@ class Cameras:
             raise InputError(
                 f"Cameras have implausible intrinsics: {given}. They must be [fx, skew, cx], "
                 f"[0, fy, cy], [0, 0, 1] in pixels of this size: focal lengths from {low:g} to "
-                f"{high:g}, the principal point inside the picture. Do not transpose or normalize "
+                f"{high:g}, the principal point inside the image. Do not transpose or normalize "
                 "them, and scale them to the clip's size."
             )
 

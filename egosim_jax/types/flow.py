@@ -78,14 +78,14 @@ JOINTS: Mapping[Kind, int] = {"human": 21, "robot": 3}
 """Number of keypoints of a hand, by kind."""
 HAND_SIZE_M = (0.01, 1.0)
 """Smallest and largest plausible extent of a hand, in meters."""
-NEAR_PICTURE = 0.25
+NEAR_IMAGE = 0.25
 """Margin around the image in which a joint counts as near the view, in widths and heights."""
 REACH_M = 3.0
 """Largest distance in front of a camera at which a joint counts as near the view, in meters."""
 
 
 def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[np.ndarray, "f n"]:
-    """Return which hands have a joint within reach of the camera and in or near its picture."""
+    """Return which hands have a joint within reach of the camera and in or near its image."""
     poses = cameras.world_from_camera
     given = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
     where = np.where(given[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
@@ -93,7 +93,7 @@ def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[
     with np.errstate(divide="ignore", invalid="ignore"):
         u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
         v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
-    near_u, near_v = NEAR_PICTURE * cameras.width, NEAR_PICTURE * cameras.height
+    near_u, near_v = NEAR_IMAGE * cameras.width, NEAR_IMAGE * cameras.height
     seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
     seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
     return np.asarray(seen.any(axis=2))

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.bench_fusion
 
 Each program runs in its own process, which reports how long it took, how much memory it held at
-most beyond its input, and how long each of the 61 pictures takes. Plain Open3D: its own choice of
+most beyond its input, and how long each of the 61 images takes. Plain Open3D: its own choice of
 blocks, integration and extraction, and `project_to_rgbd_image`, one pixel a point; ours draws two.
 """
 

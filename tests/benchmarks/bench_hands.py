@@ -1,6 +1,6 @@
 """Hands on real videos: found, doubled and jumping ones, and distances to published skeletons.
 
-    python -m tests.benchmarks.bench_hands DATA [--pictures DIR] [--only NAME ...] [--halves]
+    python -m tests.benchmarks.bench_hands DATA [--images DIR] [--only NAME ...] [--halves]
 
 DATA has `raw_clips/lift_tumbler.mp4`, whose right hand is in frames 60 to 230, and `real_clips`
 with `metadata.csv` and, per clip, `video.mp4` and `hand_keypoint_video.mp4`. The published joints
@@ -164,18 +164,18 @@ def lift_tumbler(path: Path, estimator: LandmarkHands) -> None:
 
 def draw(frame: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Return a frame with our skeletons."""
-    picture = frame.copy()
+    image = frame.copy()
     for hand in joints[np.isfinite(joints).all((-1, -2))]:
         at = [tuple(int(v) for v in np.round(p)) for p in hand]
         for inner, outer in HUMAN.bones:
             color = tuple(int(v) for v in HUMAN.colors[outer])
-            cv2.line(picture, at[inner], at[outer], color, 2, cv2.LINE_AA)
-            cv2.circle(picture, at[outer], 4, color, -1, cv2.LINE_AA)
-    return picture
+            cv2.line(image, at[inner], at[outer], color, 2, cv2.LINE_AA)
+            cv2.circle(image, at[outer], 4, color, -1, cv2.LINE_AA)
+    return image
 
 
 def write_sheet(path: Path, frames: np.ndarray, skeleton: np.ndarray, tracks: HandTracks) -> None:
-    """Write a picture of some frames: ours on the left, the published skeleton on the right."""
+    """Write an image of some frames: ours on the left, the published skeleton on the right."""
     rows = []
     for index in np.linspace(0, len(frames) - 1, 5).round().astype(int):
         ours = draw(frames[index], tracks.joints_px[index])
@@ -189,7 +189,7 @@ def write_sheet(path: Path, frames: np.ndarray, skeleton: np.ndarray, tracks: Ha
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
-    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--images", type=Path)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--halves", action="store_true")
@@ -232,8 +232,8 @@ def main() -> None:
             f"{1000 * seconds / len(frames):.0f} ms a frame",
             flush=True,
         )
-        if args.pictures:
-            write_sheet(args.pictures / f"{row['video_id'][:60]}.jpg", frames, skeleton, tracks)
+        if args.images:
+            write_sheet(args.images / f"{row['video_id'][:60]}.jpg", frames, skeleton, tracks)
     for dataset, found in totals.items():
         joined = np.concatenate(found)
         print(

@@ -24,14 +24,14 @@ WATCH = """(() => {
   const note = what => window.events.push([performance.now() / 1000, what]);
   new MutationObserver(changes => {
     for (const change of changes)
-      if (change.type == 'attributes' && change.target.tagName == 'IMG') note('picture');
+      if (change.type == 'attributes' && change.target.tagName == 'IMG') note('image');
     const text = document.body.innerText;
     for (const part of ['Generating', 'Looking at', 'remembered after'])
       if (text.includes(part) && window.last != part) { window.last = part; note(part); }
   }).observe(document.body, {subtree: true, childList: true, characterData: true,
                              attributes: true, attributeFilter: ['src']});
 })()"""
-"""Script that notes when pictures and the status change in the page."""
+"""Script that notes when images and the status change in the page."""
 WIDTH = 880
 """Columns of the recording."""
 EMPTY = 0.2
@@ -47,13 +47,13 @@ def make_clip(page, button):
     page.wait_for("window.events.some(e => e[1] == 'remembered after')")
     clicked, events = page.run("window.clicked"), page.run("window.events")
     times = {what: seconds - clicked for seconds, what in reversed(events)}
-    shown = [s - clicked for s, what in events if what == "picture"]
+    shown = [s - clicked for s, what in events if what == "image"]
     live = [seconds for seconds in shown if seconds <= times["Looking at"] + 0.05]
     return live[0], live[-1], times["remembered after"]
 
 
 def record(page, runs, path):
-    """Record the page while a clip is made: shots before and after, and its pictures as played."""
+    """Record the page while a clip is made: shots before and after, and its images as played."""
     page.run(DISMISS)
     time.sleep(1)
     before = page.screenshot()
@@ -72,14 +72,14 @@ def record(page, runs, path):
 def write_gif(path, before, after, boxes, frames):
     """Write a GIF: the page before a clip, then with each frame, then after it.
 
-    `frames` have the generated and the true picture side by side, `boxes` where the page has them.
+    `frames` have the generated and the true image side by side, `boxes` where the page has them.
     """
     shots = [Image.fromarray(before)]
     for number, frame in enumerate(frames):
         shot = Image.fromarray(before if number < len(frames) - 1 else after)
-        for picture, (x, y, width, height) in zip(np.split(frame, 2, axis=1), boxes, strict=True):
+        for image, (x, y, width, height) in zip(np.split(frame, 2, axis=1), boxes, strict=True):
             size = round(width), round(height)
-            large = Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
+            large = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
             shot.paste(large, (round(x), round(y)))
         shots.append(shot)
     height, width = before.shape[:2]
@@ -89,10 +89,10 @@ def write_gif(path, before, after, boxes, frames):
         shot.crop((left, 0, width, height)).resize(size, Image.Resampling.LANCZOS) for shot in shots
     ]
     palette = small[len(small) // 2].quantize(160)
-    pictures = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in small]
-    durations = [800, *[125] * (len(pictures) - 2), 2500]
-    pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True
+    images = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in small]
+    durations = [800, *[125] * (len(images) - 2), 2500]
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True
     )
 
 

@@ -47,7 +47,7 @@ def main(rounds: int = 9) -> None:
 
 
 def make_programs() -> dict[str, Callable[[], object]]:
-    """The timed calls; each returns when its picture is there."""
+    """The timed calls; each returns when its image is there."""
     import open3d as o3d
 
     rng = np.random.default_rng(0)
@@ -75,7 +75,7 @@ def make_programs() -> dict[str, Callable[[], object]]:
     ours_depth = np.asarray(jitted.splat(on_device, cameras, point_px=1)[0])[0]
     their_depth = theirs()[..., 0]
     both = np.isfinite(ours_depth) & (their_depth > 0)
-    assert both.mean() > 0.2, "the pictures do not overlap"
+    assert both.mean() > 0.2, "the images do not overlap"
     assert np.median(np.abs(ours_depth - their_depth)[both]) < 1e-3, "other depths"
     return {
         "NumPy, 1 pixel": lambda: reference.splat(points, cameras, point_px=1),

@@ -1,4 +1,4 @@
-"""Agreement of executed scripts with the scripts, and time of a frame without its picture.
+"""Agreement of executed scripts with the scripts, and time of a frame without its image.
 
 python -m tests.benchmarks.bench_world --scenes 100
 """

@@ -290,7 +290,7 @@ def _sheet(place: Path, inputs: Path, version: int) -> None:
     draw_sheet([SheetClip("a", [_frames(version)])], place / "sheet.png", moments=[0, 1])
 
 
-def _picture(path: Path) -> str:
+def _image(path: Path) -> str:
     return _sha256(np.asarray(Image.open(path)))
 
 
@@ -310,9 +310,9 @@ WRITERS = {
     ),
     "portrait": Writer(
         lambda place, _, version: write_portrait(place / "a.png", state(version), up="z"),
-        _file("a.png", _picture),
+        _file("a.png", _image),
     ),
-    "sheet": Writer(_sheet, _file("sheet.png", _picture)),
+    "sheet": Writer(_sheet, _file("sheet.png", _image)),
     "video": Writer(
         lambda place, _, version: write_video(place / "a.mp4", _frames(version), 8),
         _file("a.mp4", lambda path: _sha256(read_video(path).frames)),

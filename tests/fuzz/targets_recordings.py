@@ -79,7 +79,7 @@ def read_parquet(folder: Path) -> Any:
 
 
 def make_colmap(folder: Path) -> None:
-    """Write one picture and one point in both formats."""
+    """Write one image and one point in both formats."""
     binary, text = folder / "binary", folder / "text"
     binary.mkdir()
     text.mkdir()

@@ -51,19 +51,19 @@ def pixels_of_places():
     return np.stack(project(camera.intrinsics_px, local), axis=1)
 
 
-def redness(picture, place_px):
+def redness(image, place_px):
     """Share of pixels around a place that are red, which skin is not."""
-    scale = picture.shape[1] / VIDEO.width
+    scale = image.shape[1] / VIDEO.width
     (x, y), reach = place_px * scale, AROUND_PX * scale
-    window = picture[int(y - reach) : int(y + reach), int(x - reach) : int(x + reach)].astype(int)
+    window = image[int(y - reach) : int(y + reach), int(x - reach) : int(x + reach)].astype(int)
     return float((window[..., 0] - window[..., 1:].max(axis=-1) > 80).mean())
 
 
 def settled(page):
-    """Generated and true picture when both have not changed for two seconds."""
-    before, since = page.pictures(), time.monotonic()
+    """Generated and true image when both have not changed for two seconds."""
+    before, since = page.images(), time.monotonic()
     while time.monotonic() - since < 2:
-        now = page.pictures()
+        now = page.images()
         if any(not np.array_equal(a, b) for a, b in zip(now, before, strict=True)):
             before, since = now, time.monotonic()
     return before
@@ -78,9 +78,9 @@ def test_an_object_is_picked_up_and_put_elsewhere_through_the_page(tmp_path):
         browse(url, tmp_path) as page,
     ):
         page.wait_for_text("put it on the ring")
-        for picture in settled(page):
-            assert redness(picture, old) > 0.3
-            assert redness(picture, new) < 0.05
+        for image in settled(page):
+            assert redness(image, old) > 0.3
+            assert redness(image, new) < 0.05
         page.click("put it on the ring")
         page.wait_for_text("remembered after")
         generated, true = settled(page)
@@ -93,7 +93,7 @@ def test_an_object_is_picked_up_and_put_elsewhere_through_the_page(tmp_path):
         page.wait_for_text("episode.zip")
         page.click("undo")
         page.wait_for_text("0: The beginning")
-        for picture in settled(page):
-            assert redness(picture, old) > 0.3
+        for image in settled(page):
+            assert redness(image, old) > 0.3
     (saved,) = tmp_path.glob("runs/*/episode.zip")
     assert "picks up the red" in Episode.load(saved).actions[0].prompt

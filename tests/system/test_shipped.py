@@ -19,10 +19,10 @@ from egosim_jax.generation.generator import Generator
 from egosim_jax.io.digest import sha256
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
-EXPECTED, PICTURE = (Path(__file__).with_name(f"shipped.{end}") for end in ("json", "png"))
+EXPECTED, IMAGE = (Path(__file__).with_name(f"shipped.{end}") for end in ("json", "png"))
 NAME, SEED = "tabletop", 0
 FRAMES = (0, 3, 6, 9, 12, 16)
-"""Frames of the picture."""
+"""Frames of the image."""
 LEVELS, OTHERS = 2, 1e-3
 """A pixel may differ by so many levels of 255; the share that may differ more."""
 MARGIN_DB = 0.1
@@ -72,7 +72,7 @@ def test_a_clip_is_as_close_to_the_target_as_before(clip, expected):
 
 
 def test_a_clip_has_the_golden_frames(clip):
-    golden = np.asarray(Image.open(PICTURE)).astype(int)
+    golden = np.asarray(Image.open(IMAGE)).astype(int)
     error = np.abs(side_by_side(clip[0]) - golden).max(axis=-1)
     assert (error > LEVELS).mean() <= OTHERS
 
@@ -89,7 +89,7 @@ if __name__ == "__main__":
     import tests.conftest  # noqa: F401 - compiled as in the tests
 
     frames, psnr = make_clip()
-    Image.fromarray(side_by_side(frames)).save(PICTURE)
+    Image.fromarray(side_by_side(frames)).save(IMAGE)
     with tempfile.TemporaryDirectory() as folder:
         loop = simulate(Path(folder) / "run")
     figures = {"sha256": digests(), "clip_psnr_db": psnr, "loop_psnr_db": loop}

@@ -53,7 +53,7 @@ def test_the_world_has_changed_from_clip_to_clip(simulated):
     assert all(moved)
 
 
-def test_the_recording_has_the_scene_the_hands_and_the_pictures(simulated):
+def test_the_recording_has_the_scene_the_hands_and_the_images(simulated):
     command = [sys.executable, "-m", "rerun", "rrd", "print", "-v"]
     printed = subprocess.run(
         [*command, str(simulated / "simulation.rrd")], capture_output=True, text=True, check=True
@@ -107,8 +107,8 @@ def test_a_state_and_a_point_cloud_are_drawn_from_three_sides(simulated, tmp_pat
     for number, path in enumerate((simulated / "clip_1" / "state", simulated / "state_1.ply")):
         out = tmp_path / f"{number}.png"
         assert main(["view", str(path), "--out", str(out), "--up", "z"]) == 0
-        with Image.open(out) as picture:
-            assert picture.size == (3 * 640, 480)
+        with Image.open(out) as image:
+            assert image.size == (3 * 640, 480)
     count = len(load(simulated / "clip_1" / "state").points_m)
     assert f"{count} points" in capsys.readouterr().out
     assert (tmp_path / "0.png").read_bytes() == (tmp_path / "1.png").read_bytes()
@@ -126,8 +126,8 @@ def test_what_is_up_is_drawn_above(up, top):
         last_seen=np.zeros(1000, np.int32),
         intrinsics_px=np.eye(3),
     )
-    for picture in portrait(state, up=up):
-        red, green = (np.argwhere(picture[..., k] > 0)[:, 0].mean() for k in (0, 1))
+    for image in portrait(state, up=up):
+        red, green = (np.argwhere(image[..., k] > 0)[:, 0].mean() for k in (0, 1))
         assert red < green - 50
 
 

@@ -13,7 +13,7 @@ of an episode, as in EgoSim's ids, or all of it where no parts are known. The wo
 base.
 
 Two readings of the extrinsics are in use, camera to base and base to camera. The points between
-the fingers are projected by both, and the reading that puts more of them into the picture is taken
+the fingers are projected by both, and the reading that puts more of them into the image is taken
 and recorded; with none or no difference the recording is refused unless the user decides.
 
 A gripper has three joints: the flange, and the tips of thumb and index finger, `TOOL_M` along the
@@ -180,7 +180,7 @@ class AgiBot:
         if self.extrinsics is None and not shares[best] > shares[other]:
             raise InputError(
                 f"The reading of the extrinsics cannot be decided: the share of gripper points in "
-                f"the picture is {written}, and one must be larger. Choose one. (--extrinsics)"
+                f"the image is {written}, and one must be larger. Choose one. (--extrinsics)"
             )
         by = "user" if self.extrinsics else "projected grippers"
         return readings[chosen], {
@@ -191,7 +191,7 @@ class AgiBot:
 def share_in_view(
     poses: Float[np.ndarray, "f 4 4"], tools: Float[np.ndarray, "f 2 3"], lens: Lens
 ) -> float:
-    """Return the share of points between the fingers that camera poses put into the picture."""
+    """Return the share of points between the fingers that camera poses put into the image."""
     local = transform(invert(poses), tools)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = project(lens.intrinsics_px, local)

@@ -1,9 +1,9 @@
-"""COLMAP reconstructions: pictures with poses, intrinsics and triangulated points.
+"""COLMAP reconstructions: images with poses, intrinsics and triangulated points.
 
-A folder with a sparse model (itself, or in sparse/0 or sparse/) and the pictures in images/. The
-pictures in order of their names are the frames of a video, at a rate that the user gives. The
-longest run of registered pictures is the recording. One camera must have taken all pictures;
-distorted pictures are remapped, and so are the pixels that observe points. The unit is arbitrary,
+A folder with a sparse model (itself, or in sparse/0 or sparse/) and the images in images/. The
+images in order of their names are the frames of a video, at a rate that the user gives. The
+longest run of registered images is the recording. One camera must have taken all images;
+distorted images are remapped, and so are the pixels that observe points. The unit is arbitrary,
 so that `metric` is False. Conventions: `colmap_model`.
 """
 
@@ -21,11 +21,11 @@ import tyro
 
 from egosim_jax.data.readers import Entry, inside, make_id, natural_order
 from egosim_jax.data.readers.colmap_model import Image, Model, read_model
-from egosim_jax.data.readers.pictures import (
-    MAX_PICTURES,
-    PictureVideo,
+from egosim_jax.data.readers.images import (
+    MAX_IMAGES,
+    ImageVideo,
     longest_run,
-    write_pictures,
+    write_images,
 )
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
@@ -33,20 +33,20 @@ from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.images import read_image
 from egosim_jax.types import InputError
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Colmap:
-    """COLMAP reconstruction: pictures, cameras and points."""
+    """COLMAP reconstruction: images, cameras and points."""
 
     dataset: ClassVar[str] = "colmap"
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of the reconstruction: a sparse model, or one that has it in sparse/0."""
     fps: float
-    """Frame rate of the pictures in order of their names, which the model does not know."""
+    """Frame rate of the images in order of their names, which the model does not know."""
     images: Path | None = None
-    """Folder of the pictures, by default images/ next to the model."""
+    """Folder of the images, by default images/ next to the model."""
 
     def find(self) -> Iterator[Entry]:
         """List the one model of the source."""
@@ -78,24 +78,24 @@ class Colmap:
         names = [
             str(path.relative_to(root))
             for path in sorted(root.rglob("*"), key=natural_order)
-            if path.suffix.lower() in PICTURES
-        ][:MAX_PICTURES]
+            if path.suffix.lower() in IMAGES
+        ][:MAX_IMAGES]
         run = longest_run(names, by_name.__contains__)
         images = [by_name[name] for name in names[run]]
         if not images:
             raise InputError(
-                f"{quote_path(root)} has none of the model's {len(by_name)} pictures: their names "
+                f"{quote_path(root)} has none of the model's {len(by_name)} images: their names "
                 "are relative to it. (--images)"
             )
         cameras = {image.camera_id for image in images}
         if len(cameras) > 1:
             raise InputError(
-                f"The pictures are of {len(cameras)} cameras: one camera must have taken all. "
+                f"The images are of {len(cameras)} cameras: one camera must have taken all. "
                 "Reconstruct with a single camera (--ImageReader.single_camera 1)."
             )
-        paths = [inside(root, image.name, what="a picture of the model") for image in images]
+        paths = [inside(root, image.name, what="an image of the model") for image in images]
         lens = model.lenses[cameras.pop()]
-        video = write_pictures(folder, map(read_image, paths), lens, fps)
+        video = write_images(folder, map(read_image, paths), lens, fps)
         return Recording(
             recording_id=make_id([self.source.resolve().name]),
             video=video.path,
@@ -107,7 +107,7 @@ class Colmap:
             intrinsics_px=video.intrinsics_px,
             points=_points(model, images, video),
             provenance={
-                "pictures": f"{len(images)} of {len(names)}, {len(by_name)} registered",
+                "images": f"{len(images)} of {len(names)}, {len(by_name)} registered",
                 "lens": "pinhole" if video.remap is None else "remapped",
             },
         )
@@ -127,7 +127,7 @@ def make_rate(fps: float) -> Fraction:
     return Fraction(fps).limit_denominator(1001)
 
 
-def _points(model: Model, images: list[Image], video: PictureVideo) -> ScenePoints | None:
+def _points(model: Model, images: list[Image], video: ImageVideo) -> ScenePoints | None:
     """Return the model's points with the pixels that observe them."""
     if not len(model.point_ids):
         return None

@@ -37,7 +37,7 @@ _NUMBERS = {name: number for number, (name, _) in MODELS.items()}
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Image:
-    """Picture of a model."""
+    """Image of a model."""
 
     image_id: int
     name: str
@@ -53,12 +53,12 @@ class Image:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """Cameras, pictures and points of a sparse model."""
+    """Cameras, images and points of a sparse model."""
 
     lenses: Mapping[int, Lens]
     """Lens of each camera by id."""
     images: tuple[Image, ...]
-    """Pictures that the COLMAP model registered."""
+    """Images that the COLMAP model registered."""
     point_ids: Int[np.ndarray, " p"]
     points_m: Float[np.ndarray, "p 3"]
     """Positions in the model's unit."""
@@ -88,7 +88,7 @@ def read_model(folder: Path) -> Model:
     unknown = {image.camera_id for image in images} - parts["cameras"].keys()
     if unknown or not images:
         raise InputError(
-            f"{quote_path(folder)} has {len(images)} registered pictures, with cameras that are "
+            f"{quote_path(folder)} has {len(images)} registered images, with cameras that are "
             f"not listed: {quote(str(sorted(unknown)))}."
         )
     return Model(lenses=parts["cameras"], images=images, point_ids=ids, points_m=points,
@@ -100,7 +100,7 @@ def make_lens(model: str, width: int, height: int, parameters: list[float]) -> L
     if model not in _NUMBERS:
         raise InputError(
             f"The camera model {quote_text(model)} is not read; {', '.join(_NUMBERS)} are. "
-            "Undistort the pictures with COLMAP first."
+            "Undistort the images with COLMAP first."
         )
     if len(parameters) != MODELS[_NUMBERS[model]][1]:
         raise ValueError(f"a {model} camera has {len(parameters)} parameters")

@@ -11,7 +11,7 @@ EgoSim's cuts of such files, `<id>_<start>_<end>.hdf5` of 121 poses at 16 frames
 cameras alone. The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary origin.
 Of the 25 joints of a hand the four metacarpals are not used: our 21 are the wrist (`Hand`), the
 thumb from Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of index, middle,
-ring and little finger. Columns and rows count from the corner of the picture (its center is at
+ring and little finger. Columns and rows count from the corner of the image (its center is at
 960, 540), so that half a pixel is subtracted. Followed: Apple's loader of the set as of 2025.
 """
 
@@ -140,12 +140,12 @@ def _fit_intrinsics(
 ) -> Float[np.ndarray, "3 3"]:
     """Return intrinsics of pixel centers at integers, for a video that may have been resized.
 
-    The principal point is the center of the picture, from which its size follows.
+    The principal point is the center of the image, from which its size follows.
     """
     columns, rows = 2 * intrinsics[0, 2], 2 * intrinsics[1, 2]
     if not (columns > 0 and rows > 0 and abs(columns * height - rows * width) < 2 * columns):
         raise InputError(
-            f"camera/intrinsic is for a picture of {columns:g}x{rows:g}, the video has "
+            f"camera/intrinsic is for an image of {columns:g}x{rows:g}, the video has "
             f"{width}x{height}: it must have the same aspect. Use the video that belongs to it."
         )
     fitted = intrinsics.copy()

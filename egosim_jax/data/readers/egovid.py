@@ -40,7 +40,7 @@ from egosim_jax.types import InputError
 POSES = ("fused_pose.npy", "sfm_pose.npy")
 """Files of poses, the recommended one first."""
 ROWS = 540
-"""Rows of the pictures that the intrinsics are for."""
+"""Rows of the images that the intrinsics are for."""
 MAX_NPY_BYTES = 1 << 24
 """Largest file of poses in bytes."""
 MAX_LINE = 1 << 20

@@ -5,7 +5,7 @@
 
 The keypoints are those of a right hand in meters, in our order, without its place; a left one is
 mirrored in x. `cam_t_full` places it before a camera whose focal length is 5000 / 256 of the longer
-side of the picture and whose center is that of the picture, counted from its corner. That camera is
+side of the image and whose center is that of the image, counted from its corner. That camera is
 not the recording's: the pixels are kept, and the hand is placed so that the recording's camera sees
 it there, by linear least squares. Of several hands of one side the most confident is taken.
 """
@@ -23,7 +23,7 @@ from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.types import Cameras, InputError
 
 FOCAL = 5000 / 256
-"""Focal length of HaMeR's camera, in longer sides of the picture."""
+"""Focal length of HaMeR's camera, in longer sides of the image."""
 MAX_BYTES = 1 << 28
 """Largest file in bytes."""
 

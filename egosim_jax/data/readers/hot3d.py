@@ -1,6 +1,6 @@
 """HOT3D clips: five seconds of Aria or Quest 3 with cameras and both hands, a tar file each.
 
-    <n>.image_<stream>.jpg      pictures; stream 214-1 is Aria's in color
+    <n>.image_<stream>.jpg      images; stream 214-1 is Aria's in color
     <n>.cameras.json            per stream: T_world_from_camera, and calibration of a fisheye624
     <n>.hands.json              per side: umetrack_pose with joint_angles and T_world_from_wrist
     <n>.info.json               timestamps in nanoseconds
@@ -8,7 +8,7 @@
 
 Transforms are quaternions w x y z and translations in meters; camera axes are OpenCV's, pixel
 centers at integers. The fisheye is remapped to a pinhole. Aria's color camera is mounted sideways:
-its pictures are turned clockwise by 90 degrees, and the cameras with them. Hands are computed from
+its images are turned clockwise by 90 degrees, and the cameras with them. Hands are computed from
 UmeTrack's model (`umetrack`); MANO's parameters are not used, nor are hands of clips without a
 shape, as those for testing. Followed: facebookresearch/hot3d, `clip_util.py`, of 2025.
 """
@@ -55,7 +55,7 @@ _FRAME = re.compile(r"(\d{1,9})\.cameras\.json")
 
 @dataclass(frozen=True, kw_only=True)
 class Hot3D:
-    """HOT3D clips of Aria or Quest 3: pictures, cameras and hands."""
+    """HOT3D clips of Aria or Quest 3: images, cameras and hands."""
 
     dataset: ClassVar[str] = "hot3d"
     source: Annotated[Path, tyro.conf.Positional]
@@ -84,8 +84,8 @@ class Hot3D:
             remap = Remap.of(lens)
             poses = np.concatenate([pose for _, pose in cameras])
             turned = self.stream == COLOR
-            pictures = remap.apply(clip.picture(f"{key}.image_{self.stream}.jpg") for key in keys)
-            frames = (np.rot90(picture, -1) for picture in pictures) if turned else pictures
+            images = remap.apply(clip.image(f"{key}.image_{self.stream}.jpg") for key in keys)
+            frames = (np.rot90(image, -1) for image in images) if turned else images
             fps = clip.rate(keys, self.stream)
             _, height, width = write_frames(folder / "video.mp4", frames, fps)
             joints = clip.hands(keys)
@@ -144,8 +144,8 @@ class _Clip:
             raise InputError(f"{self.name}: {name} is not a JSON object.")
         return value
 
-    def picture(self, name: str) -> np.ndarray:
-        """Return a picture of the Aria camera, decoded."""
+    def image(self, name: str) -> np.ndarray:
+        """Return an image of the Aria camera, decoded."""
         return decode_image(self.read(name), name=f"{self.name}: {name}")
 
     def camera(self, key: str, stream: str) -> tuple[dict[str, Any], np.ndarray]:
@@ -226,7 +226,7 @@ def _lens(calibrations: list[dict[str, Any]], name: str) -> Lens:
     fx, fy, cx, cy, *k = values if len(values) == 16 else [values[0], *values]
     height, width = first.get("image_height"), first.get("image_width")
     if not isinstance(height, int) or not isinstance(width, int) or min(height, width) < 1:
-        raise InputError(f"{name}: its picture has {quote(width)} x {quote(height)} pixels.")
+        raise InputError(f"{name}: its image has {quote(width)} x {quote(height)} pixels.")
     return Lens(
         model="fisheye624",
         coefficients=tuple(k),

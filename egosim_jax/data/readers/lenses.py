@@ -1,4 +1,4 @@
-"""Lenses that are not pinholes, and the remapping of their pictures to a pinhole's.
+"""Lenses that are not pinholes, and the remapping of their images to a pinhole's.
 
 A lens takes rays `x y 1` (or any point before the camera) to pixels. With r the distance from the
 axis on the plane z = 1, and theta = atan r the angle:
@@ -43,9 +43,9 @@ class Lens:
     intrinsics_px: Float[np.ndarray, "3 3"]
     """Focal lengths and principal point in pixels."""
     height: int
-    """Rows of the picture in pixels."""
+    """Rows of the image in pixels."""
     width: int
-    """Columns of the picture in pixels."""
+    """Columns of the image in pixels."""
 
     def __post_init__(self) -> None:
         """Check the number of coefficients, and that all are finite and plausible."""
@@ -94,7 +94,7 @@ class Lens:
         return self.project(np.concatenate([rays, np.ones_like(rays[:, :1])], axis=1))
 
     def is_pinhole(self) -> bool:
-        """Return True if the distortion is below `PINHOLE_PX` everywhere in the picture."""
+        """Return True if the distortion is below `PINHOLE_PX` everywhere in the image."""
         pixels = _grid(self.height, self.width, 33)
         return bool(np.abs(self.project(_rays(self.intrinsics_px, pixels)) - pixels).max() < (
             PINHOLE_PX
@@ -104,12 +104,12 @@ class Lens:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Remap:
-    """Remapping of the pictures of a lens to those of a pinhole of the same size."""
+    """Remapping of the images of a lens to those of a pinhole of the same size."""
 
     lens: Lens
-    """Lens of the pictures."""
+    """Lens of the images."""
     intrinsics_px: Float[np.ndarray, "3 3"]
-    """Intrinsics of the pinhole, whose picture has no black borders."""
+    """Intrinsics of the pinhole, whose image has no black borders."""
 
     @classmethod
     def of(cls, lens: Lens) -> Remap:
@@ -128,30 +128,30 @@ class Remap:
                 return cls(lens=lens, intrinsics_px=intrinsics)
         raise InputError(
             f"A lens {lens.model} with {lens.coefficients} cannot be remapped to a pinhole: more "
-            f"than {MAX_ZOOM:g} times its focal length would be needed to fill the picture. Check "
+            f"than {MAX_ZOOM:g} times its focal length would be needed to fill the image. Check "
             "its coefficients."
         )
 
     def apply(
-        self, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]
+        self, images: Iterable[UInt8[np.ndarray, "h w 3"]]
     ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-        """Yield remapped pictures, interpolated bilinearly."""
+        """Yield remapped images, interpolated bilinearly."""
         import cv2
 
         height, width = self.lens.height, self.lens.width
         rows, columns = np.mgrid[:height, :width].astype(float)
         rays = _rays(self.intrinsics_px, np.stack([columns, rows], axis=-1))
         x, y = np.moveaxis(self.lens.project(rays).astype(np.float32), -1, 0)
-        for picture in pictures:
-            if picture.shape != (height, width, 3):
+        for image in images:
+            if image.shape != (height, width, 3):
                 raise InputError(
-                    f"A picture has {picture.shape[1]}x{picture.shape[0]} pixels: its camera is "
+                    f"An image has {image.shape[1]}x{image.shape[0]} pixels: its camera is "
                     f"calibrated for {width}x{height}."
                 )
-            yield cv2.remap(picture, x, y, cv2.INTER_LINEAR)
+            yield cv2.remap(image, x, y, cv2.INTER_LINEAR)
 
     def move(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Return where pixels of the lens's picture are in the pinhole's; NaN outside the lens."""
+        """Return where pixels of the lens's image are in the pinhole's; NaN outside the lens."""
         rays = self.lens.unproject(pixels)
         return rays * self.intrinsics_px[[0, 1], [0, 1]] + self.intrinsics_px[:2, 2]
 

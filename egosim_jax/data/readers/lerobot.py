@@ -189,7 +189,7 @@ def _choose_camera(features: Mapping[str, Any], wanted: str | None) -> str:
         return chosen[0]
     if not videos and wanted is None and "image" in dtypes.values():
         raise InputError(
-            "The dataset stores pictures in its tables, not videos, which is not read. Convert it "
+            "The dataset stores images in its tables, not videos, which is not read. Convert it "
             "with LeRobot's own script."
         )
     keys = listing([quote_text(key) for key, dtype in dtypes.items() if dtype == "video"], most=20)

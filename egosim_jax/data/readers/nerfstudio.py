@@ -1,8 +1,8 @@
-"""nerfstudio captures: transforms.json with pictures, poses, intrinsics and maybe depth.
+"""nerfstudio captures: transforms.json with images, poses, intrinsics and maybe depth.
 
 `transform_matrix` takes camera to world in OpenGL's axes (x right, y up, z backward), which are
 turned to OpenCV's; the world stays the file's. Columns and rows count from the corner of the
-picture, so that half a pixel is subtracted. Depth files have thousandths of a meter. The unit of
+image, so that half a pixel is subtracted. Depth files have thousandths of a meter. The unit of
 poses is arbitrary unless the user says that it is the meter (as of Polycam and Record3D captures).
 Frames are in order of their file names. Followed: nerfstudio 1.1, `nerfstudio_dataparser.py`.
 """
@@ -20,8 +20,8 @@ import tyro
 
 from egosim_jax.data.readers import Entry, inside, make_id, natural_order
 from egosim_jax.data.readers.colmap import make_rate
+from egosim_jax.data.readers.images import MAX_IMAGES, ImageVideo, write_images
 from egosim_jax.data.readers.lenses import Lens
-from egosim_jax.data.readers.pictures import MAX_PICTURES, PictureVideo, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
@@ -37,13 +37,13 @@ MAX_SPREAD = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Nerfstudio:
-    """nerfstudio capture: pictures, cameras and depth."""
+    """nerfstudio capture: images, cameras and depth."""
 
     dataset: ClassVar[str] = "nerfstudio"
     source: Annotated[Path, tyro.conf.Positional]
     """Folder with transforms.json, or a file like it."""
     fps: float
-    """Frame rate of the pictures in order of their names, which the file does not know."""
+    """Frame rate of the images in order of their names, which the file does not know."""
     metric: bool = False
     """Poses are in meters."""
 
@@ -63,17 +63,17 @@ class Nerfstudio:
         fps = make_rate(self.fps)
         written = read_json(path, limit=1 << 27)
         entries = written.get("frames") if isinstance(written, dict) else None
-        if not isinstance(entries, list) or not 0 < len(entries) <= MAX_PICTURES:
-            raise InputError(f"{quote_path(path)}: frames must be a list of 1 to {MAX_PICTURES:,}.")
+        if not isinstance(entries, list) or not 0 < len(entries) <= MAX_IMAGES:
+            raise InputError(f"{quote_path(path)}: frames must be a list of 1 to {MAX_IMAGES:,}.")
         for number, entry in enumerate(entries):
             if not isinstance(entry, dict):
                 raise InputError(f"{quote_path(path)}: frame {number} is {quote(entry)}.")
-        pictures = [(inside(path.parent, e.get("file_path"), what="file_path"), e) for e in entries]
-        pictures.sort(key=lambda pair: natural_order(pair[0]))
-        frames = [entry for _, entry in pictures]
+        images = [(inside(path.parent, e.get("file_path"), what="file_path"), e) for e in entries]
+        images.sort(key=lambda pair: natural_order(pair[0]))
+        frames = [entry for _, entry in images]
         lens = _read_lens(written, frames, path)
         poses = np.stack([_pose(entry, path) for entry in frames]) @ OPENCV_FROM_OPENGL
-        video = write_pictures(folder, (read_image(p) for p, _ in pictures), lens, fps)
+        video = write_images(folder, (read_image(p) for p, _ in images), lens, fps)
         return Recording(
             recording_id=make_id([path.resolve().parent.name]),
             video=video.path,
@@ -138,8 +138,8 @@ def _pose(entry: Mapping[str, Any], path: Path) -> np.ndarray:
     return matrix
 
 
-def _find_depth(root: Path, frames: list[dict[str, Any]], video: PictureVideo) -> DepthFiles | None:
-    """Return depth files, unless their pixels would have to be remapped as the pictures were."""
+def _find_depth(root: Path, frames: list[dict[str, Any]], video: ImageVideo) -> DepthFiles | None:
+    """Return depth files, unless their pixels would have to be remapped as the images were."""
     names = [entry.get("depth_file_path") for entry in frames]
     if not any(names) or video.remap is not None:
         return None

@@ -1,4 +1,4 @@
-"""Captures of single pictures: they are written as the video of a recording."""
+"""Captures of single images: they are written as the video of a recording."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.io.video import write_frames
 from egosim_jax.types import InputError
 
-MAX_PICTURES = 100_000
-"""Largest number of pictures of a capture."""
+MAX_IMAGES = 100_000
+"""Largest number of images of a capture."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
-class PictureVideo:
-    """Video that was written from pictures, and the pinhole that it is of."""
+class ImageVideo:
+    """Video that was written from images, and the pinhole that it is of."""
 
     path: Path
     frames: int
@@ -30,30 +30,30 @@ class PictureVideo:
     width: int
     intrinsics_px: Float[np.ndarray, "3 3"]
     remap: Remap | None
-    """Remapping of the pictures; None if their lens is a pinhole."""
+    """Remapping of the images; None if their lens is a pinhole."""
 
 
-def write_pictures(
-    folder: Path, pictures: Iterable[np.ndarray], lens: Lens, fps: Fraction
-) -> PictureVideo:
-    """Write pictures as video.mp4 of a folder, remapped to a pinhole if their lens is not one."""
+def write_images(
+    folder: Path, images: Iterable[np.ndarray], lens: Lens, fps: Fraction
+) -> ImageVideo:
+    """Write images as video.mp4 of a folder, remapped to a pinhole if their lens is not one."""
     remap = None if lens.is_pinhole() else Remap.of(lens)
     intrinsics = lens.intrinsics_px if remap is None else remap.intrinsics_px
     path = folder / "video.mp4"
-    frames = _checked(pictures, lens) if remap is None else remap.apply(pictures)
+    frames = _checked(images, lens) if remap is None else remap.apply(images)
     count, height, width = write_frames(path, frames, fps)
-    return PictureVideo(path=path, frames=count, height=height, width=width,
+    return ImageVideo(path=path, frames=count, height=height, width=width,
                         intrinsics_px=intrinsics, remap=remap)  # fmt: skip
 
 
-def _checked(pictures: Iterable[np.ndarray], lens: Lens) -> Iterator[np.ndarray]:
-    for number, picture in enumerate(pictures):
-        if picture.shape[:2] != (lens.height, lens.width):
+def _checked(images: Iterable[np.ndarray], lens: Lens) -> Iterator[np.ndarray]:
+    for number, image in enumerate(images):
+        if image.shape[:2] != (lens.height, lens.width):
             raise InputError(
-                f"Picture {number} has {picture.shape[1]}x{picture.shape[0]} pixels: its camera is "
-                f"calibrated for {lens.width}x{lens.height}. Use the pictures of that size."
+                f"Image {number} has {image.shape[1]}x{image.shape[0]} pixels: its camera is "
+                f"calibrated for {lens.width}x{lens.height}. Use the images of that size."
             )
-        yield picture
+        yield image
 
 
 def longest_run(names: Sequence[str], known: Callable[[str], bool]) -> slice:

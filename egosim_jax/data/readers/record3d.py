@@ -1,14 +1,14 @@
-"""Record3D captures of an iPhone: pictures with poses, intrinsics and depth of the LiDAR.
+"""Record3D captures of an iPhone: images with poses, intrinsics and depth of the LiDAR.
 
     NAME.r3d, a zip archive, or a folder with what is in it
         metadata        JSON: w h, dw dh, fps, K (9 numbers by columns), poses (qx qy qz qw x y z),
                         perFrameIntrinsicCoeffs (fx fy cx cy, at w x h)
-        rgbd/<n>.jpg    pictures
+        rgbd/<n>.jpg    images
         rgbd/<n>.depth  float32 meters `dh dw`, compressed by LZFSE
 
 or a folder exported as "EXR + RGB", with metadata.json and rgb/<n>.jpg, whose EXR depth is not
 read. Poses take camera to world in OpenGL's axes, as ARKit's, in meters, the world is y up.
-Intrinsics count from the corner of the picture, so that half a pixel is subtracted; ARKit refocuses
+Intrinsics count from the corner of the image, so that half a pixel is subtracted; ARKit refocuses
 all the time, and the median over the frames is taken if it changes little. Depth is written as
 PNG of millimeters, and needs the package pyliblzfse; without it depth is unknown, and that is
 recorded. Followed: nerfstudio 1.1, `record3d_utils.py`, and readers of .r3d files of 2025.
@@ -32,9 +32,9 @@ import tyro
 from PIL import Image
 
 from egosim_jax.data.readers import Entry, make_id, natural_order
+from egosim_jax.data.readers.images import MAX_IMAGES, write_images
 from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.readers.lzfse import unpack
-from egosim_jax.data.readers.pictures import MAX_PICTURES, write_pictures
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
@@ -57,14 +57,14 @@ MAX_SPREAD = 0.03
 """Largest relative change of the focal length during a capture."""
 MAX_DEPTH_SIDE = 4096
 """Largest number of rows or columns of a depth map."""
-_PICTURE = re.compile(r"(?:rgbd|rgb)/(\d{1,9})\.jpg")
+_IMAGE = re.compile(r"(?:rgbd|rgb)/(\d{1,9})\.jpg")
 
 ReadFile = Callable[[str], bytes]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Record3D:
-    """Record3D captures: pictures, cameras and LiDAR depth."""
+    """Record3D captures: images, cameras and LiDAR depth."""
 
     dataset: ClassVar[str] = "record3d"
     source: Annotated[Path, tyro.conf.Positional]
@@ -94,18 +94,18 @@ def _read(path: Path, folder: Path) -> Recording:
     with _open_capture(path) as (names, read):
         metadata = _read_metadata(names, read, path)
         numbered = sorted(
-            (int(match[1]), name) for name in names if (match := _PICTURE.fullmatch(name))
-        )[:MAX_PICTURES]  # fmt: skip
+            (int(match[1]), name) for name in names if (match := _IMAGE.fullmatch(name))
+        )[:MAX_IMAGES]  # fmt: skip
         poses = _poses(metadata, path)
         if [number for number, _ in numbered] != list(range(len(poses))):
             raise InputError(
-                f"{quote_path(path)} has {len(numbered)} pictures and {len(poses)} poses: the "
-                "pictures must be numbered from 0, one per pose. Export the capture again."
+                f"{quote_path(path)} has {len(numbered)} images and {len(poses)} poses: the "
+                "images must be numbered from 0, one per pose. Export the capture again."
             )
         lens, spread = _lens(metadata, len(poses), path)
         fps = Fraction(_number(metadata, "fps", path)).limit_denominator(1001)
-        pictures = (decode_image(read(name), name=quote_text(name)) for _, name in numbered)
-        video = write_pictures(folder, pictures, lens, fps)
+        images = (decode_image(read(name), name=quote_text(name)) for _, name in numbered)
+        video = write_images(folder, images, lens, fps)
         depth, why = _write_depth(names, read, metadata, len(poses), path, folder)
     return Recording(
         recording_id=make_id([path.resolve().stem]),

@@ -41,7 +41,7 @@ def estimate_cameras(
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     poses = np.full((len(frames), 4, 4), np.nan)
     for number, pose in enumerate(cameras.world_from_camera):
-        gray = [cv2.cvtColor(picture[number], cv2.COLOR_RGB2GRAY) for picture in (target, frames)]
+        gray = [cv2.cvtColor(image[number], cv2.COLOR_RGB2GRAY) for image in (target, frames)]
         row, column = select_keypoints(gray[0], still[number] & np.isfinite(depth_m[number]))
         if len(row) < MIN_INLIERS:
             continue

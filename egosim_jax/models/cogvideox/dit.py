@@ -107,7 +107,7 @@ def grid_positions(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the positions of frames, rows and columns.
 
-    The picture is fitted into the base grid, keeping its aspect ratio, and centered there; its
+    The image is fitted into the base grid, keeping its aspect ratio, and centered there; its
     tokens are spread over that region.
     """
     if rows * config.base_columns > columns * config.base_rows:

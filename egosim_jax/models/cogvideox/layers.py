@@ -53,9 +53,9 @@ class CogVideoXDiTSizes:
     time_dim: int = 512
     """Width of the time embedding."""
     base_rows: int = 30
-    """Rows of tokens of the pictures that the base model was trained with."""
+    """Rows of tokens of the images that the base model was trained with."""
     base_columns: int = 45
-    """Columns of tokens of those pictures."""
+    """Columns of tokens of those images."""
     eps: float = 1e-5
     """Epsilon of the norms."""
     qk_eps: float = 1e-6

@@ -1,7 +1,7 @@
-"""CLIP image encoder: a picture to a grid of tokens, as Wan 2.1's image-to-video models use it.
+"""CLIP image encoder: an image to a grid of tokens, as Wan 2.1's image-to-video models use it.
 
 The vision transformer of open-clip's XLM-RoBERTa-Large ViT-H/14 (Dosovitskiy et al. 2021; Radford
-et al. 2021). The picture is cut into patches, a class token is put before them, positions are
+et al. 2021). The image is cut into patches, a class token is put before them, positions are
 added and normalized, and each block adds
 
     x += attention(LayerNorm(x))      x += D gelu(U LayerNorm(x)), gelu with the exact erf
@@ -36,7 +36,7 @@ class CLIPVisionConfig:
     """Module of the conversion table."""
 
     image_size: int = 224
-    """Rows and columns of the picture in pixels, a multiple of `patch`."""
+    """Rows and columns of the image in pixels, a multiple of `patch`."""
     patch: int = 14
     """Rows and columns of a patch in pixels."""
     dim: int = 1280
@@ -55,7 +55,7 @@ class CLIPVisionConfig:
     """Dtype of the linears and of the residual stream; norms and softmax are float32."""
 
     def __post_init__(self) -> None:
-        """Check that patches tile the picture, heads the width, and that a block remains."""
+        """Check that patches tile the image, heads the width, and that a block remains."""
         if self.image_size < self.patch or self.image_size % self.patch:
             raise InputError(
                 f"Patches of {self.patch} pixels do not tile an image of {self.image_size}: "
@@ -79,7 +79,7 @@ class CLIPVisionConfig:
 
     @property
     def tokens(self) -> int:
-        """Tokens of a picture: its patches and the class token."""
+        """Tokens of an image: its patches and the class token."""
         return (self.image_size // self.patch) ** 2 + 1
 
     @property
@@ -158,7 +158,7 @@ class CLIPVision(nnx.Module):
     def __call__(
         self, pixels: Float[Array, "b {self.config.image_size} {self.config.image_size} 3"]
     ) -> Float[Array, "b {self.config.tokens} {self.config.dim}"]:
-        """Encode pictures whose channels have been normalized with CLIP's mean and deviation."""
+        """Encode images whose channels have been normalized with CLIP's mean and deviation."""
         dtype = jnp.dtype(self.config.dtype)
         patches = self.patch_embed(pixels)
         first = repeat(self.class_token[...].astype(dtype), "d -> b 1 d", b=len(pixels))

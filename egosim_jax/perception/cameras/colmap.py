@@ -1,6 +1,6 @@
 """Structure from motion in child processes: COLMAP by pycolmap, of which no crash reaches us.
 
-pycolmap and OpenCV crash in one process. So the pictures are written to a temporary folder here,
+pycolmap and OpenCV crash in one process. So the images are written to a temporary folder here,
 each step runs in a process that never imports OpenCV (`colmap_child.py`), with a time limit, and
 its result is an npz file. COLMAP has the center of the first pixel at (0.5, 0.5); what is read
 back has it at (0, 0), and pixels of the size that the video was given in.
@@ -45,17 +45,17 @@ class ColmapConfig:
     """Settings of structure from motion."""
 
     features: int = 4096
-    """Most SIFT features of a picture."""
+    """Most SIFT features of an image."""
     peak_threshold: float = 0.0067
     """Least contrast of a feature."""
     overlap: int = 10
-    """Following pictures that each one is matched with."""
+    """Following images that each one is matched with."""
     init_angle_deg: float = 2.0
-    """Least triangulation angle of the first two pictures."""
+    """Least triangulation angle of the first two images."""
     init_inliers: int = 50
-    """Fewest inliers of the first two pictures."""
+    """Fewest inliers of the first two images."""
     focal_guess: float = 0.45
-    """Focal length where self-calibration begins, in longer sides of the picture."""
+    """Focal length where self-calibration begins, in longer sides of the image."""
     threads: int = -1
     """Threads; 1 makes the result reproducible, -1 takes all processors."""
     seed: int = 0
@@ -86,7 +86,7 @@ def require_pycolmap() -> None:
 
 @dataclass(frozen=True)
 class Scene:
-    """Matched pictures of a video, ready to be reconstructed in several ways."""
+    """Matched images of a video, ready to be reconstructed in several ways."""
 
     folder: Path
     frames: tuple[int, ...]
@@ -163,10 +163,10 @@ def open_scene(
         for part in ("images", "masks"):
             (folder / part).mkdir()
         for index, frame in enumerate(frames):
-            picture, mask = f"images/{index:06d}.png", f"masks/{index:06d}.png.png"
-            done = cv2.imwrite(str(folder / picture), video.gray[frame])
+            image, mask = f"images/{index:06d}.png", f"masks/{index:06d}.png.png"
+            done = cv2.imwrite(str(folder / image), video.gray[frame])
             if not (done and cv2.imwrite(str(folder / mask), video.still[frame])):
-                raise OSError(f"The picture {folder / picture} could not be written.")
+                raise OSError(f"The image {folder / image} could not be written.")
         yield Scene(folder, frames, video.reduction, height, width, config)
 
 

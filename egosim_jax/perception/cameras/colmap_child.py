@@ -1,7 +1,7 @@
 """Structure from motion by pycolmap, run as a program: `python -P colmap_child.py JOB.json`.
 
 pycolmap and OpenCV crash in one process, so this file is run by its path, imports nothing of the
-package and never OpenCV. `colmap.py` prepares the pictures, starts it and reads what it writes.
+package and never OpenCV. `colmap.py` prepares the images, starts it and reads what it writes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _end_with_parent() -> None:
 
 
 def _features(pycolmap: Any, job: dict[str, Any]) -> None:
-    """Extract SIFT features of all pictures and match those that are near in time."""
+    """Extract SIFT features of all images and match those that are near in time."""
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", mask_path=job["masks"])
     reader.default_focal_length_factor = job["focal_factor"]
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job["threads"], use_gpu=False)
@@ -54,7 +54,7 @@ def _features(pycolmap: Any, job: dict[str, Any]) -> None:
 
 
 def _map(pycolmap: Any, job: dict[str, Any]) -> None:
-    """Reconstruct cameras and points from the matches; keep the model with most pictures."""
+    """Reconstruct cameras and points from the matches; keep the model with most images."""
     if job["focal_px"] is not None:
         _set_focal(pycolmap, job)
     free = job["focal_px"] is None

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 WORKING_PX = 960
-"""Longest side of the pictures that are tracked; larger ones are reduced."""
+"""Longest side of the images that are tracked; larger ones are reduced."""
 MIN_CORNERS = 20
-"""Fewest background corners of a picture with enough texture."""
+"""Fewest background corners of an image with enough texture."""
 MAX_RETURN_PX = 0.7
 """Largest distance from a corner to where its track returns when followed backward."""
 _CORNERS, _QUALITY, _APART_PX = 600, 0.003, 8
@@ -90,12 +90,12 @@ def background(
     kernel = np.ones((wide, wide), np.uint8)
     gray, still = [], []
     for frame, mask in zip(frames, moving, strict=True):
-        picture = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        image = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
         mask = mask.astype(np.uint8)
         if reduction > 1:
-            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
-        gray.append(equalize.apply(picture) if picture.std() >= 2 else picture)
+        gray.append(equalize.apply(image) if image.std() >= 2 else image)
         still.append(255 * (1 - cv2.dilate(mask, kernel)))
     return Background(gray=gray, still=still, reduction=max(frames.shape[1:3]) / max(size))
 

@@ -96,15 +96,15 @@ class GateConfig:
 
 
 def measure(
-    found: Reconstruction, *, frames: int, pictures: int, height: int, width: int
+    found: Reconstruction, *, frames: int, images: int, height: int, width: int
 ) -> dict[str, float]:
     """Return the figures that the gate compares.
 
-    The reconstruction is of `pictures` among the `frames` of a video.
+    The reconstruction is of `images` among the `frames` of a video.
     """
     registered = len(found.frames)
     figures = {
-        "registered": registered / pictures,
+        "registered": registered / images,
         "points": float(len(found.points)),
         "focal_px": found.focal_px,
         "radial": found.radial,

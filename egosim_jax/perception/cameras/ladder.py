@@ -55,7 +55,7 @@ class CameraLadder:
     """Only this method is tried, None: all. A static or turning camera is then taken as given."""
     assumed_view_deg: float = 90.0
     """Width of the view if nothing gives the focal length of a static or turning camera."""
-    max_pictures: int = 240
+    max_images: int = 240
     """Most frames that are matched; of longer videos every second to sixth frame is."""
     gate: GateConfig = field(default_factory=GateConfig)
     colmap: ColmapConfig = field(default_factory=ColmapConfig)
@@ -69,8 +69,8 @@ class CameraLadder:
             problem = "the rung given, and no other, goes with known cameras. Give both or neither"
         elif not 10 <= self.assumed_view_deg <= 150:
             problem = f"the assumed view must be 10 to 150 degrees, not {self.assumed_view_deg:g}"
-        elif self.max_pictures < 3:
-            problem = f"at least 3 pictures are needed, not {self.max_pictures}"
+        elif self.max_images < 3:
+            problem = f"at least 3 images are needed, not {self.max_images}"
         if problem:
             raise InputError(f"Cameras cannot be estimated so: {problem}. (cameras, rung)")
 
@@ -182,18 +182,18 @@ class _Climb:
 
     @cached_property
     def scene(self) -> Scene:
-        """Pictures with matched features; raises `ColmapError`."""
+        """Images with matched features; raises `ColmapError`."""
         size = {"height": self.frames.shape[1], "width": self.frames.shape[2]}
         scene = self.stack.enter_context(
-            open_scene(self.video, self._pictures(), config=self.config.colmap, **size)
+            open_scene(self.video, self._images(), config=self.config.colmap, **size)
         )
         scene.match()
         return scene
 
-    def _pictures(self) -> tuple[int, ...]:
+    def _images(self) -> tuple[int, ...]:
         """Return the frames that are matched, with the first and the last one."""
         last = len(self.frames) - 1
-        number = min(last + 1, self.config.max_pictures)
+        number = min(last + 1, self.config.max_images)
         return tuple(int(i) for i in np.rint(np.linspace(0, last, number)))
 
     def _unusable(self) -> str | None:
@@ -233,7 +233,7 @@ class _Climb:
         """Return the reconstruction of a rung if it passes the gate."""
         if len(self.frames) < 3:
             return self._fail(rung, "it needs at least 3 frames")
-        if len(self.frames) > (self.config.gate.max_gap + 1) * self.config.max_pictures:
+        if len(self.frames) > (self.config.gate.max_gap + 1) * self.config.max_images:
             return self._fail(
                 rung,
                 f"{len(self.frames)} frames are too many to reconstruct: cut the video into clips "
@@ -247,7 +247,7 @@ class _Climb:
             return self._fail(rung, str(error))
         count, height, width = self.frames.shape[:3]
         figures = measure(
-            found, frames=count, pictures=len(self.scene.frames), height=height, width=width
+            found, frames=count, images=len(self.scene.frames), height=height, width=width
         )
         self.figures |= {f"{rung}_{name}": value for name, value in figures.items()}
         if problems := refusals(figures, self.config.gate, calibrated=focal is not None):

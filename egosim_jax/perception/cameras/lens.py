@@ -1,8 +1,8 @@
 """Radial distortion: undistorted frames, masks and pixels of a `CameraEstimate`.
 
 A lens takes a point at (x, y, 1) to the recorded pixel c + f (1 + k r²) (x, y), with r² = x² + y²,
-f its focal length, k its radial coefficient and c the center of the picture. The undistorted
-picture has the same size and center, and the least focal length F that shows no pixel which was
+f its focal length, k its radial coefficient and c the center of the image. The undistorted
+image has the same size and center, and the least focal length F that shows no pixel which was
 not recorded: with R the distance from the center to the corner (k > 0) or to the nearest border
 (k < 0), F = f (1 + k R² / F²).
 """
@@ -48,8 +48,8 @@ def undistort(
     rays = pixels @ np.linalg.inv(cameras.intrinsics_px).T
     recorded = _model(lens, cameras.intrinsics_px).project(rays).astype(np.float32)
     columns, rows = recorded[..., 0].copy(), recorded[..., 1].copy()
-    picture = frames.dtype == np.uint8 and frames.ndim == 4
-    method = cv2.INTER_LINEAR if picture else cv2.INTER_NEAREST
+    image = frames.dtype == np.uint8 and frames.ndim == 4
+    method = cv2.INTER_LINEAR if image else cv2.INTER_NEAREST
     source = frames.astype(np.uint8) if frames.dtype == bool else frames
     remapped = [
         cv2.remap(f, columns, rows, method, borderMode=cv2.BORDER_REPLICATE) for f in source

@@ -12,7 +12,7 @@ from egosim_jax.types import Cameras
 
 
 def pinhole(focal_px: float, *, height: int, width: int) -> Float[np.ndarray, "3 3"]:
-    """Return intrinsics with the principal point in the center of the picture."""
+    """Return intrinsics with the principal point in the center of the image."""
     return np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1.0]])
 
 

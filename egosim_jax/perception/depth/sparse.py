@@ -21,7 +21,7 @@ class SparseFilter:
     max_error_px: float = 2.0
     """Largest mean reprojection error in pixels."""
     neighbors: int = 8
-    """Number of nearest points in the picture that a depth is compared with."""
+    """Number of nearest points in the image that a depth is compared with."""
     tolerance: float = 0.08
     """Relative difference of 1/z from the neighbors' median that is always accepted."""
     deviations: float = 3.0
@@ -60,7 +60,7 @@ class SparseFilter:
     def _agrees(
         self, pixels: Float[np.ndarray, "n 2"], inverse: Float[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return which inverse depths are like those of their neighbors in the picture."""
+        """Return which inverse depths are like those of their neighbors in the image."""
         from scipy.spatial import KDTree
 
         if len(pixels) <= self.neighbors:

@@ -159,7 +159,7 @@ class _Moments:
         return cls(gray=gray, mean=mean, deviation=np.sqrt(variance), window=window)
 
     def correlate(self, other: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        """Return the zero-mean normalized cross-correlation with another picture."""
+        """Return the zero-mean normalized cross-correlation with another image."""
         mean = _mean(other, self.window)
         variance = np.maximum(_mean(other * other, self.window) - mean * mean, 0)
         covariance = _mean(other * self.gray, self.window) - mean * self.mean

@@ -3,7 +3,7 @@
 Corners are followed by Lucas-Kanade optical flow forwards and backwards in time as long as the way
 back ends where it began. A point X that is seen at normalized (x, y) by a camera with rotation R
 and translation t satisfies (R_1 - x R_3) X = x t_3 - t_1 and the same for y: least squares over its
-frames, weighted by 1 / depth in a second pass, which makes it the error in the picture.
+frames, weighted by 1 / depth in a second pass, which makes it the error in the image.
 """
 
 from __future__ import annotations

@@ -258,7 +258,7 @@ def fill_gaps(
 def find_gaps(
     joints_px: Float[np.ndarray, "f 2 21 2"], *, most: int, max_motion: float
 ) -> Bool[np.ndarray, "f 2"]:
-    """Return the frames of gaps between two hands that are near by in time and in the picture."""
+    """Return the frames of gaps between two hands that are near by in time and in the image."""
     missing = np.any(np.isnan(joints_px), axis=(2, 3))
     gaps = np.zeros_like(missing)
     for side in (LEFT, RIGHT):

@@ -28,7 +28,7 @@ def test_portrait_keeps_its_shape_and_is_not_cropped_to_landscape():
     portrait = replace(FULL_HD, height=1920, width=1080)
     fitted = plan(portrait, Sampling(), cut=False)
     assert (fitted.height, fitted.width) == (832, 464)
-    with pytest.raises(InputError, match=r"would keep 3\d% of the picture.*--size"):
+    with pytest.raises(InputError, match=r"would keep 3\d% of the image.*--size"):
         plan(portrait, Sampling(size=(480, 832)), cut=False)
 
 

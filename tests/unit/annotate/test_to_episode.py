@@ -32,7 +32,7 @@ def test_the_rest_of_the_video_becomes_actions(clip, tmp_path):
     assert len(found.state.points_m) == 48 * 80
 
 
-def test_joints_are_where_they_were_in_the_picture(clip):
+def test_joints_are_where_they_were_in_the_image(clip):
     episode = episode_from(clip, SMALL, clips=1)
     action = episode.actions[0]
     local = transform(invert(action.cameras.world_from_camera[0]), action.joints_m[0, 1])

@@ -128,11 +128,11 @@ def test_look_draws_the_first_clip_of_each_value_of_a_column(make_clips, out, tm
     sheet = tmp_path / "sheet.png"
     look = Look(shards=out, out=sheet, by=("split",), streams=("target", "prior"), moments=3)
     assert look.run() == ExitCode.DONE
-    with Image.open(sheet) as picture:
-        assert picture.size == (3 * 240, 2 * (16 + 2 * 120))
+    with Image.open(sheet) as image:
+        assert image.size == (3 * 240, 2 * (16 + 2 * 120))
     Look(shards=out, out=sheet, limit=4, streams=("hands",), moments=3, width=32).run()
-    with Image.open(sheet) as picture:
-        drawn = np.asarray(picture)
+    with Image.open(sheet) as image:
+        drawn = np.asarray(image)
     assert drawn.shape == (4 * (16 + 16), 3 * 32, 3)
     np.testing.assert_array_equal(drawn[16:32, 32:64], ShardReader(out)[0].arrays["hands"][2])
 
@@ -141,8 +141,8 @@ def test_look_draws_videos_of_any_length_and_size_in_their_order(make_clips, out
     Pack(metadata=make_clips(clips=12, frames=5), out=out).run()
     sheet = tmp_path / "sheet.png"
     Look(shards=out, out=sheet, streams=("prior",), moments=2, width=48).run()
-    with Image.open(sheet) as picture:
-        drawn = np.asarray(picture)
+    with Image.open(sheet) as image:
+        drawn = np.asarray(image)
     assert drawn.shape == (12 * (16 + 32), 2 * 48, 3)
     for number, record in enumerate(ShardReader(out)):
         last = decode_video(record.arrays["prior"].tobytes(), name="prior").frames[4]

@@ -15,7 +15,7 @@ STD = (0.26862954, 0.26130258, 0.27577711)
 SIZES = [((48, 80), 28), ((480, 832), 224), ((16, 16), 28)]
 
 
-def picture(height, width):
+def image(height, width):
     return np.random.default_rng(1).integers(0, 256, (2, height, width, 3), np.uint8)
 
 
@@ -44,7 +44,7 @@ def resized(image, size, row, column, channel):
 @pytest.mark.parametrize(("shape", "size"), SIZES)
 @pytest.mark.parametrize("image_range", ["unit", "signed"])
 def test_pixels_equal_torchs_bicubic_resize(shape, size, image_range):
-    frames = picture(*shape)
+    frames = image(*shape)
     x = torch.from_numpy(frames).permute(0, 3, 1, 2).double() / 255
     if image_range == "signed":
         x = 2 * x - 1
@@ -59,7 +59,7 @@ def test_pixels_equal_torchs_bicubic_resize(shape, size, image_range):
 
 
 def test_pixels_equal_the_kernel_summed_by_hand():
-    frames = picture(24, 40)
+    frames = image(24, 40)
     actual = clip_pixels(frames, image_size=14, image_range="unit")
     for row, column, channel in np.ndindex(14, 14, 3):
         value = resized(frames[1] / 255, 14, row, column, channel)

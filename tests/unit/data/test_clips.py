@@ -178,7 +178,7 @@ def test_lenient_still_refuses_a_missing_prior(files):
 
 
 def test_clips_that_were_written_are_read_back(tmp_path):
-    """Within what 4:2:0 color and near-lossless H.264 leave of smooth pictures."""
+    """Within what 4:2:0 color and near-lossless H.264 leave of smooth images."""
     spec = VideoSpec(frames=9, height=32, width=48)
     frame, row, column = np.mgrid[:9, :32, :48]
     smooth = [

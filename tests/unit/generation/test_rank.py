@@ -92,17 +92,17 @@ def test_results_of_a_version_that_recorded_no_conditions_are_taken(tmp_path):
 def test_a_video_that_ends_at_the_goal_scores_highest():
     rng = np.random.default_rng(0)
     goal, other = rng.integers(0, 256, (2, 64, 64, 3), np.uint8)
-    score = rank.by_picture(goal, (64, 64))
+    score = rank.by_image(goal, (64, 64))
     assert score(np.stack([other, goal])) == pytest.approx(0, abs=1e-6)
     assert score(np.stack([goal, other])) < -0.1
-    half = rank.by_picture(goal, (32, 32))
+    half = rank.by_image(goal, (32, 32))
     assert half(np.stack([other, goal])[:, ::2, ::2]) < 0  # of the goal at the video's size
 
 
-def test_a_picture_of_another_shape_than_the_clips_is_not_stretched():
+def test_a_image_of_another_shape_than_the_clips_is_not_stretched():
     with pytest.raises(InputError, match=r"has 640x480 pixels .* to the 832x480 of the clips"):
-        rank.by_picture(np.zeros((480, 640, 3), np.uint8), (480, 832))
-    rank.by_picture(np.zeros((960, 1664, 3), np.uint8), (480, 832))
+        rank.by_image(np.zeros((480, 640, 3), np.uint8), (480, 832))
+    rank.by_image(np.zeros((960, 1664, 3), np.uint8), (480, 832))
 
 
 def test_a_text_without_a_network_is_refused_with_the_way_out():

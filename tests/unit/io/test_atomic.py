@@ -12,7 +12,7 @@ from egosim_jax.io.atomic import append_line, atomic_folder, atomic_write, lock_
 
 
 def test_a_file_has_its_name_when_all_is_written(tmp_path):
-    path = tmp_path / "new" / "picture.png"
+    path = tmp_path / "new" / "image.png"
     with atomic_write(path) as temporary:
         assert temporary.suffix == ".png"
         temporary.write_text("half", encoding="utf-8")

@@ -25,10 +25,10 @@ def write(path, *, codec="libx264", count=40, options=None, times=None):
         for index in range(count):
             frame = np.full((64, 64, 3), 3 * index, np.uint8)
             frame[:, : index + 1] = 255 - 3 * index
-            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts = 20 * index if times is None else times[index]
-            picture.time_base = Fraction(1, 600)
-            container.mux(stream.encode(picture))
+            coded = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            coded.pts = 20 * index if times is None else times[index]
+            coded.time_base = Fraction(1, 600)
+            container.mux(stream.encode(coded))
         container.mux(stream.encode())
     return path
 

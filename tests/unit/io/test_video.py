@@ -190,7 +190,7 @@ def test_a_packet_without_a_frame_is_refused():
     (count,) = struct.unpack_from(">I", data, data.index(b"stsz") + 12)
     sizes = struct.unpack_from(f">{count}I", data, data.index(b"stsz") + 16)
     third = data.index(b"mdat") + 4 + sum(sizes[:5])
-    data[third + 4] = 0x0C  # a filler instead of a picture
+    data[third + 4] = 0x0C  # a filler instead of a frame
     with pytest.raises(InputError, match=r"8 of its 9 frames|damaged"):
         decode_video(bytes(data))
 
@@ -296,7 +296,7 @@ def test_official_decoding_is_the_scalers_default():
     """Equal, bit for bit, to `ffmpeg -pix_fmt rgb24`, which imageio calls."""
     data = encode_video(detailed(), 16)
     with av.open(io.BytesIO(data)) as container:
-        expected = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
+        expected = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     official = decode_video(data, decoding="official").frames
     np.testing.assert_array_equal(official, expected)
     accurate = decode_video(data).frames

@@ -1,4 +1,4 @@
-"""First frames without hands, of the tabletop world, where the picture under them is known."""
+"""First frames without hands, of the tabletop world, where the image under them is known."""
 
 from dataclasses import replace
 

@@ -148,7 +148,7 @@ def test_arrays_that_unpack_to_too_much_or_are_of_another_shape_are_refused(tmp_
 
 
 @pytest.mark.parametrize("kind", ["depth", "mask"])
-def test_every_damaged_archive_of_pictures_is_refused_in_one_line(tmp_path, kind):
+def test_every_damaged_archive_of_images_is_refused_in_one_line(tmp_path, kind):
     write(tmp_path)
     pipeline, random = RecordedConfig(folder=tmp_path, name="clip").build(), Random(0)
     field = "depth_m" if kind == "depth" else "object_ids"

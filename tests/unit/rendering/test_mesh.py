@@ -91,7 +91,7 @@ def test_a_sphere_is_shaded_by_its_normals(renderer):
         colors=np.tile(color, (len(vertices), 1)),
     )
     cameras = make_cameras()
-    picture, depth = renderer.draw_mesh(mesh, cameras)
+    image, depth = renderer.draw_mesh(mesh, cameras)
     pose = cameras.world_from_camera[0]
     center = (np.array([0, 0.3, 0]) - pose[:3, 3]) @ pose[:3, :3]
     rays = pixel_rays(cameras.intrinsics_px, height=HEIGHT, width=WIDTH)
@@ -104,8 +104,8 @@ def test_a_sphere_is_shaded_by_its_normals(renderer):
     inside = cosine > 0.3
     assert inside.sum() > 60
     np.testing.assert_allclose(depth[0][inside], t[inside], atol=2e-3)
-    assert np.abs(picture[0][inside] - expected[inside]).max() < 3
-    assert not picture[0][np.isnan(t)].any()
+    assert np.abs(image[0][inside] - expected[inside]).max() < 3
+    assert not image[0][np.isnan(t)].any()
 
 
 def test_the_two_renderers_draw_the_same_hands(hands):
@@ -120,8 +120,8 @@ def test_the_two_renderers_draw_the_same_hands(hands):
 
 
 def test_left_hands_are_green_right_ones_red_and_missing_ones_black(hands):
-    picture, _ = mesh_reference.draw_mesh(hand_mesh.pose_hands(hands), make_cameras(2))
-    left, right = picture[:, :, : WIDTH // 2], picture[:, :, WIDTH // 2 :]
+    image, _ = mesh_reference.draw_mesh(hand_mesh.pose_hands(hands), make_cameras(2))
+    left, right = image[:, :, : WIDTH // 2], image[:, :, WIDTH // 2 :]
     assert left[0].any()
     assert not left[1].any()
     drawn = left[0][left[0].any(axis=-1)].astype(int)

@@ -87,7 +87,7 @@ def test_of_equally_near_points_the_first_is_seen(renderer):
 
 
 @pytest.mark.parametrize("renderer", [reference, jitted])
-def test_a_square_that_begins_outside_the_picture_still_shows(renderer):
+def test_a_square_that_begins_outside_the_image_still_shows(renderer):
     cameras = Cameras(
         world_from_camera=np.eye(4)[None],
         intrinsics_px=np.array([[10.0, 0, 0], [0, 10.0, 0], [0, 0, 1]]),
@@ -124,7 +124,7 @@ def test_gamma_lifts_the_colors_of_points(renderer, scene):
 
 
 @pytest.mark.parametrize("renderer", [reference, jitted])
-def test_both_masks_against_the_picture(renderer, scene):
+def test_both_masks_against_the_image(renderer, scene):
     points, _ = scene
     cameras = make_cameras()
     _, twice = splat_by_hand(points, cameras, 4)
@@ -160,8 +160,8 @@ def hands_by_hand(joints, cameras, kind):
         bones, colors = [(0, 1), (0, 2)], [RAW[2], RAW[0], RAW[1]]
     fx, fy = cameras.intrinsics_px[0, 0], cameras.intrinsics_px[1, 1]
     cx, cy = cameras.intrinsics_px[:2, 2]
-    picture = np.zeros((len(joints), HEIGHT, WIDTH, 3), np.uint8)
-    depth = np.full(picture.shape[:3], np.inf)
+    image = np.zeros((len(joints), HEIGHT, WIDTH, 3), np.uint8)
+    depth = np.full(image.shape[:3], np.inf)
     for f, pose in enumerate(cameras.world_from_camera):
         shapes = []
         for hand in joints[f]:
@@ -175,8 +175,8 @@ def hands_by_hand(joints, cameras, kind):
                 for start, end, radius, color in shapes:
                     t = first_inside(ray, start, end, radius)
                     if 0.01 <= t < depth[f, j, i]:
-                        depth[f, j, i], picture[f, j, i] = t, color
-    return picture, depth
+                        depth[f, j, i], image[f, j, i] = t, color
+    return image, depth
 
 
 def first_inside(ray, start, end, radius):
@@ -198,12 +198,12 @@ def first_inside(ray, start, end, radius):
 def test_the_three_hand_renderers_agree(kind):
     cameras = make_cameras(2)
     hands = make_hands(2)[:, :, : 21 if kind == "human" else 3]
-    picture, depth = hands_by_hand(hands, cameras, kind)
-    assert picture.any(axis=(1, 2, 3)).all()
+    image, depth = hands_by_hand(hands, cameras, kind)
+    assert image.any(axis=(1, 2, 3)).all()
     for renderer in (reference, jitted):
         got, got_depth = map(np.asarray, renderer.draw_hands(hands, cameras, kind=kind))
-        assert (got != picture).any(axis=-1).mean() <= DIFFERENT
-        same = (got == picture).all(axis=-1) & np.isfinite(depth) & np.isfinite(got_depth)
+        assert (got != image).any(axis=-1).mean() <= DIFFERENT
+        same = (got == image).all(axis=-1) & np.isfinite(depth) & np.isfinite(got_depth)
         np.testing.assert_allclose(got_depth[same], depth[same], rtol=1e-4)
 
 
@@ -212,10 +212,10 @@ def test_a_hand_that_is_missing_or_behind_the_camera_is_not_drawn(renderer):
     hands = make_hands(3)
     hands[0, :, 0] = np.nan
     hands[1] -= np.array([0, 20, 0], np.float32)
-    picture, depth = map(np.asarray, renderer.draw_hands(hands, make_cameras(3), kind="human"))
-    assert not picture[:2].any()
+    image, depth = map(np.asarray, renderer.draw_hands(hands, make_cameras(3), kind="human"))
+    assert not image[:2].any()
     assert np.isinf(depth[:2]).all()
-    assert picture[2].any()
+    assert image[2].any()
 
 
 def test_both_renderers_are_a_renderer_by_name():
@@ -259,10 +259,10 @@ def test_hands_close_to_the_camera_are_drawn_alike():
     cameras = make_cameras(2)
     forward, eye = cameras.world_from_camera[:, :3, 2], cameras.world_from_camera[:, :3, 3]
     near = (eye + 0.02 * forward)[:, None, None] + rng.normal(scale=0.02, size=(2, 9, 21, 3))
-    pictures, depths = zip(
+    images, depths = zip(
         *(r.draw_hands(near, cameras, kind="human") for r in (reference, jitted)), strict=True
     )
-    assert pictures[0].any(axis=-1).mean() > 0.2
-    assert (pictures[0] != pictures[1]).any(axis=-1).mean() <= DIFFERENT
-    same = (pictures[0] == pictures[1]).all(axis=-1) & np.isfinite(depths[0])
+    assert images[0].any(axis=-1).mean() > 0.2
+    assert (images[0] != images[1]).any(axis=-1).mean() <= DIFFERENT
+    same = (images[0] == images[1]).all(axis=-1) & np.isfinite(depths[0])
     np.testing.assert_allclose(depths[1][same], depths[0][same], rtol=1e-3)

@@ -29,7 +29,7 @@ def cameras(x=0.0):
     )
 
 
-def picture(plates, x=0.0):
+def image(plates, x=0.0):
     """Depth and ids when the plate's lower left corner is at each of `plates`; None: no plate."""
     depth = np.full((FRAMES, HEIGHT, WIDTH), TABLE_M, np.float32)
     ids = np.zeros(depth.shape, np.int32)
@@ -43,7 +43,7 @@ def picture(plates, x=0.0):
 
 
 def perceived(plates, *, x=0.0, step=1, **changes):
-    depth, ids = picture(plates, x)
+    depth, ids = image(plates, x)
     colors = np.where(ids[..., None] == 1, [200, 30, 30], [120, 110, 90]).astype(np.uint8)
     whole = {
         "step": step,
@@ -59,7 +59,7 @@ def perceived(plates, *, x=0.0, step=1, **changes):
 
 
 def start(x=0.0):
-    """A state with a far away point alone, then what the first picture shows."""
+    """A state with a far away point alone, then what the first image shows."""
     seed = SceneState(
         points_m=np.array([[50.0, 50, 50]], np.float32),
         colors=np.zeros((1, 3), np.uint8),

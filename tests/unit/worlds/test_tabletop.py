@@ -49,7 +49,7 @@ def test_depth_and_ids_of_a_box_against_its_slabs():
     camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     camera[:3, 3] = [0, -0.1, 0.05]
     intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
-    picture = caster.render(camera, intrinsics, height=48, width=80)
+    image = caster.render(camera, intrinsics, height=48, width=80)
     rays = pixel_rays(intrinsics, height=48, width=80).reshape(-1, 3)
     body_from_camera = invert(pose) @ camera
     start = body_from_camera[:3, 3]
@@ -61,9 +61,9 @@ def test_depth_and_ids_of_a_box_against_its_slabs():
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
     hit = (enter <= leave) & (enter > 0)
     assert hit.sum() > 50
-    assert ((picture.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
-    both = hit & np.isfinite(picture.depth_m.ravel())
-    np.testing.assert_allclose(picture.depth_m.ravel()[both], enter[both], rtol=1e-5)
+    assert ((image.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
+    both = hit & np.isfinite(image.depth_m.ravel())
+    np.testing.assert_allclose(image.depth_m.ravel()[both], enter[both], rtol=1e-5)
 
 
 def test_a_ball_is_seen_where_its_pose_projects():
@@ -76,8 +76,8 @@ def test_a_ball_is_seen_where_its_pose_projects():
     camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     camera[:3, 3] = [0.02, -0.1, body.size_m[2] / 2]
     intrinsics = np.array([[160.0, 0, 79.5], [0, 160.0, 47.5], [0, 0, 1]])
-    picture = caster.render(camera, intrinsics, height=96, width=160)
-    rows, columns = np.nonzero(picture.ids == FIRST_BODY)
+    image = caster.render(camera, intrinsics, height=96, width=160)
+    rows, columns = np.nonzero(image.ids == FIRST_BODY)
     center = pose @ [0, 0, body.size_m[2] / 2, 1]
     u, v = project(intrinsics, transform(invert(camera), center[None, :3]))
     assert abs(columns.mean() - u[0]) < 0.5
@@ -250,7 +250,7 @@ def test_cameras_that_are_not_rigid_are_refused(clips, change, message):
         replace(clips[0].cameras, world_from_camera=poses)
 
 
-def test_a_camera_without_a_picture_is_refused(clips):
+def test_a_camera_without_a_image_is_refused(clips):
     with pytest.raises(InputError, match="invalid intrinsics or image size"):
         replace(clips[0].cameras, intrinsics_px=np.diag([0.0, 60.0, 1.0]))
 

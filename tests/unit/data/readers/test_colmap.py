@@ -103,7 +103,7 @@ def test_cameras_points_and_observations_are_those_of_the_scene(world, tmp_path,
     np.testing.assert_allclose(np.stack([u, v], 1), points.pixels_px, atol=1e-3)
 
 
-def test_pictures_of_a_radial_lens_are_remapped_and_so_are_observations(world, tmp_path, imported):
+def test_images_of_a_radial_lens_are_remapped_and_so_are_observations(world, tmp_path, imported):
     write_model(
         tmp_path / "room", world, binary=True, model="OPENCV", distortion=(-0.2, 0.03, 0, 0)
     )
@@ -117,12 +117,12 @@ def test_pictures_of_a_radial_lens_are_remapped_and_so_are_observations(world, t
     np.testing.assert_allclose(np.stack([u, v], 1), points.pixels_px, atol=2e-3)
 
 
-def test_the_longest_run_of_registered_pictures_is_taken(world, tmp_path, imported):
+def test_the_longest_run_of_registered_images_is_taken(world, tmp_path, imported):
     write_model(tmp_path / "room", world, binary=True, skip=(3,))
     recording = imported(Colmap(source=tmp_path / "room", fps=10.0))[0]["room"]
     assert recording.frames == 8
     np.testing.assert_allclose(recording.world_from_camera, world.poses[4:], atol=1e-9)
-    assert recording.provenance["pictures"] == "8 of 12, 11 registered"
+    assert recording.provenance["images"] == "8 of 12, 11 registered"
     assert recording.points.frames.max() == 7
 
 
@@ -143,7 +143,7 @@ def test_a_truncated_file_or_a_false_count_is_refused(world, tmp_path, name):
             read_model(folder)
 
 
-def test_a_name_that_leaves_the_folder_of_pictures_is_not_found(world, tmp_path, imported):
+def test_a_name_that_leaves_the_folder_of_images_is_not_found(world, tmp_path, imported):
     folder = write_model(tmp_path / "room", world, binary=False)
     text = (folder / "images.txt").read_text()
     (folder / "images.txt").write_text(text.replace("frame_", "../images/frame_"))

@@ -81,7 +81,7 @@ def test_cameras_hands_and_texts_are_read(world, tmp_path, imported):
     assert recording.names == ("towel", "table")
 
 
-def test_joints_project_into_the_picture_without_flipping_an_axis(world, tmp_path, imported):
+def test_joints_project_into_the_image_without_flipping_an_axis(world, tmp_path, imported):
     write_episode(world, tmp_path / "0.hdf5")
     recording = imported(EgoDex(source=tmp_path / "0.hdf5"))[0]["0"]
     local = transform(invert(recording.world_from_camera[:, None]), recording.joints_m)

@@ -50,7 +50,7 @@ def make_poses():
 
 
 def write_clip(path, *, shapes=True, stream="214-1", model="FISHEYE624", focal=FOCAL):
-    """Write a clip whose pictures show a white dot at each keypoint of the left hand."""
+    """Write a clip whose images show a white dot at each keypoint of the left hand."""
     lens = Lens(
         model="fisheye624",
         coefficients=tuple(COEFFICIENTS),
@@ -95,11 +95,11 @@ def write_clip(path, *, shapes=True, stream="214-1", model="FISHEYE624", focal=F
             add(
                 f"{key}.info.json", {"image_timestamps_ns": {stream: round(1e9 + frame * 1e9 / 30)}}
             )
-            picture = np.zeros((SIZE, SIZE, 3), np.uint8)
+            image = np.zeros((SIZE, SIZE, 3), np.uint8)
             for x, y in lens.project(transform(invert(pose), points)):
-                cv2.circle(picture, (round(x), round(y)), 2, (255, 255, 255), -1)
+                cv2.circle(image, (round(x), round(y)), 2, (255, 255, 255), -1)
             data = io.BytesIO()
-            Image.fromarray(picture).save(data, "JPEG", quality=95)
+            Image.fromarray(image).save(data, "JPEG", quality=95)
             add(f"{key}.image_{stream}.jpg", data.getvalue())
 
 
@@ -112,13 +112,13 @@ def test_keypoints_are_where_the_turned_pinhole_projects_them(tmp_path, imported
     assert recording.metric
     local = transform(invert(recording.world_from_camera[:, None]), recording.joints_m)
     u, v = project(recording.intrinsics_px, local)
-    pictures = recording.read_frames().frames
+    images = recording.read_frames().frames
     for frame in range(FRAMES):
         for x, y in zip(u[frame, 0], v[frame, 0], strict=True):
-            assert pictures[frame, round(y), round(x), 0] > 150
+            assert images[frame, round(y), round(x), 0] > 150
 
 
-def test_the_picture_is_turned_clockwise(tmp_path, imported):
+def test_the_image_is_turned_clockwise(tmp_path, imported):
     """The color camera's x axis points up: what is right of it appears below."""
     write_clip(tmp_path / "set/clip.tar")
     recording = imported(Hot3D(source=tmp_path / "set"))[0]["clip"]

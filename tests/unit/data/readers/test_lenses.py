@@ -1,4 +1,4 @@
-"""Lenses agree with OpenCV and COLMAP; remapped pictures have no borders and the right pixels."""
+"""Lenses agree with OpenCV and COLMAP; remapped images have no borders and the right pixels."""
 
 import json
 import subprocess
@@ -65,7 +65,7 @@ def test_unproject_inverts_project(model, k):
 
 
 @pytest.mark.parametrize(("model", "k"), [("brown", BROWN), ("fisheye", FISHEYE)])
-def test_a_remapped_picture_has_no_border_and_shows_points_where_the_pinhole_projects(model, k):
+def test_a_remapped_image_has_no_border_and_shows_points_where_the_pinhole_projects(model, k):
     remap = Remap.of(lens(model, k))
     (white,) = remap.apply([np.full((480, 640, 3), 255, np.uint8)])
     assert (white == 255).all()
@@ -73,13 +73,13 @@ def test_a_remapped_picture_has_no_border_and_shows_points_where_the_pinhole_pro
     moved = remap.move(pixels)
     flat = POINTS / POINTS[:, 2:] @ remap.intrinsics_px.T
     np.testing.assert_allclose(moved, flat[:, :2], atol=1e-3)
-    picture = np.zeros((480, 640, 3), np.uint8)
+    image = np.zeros((480, 640, 3), np.uint8)
     inside = (np.abs(flat[:, :2] - [320, 240]) < [300, 220]).all(axis=1)
     for point, (x, y) in zip(pixels[inside][:5], flat[inside][:5, :2], strict=True):
-        cv2.circle(picture, tuple(np.rint(point).astype(int).tolist()), 3, (255, 255, 255), -1)
-        (out,) = remap.apply([picture])
+        cv2.circle(image, tuple(np.rint(point).astype(int).tolist()), 3, (255, 255, 255), -1)
+        (out,) = remap.apply([image])
         assert out[round(y), round(x), 0] > 200
-        picture[:] = 0
+        image[:] = 0
 
 
 def test_a_lens_without_distortion_is_a_pinhole():

@@ -40,7 +40,7 @@ def pack(data):
     return b"bvxn" + struct.pack("<II", len(data), len(payload)) + payload + b"bvx$"
 
 
-def write_capture(path, world, *, per_frame=True, pictures="rgbd", **changes):
+def write_capture(path, world, *, per_frame=True, images="rgbd", **changes):
     opengl = world.poses @ FLIP
     (fx, _, cx), (_, fy, cy), _ = world.intrinsics.tolist()
     metadata = {
@@ -58,7 +58,7 @@ def write_capture(path, world, *, per_frame=True, pictures="rgbd", **changes):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("metadata", json.dumps(metadata))
         for number, frame in enumerate(world.video):
-            archive.writestr(f"{pictures}/{number}.jpg", jpeg(frame))
+            archive.writestr(f"{images}/{number}.jpg", jpeg(frame))
             depth = np.full((3, 4), 0.5 + 0.1 * number, np.float32)
             depth[0, 0] = np.nan
             archive.writestr(f"rgbd/{number}.depth", pack(depth.tobytes()))
@@ -132,7 +132,7 @@ def test_without_the_library_depth_is_unknown_and_that_is_recorded(world, tmp_pa
 
 
 def test_a_folder_that_was_exported_is_read(world, tmp_path, imported):
-    write_capture(tmp_path / "scan.r3d", world, pictures="rgb")
+    write_capture(tmp_path / "scan.r3d", world, images="rgb")
     with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
         archive.extractall(tmp_path / "room")
     (tmp_path / "room/metadata").rename(tmp_path / "room/metadata.json")

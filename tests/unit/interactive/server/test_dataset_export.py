@@ -73,8 +73,8 @@ def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
         for path in sorted((tmp_path / "set" / "data").rglob("*.parquet"))
     ]
     assert [len(table["index"]) for table in tables] == [2 * per_clip + 1, per_clip + 1]
-    pictures = [p["bytes"] for table in tables for p in table["observation.images.ego"]]
-    found = np.stack([np.asarray(Image.open(io.BytesIO(data))) for data in pictures])
+    images = [p["bytes"] for table in tables for p in table["observation.images.ego"]]
+    found = np.stack([np.asarray(Image.open(io.BytesIO(data))) for data in images])
     np.testing.assert_array_equal(found, frames)
     rows = np.concatenate([np.array(table["action"], np.float32) for table in tables])
     np.testing.assert_array_equal(rows, actions)

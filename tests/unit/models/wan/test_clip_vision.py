@@ -13,13 +13,13 @@ from egosim_jax.types import InputError
 SIZES = dict(image_size=42, patch=14, dim=32, layers=3, heads=4, ffn_dim=48)
 
 
-def pictures(count=2):
+def images(count=2):
     return jax.random.normal(jax.random.key(0), (count, 42, 42, 3))
 
 
 def test_a_patch_is_the_weighted_sum_of_its_pixels():
     embed = PatchEmbed(CLIPVisionConfig(**SIZES), rngs=nnx.Rngs(0))
-    kernel, pixels = np.asarray(embed.kernel[...], np.float64), pictures(1)
+    kernel, pixels = np.asarray(embed.kernel[...], np.float64), images(1)
     # the patch in row 1, column 2 of a 3 x 3 grid is token 5
     want = (np.asarray(pixels)[0, 14:28, 28:42, :, None] * kernel).sum(axis=(0, 1, 2))
     # float32 sums of 588 terms
@@ -43,7 +43,7 @@ def test_bfloat16_stays_close_to_float32():
             {path: draw(size=shape, scale=0.2) for path, shape in flat_shapes(model).items()},
             dtype="float32",
         )
-        return jax.jit(model)(pictures())
+        return jax.jit(model)(images())
 
     want, have = encode("float32"), encode("bfloat16")
     assert have.dtype == jnp.bfloat16

@@ -39,11 +39,11 @@ def _rectangles() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
 @functools.cache
 def _texture(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    picture = np.zeros((512, 512, 3), np.float32)
+    image = np.zeros((512, 512, 3), np.float32)
     for size in (8, 24, 64, 128):
         noise = rng.normal(size=(size, size, 3)).astype(np.float32)
-        picture += cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
-    return np.clip(128 + 45 * picture, 0, 255)
+        image += cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + 45 * image, 0, 255)
 
 
 def render(cameras: Cameras, *, lens: Lens | None = None, seed: int = 0) -> np.ndarray:
@@ -64,7 +64,7 @@ def render(cameras: Cameras, *, lens: Lens | None = None, seed: int = 0) -> np.n
 def _frame(pose: np.ndarray, rays: np.ndarray, textures: list[np.ndarray]) -> np.ndarray:
     directions = rays @ pose[:3, :3].T
     nearest = np.full(rays.shape[:2], np.inf)
-    picture = np.zeros(rays.shape, np.float32)
+    image = np.zeros(rays.shape, np.float32)
     for (corner, u, v), texture in zip(_rectangles(), textures, strict=True):
         normal = np.cross(u, v)
         depth = ((corner - pose[:3, 3]) @ normal) / (directions @ normal + 1e-12)
@@ -75,8 +75,8 @@ def _frame(pose: np.ndarray, rays: np.ndarray, textures: list[np.ndarray]) -> np
         colors = cv2.remap(
             texture, place.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
-        picture[seen], nearest[seen] = colors[seen], depth[seen]
-    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+        image[seen], nearest[seen] = colors[seen], depth[seen]
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
 def path(

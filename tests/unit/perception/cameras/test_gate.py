@@ -36,7 +36,7 @@ def line(count: int = 10, *, step: float = 0.1) -> Reconstruction:
 
 
 def figures(found: Reconstruction, frames: int = 10) -> dict[str, float]:
-    return measure(found, frames=frames, pictures=10, height=480, width=640)
+    return measure(found, frames=frames, images=10, height=480, width=640)
 
 
 def test_figures_of_a_real_reconstruction_pass() -> None:

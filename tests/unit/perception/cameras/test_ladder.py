@@ -118,7 +118,7 @@ def test_videos_without_texture_are_refused(kind: str) -> None:
 
 def test_a_long_video_is_not_reconstructed() -> None:
     frames = render(path(13, move=np.array([0.5, 0.0, 0.0])))
-    found = estimate(CameraLadder(max_pictures=3, rung="incremental"), np.repeat(frames, 2, axis=0))
+    found = estimate(CameraLadder(max_images=3, rung="incremental"), np.repeat(frames, 2, axis=0))
     assert found.verdict.rung == "refused"
     assert "26 frames are too many" in found.verdict.reason
 

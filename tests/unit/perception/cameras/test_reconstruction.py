@@ -103,10 +103,10 @@ def test_one_thread_gives_the_same_result_twice() -> None:
     assert (first.cameras.world_from_camera == second.cameras.world_from_camera).all()
 
 
-def test_black_frames_and_skipped_pictures_are_interpolated() -> None:
+def test_black_frames_and_skipped_images_are_interpolated() -> None:
     frames = room(False).copy()
     frames[[9, 10]] = 0
-    ladder = CameraLadder(colmap=ONE_THREAD, max_pictures=22, rung="incremental")
+    ladder = CameraLadder(colmap=ONE_THREAD, max_images=22, rung="incremental")
     found = ladder(frames, np.zeros(frames.shape[:3], bool))
     assert found.verdict.rung == "incremental"
     assert "frames interpolated" in found.verdict.reason
