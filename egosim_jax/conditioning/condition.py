@@ -1,11 +1,11 @@
-"""Conditioning inputs of the denoiser, and what stands for an absent one.
+"""Conditioning inputs of the denoiser, and the value of a dropped one.
 
     prior   latents 0 and mask 1: nothing was observed, everything is to be generated
     mask    0: everything counts as observed, as in the EgoSim release without a mask file;
             the prior stays
     hands   latents 0
-    text    embeddings 0, the empty prompt of the EgoSim release's continuous runner, or those of
-            the model's `unconditional_prompt` (CogVideoX)
+    text    embeddings 0, as the continuous runner of the EgoSim release has for an empty prompt;
+            CogVideoX: the embeddings of `unconditional_prompt`
 
 The CLIP tokens of the first frame are never dropped.
 """
@@ -41,7 +41,7 @@ class Condition:
     text: Float[Array, "b n d"]
     """Embeddings of the prompt's tokens."""
     null_text: Float[Array, "b n d"] | None = None
-    """Prompt embeddings that stand for no prompt; None: zeros."""
+    """Embeddings of the negative prompt; None: zeros."""
     image: Float[Array, "b m e"] | None = None
     """Image tokens of the first frame; None for models without the image branch."""
 

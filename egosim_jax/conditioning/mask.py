@@ -1,7 +1,7 @@
 """Packing of the mask of unobserved pixels into channels of the latent grid.
 
-The rules are those of the EgoSim release; 1 says not observed, generate, and 0 observed, keep, the
-opposite of the Wan 2.1 inpainting models. For a mask video of the model's size:
+The EgoSim release has these rules. 1 means not observed, generate; 0 means observed, keep. The
+Wan 2.1 inpainting models use the opposite. For a mask video of the model's size:
 
 1. A gray level above one half of white is 1, everything else 0.
 2. The first frame is all 0: the prior is complete where the video starts.
@@ -9,15 +9,15 @@ opposite of the Wan 2.1 inpainting models. For a mask video of the model's size:
    index floor(i in / out). In space this takes every fourth pixel. In time, the release first
    repeats the last frame up to 4f + 1 frames for f latent frames, though a clip has
    4f - 3, and floor(i (4f + 1) / f) = 4i: latent frame i is decided by pixel frame 4i.
-4. Each 2 x 2 block of what is left becomes four channels, channel 2 dh + dw, so that latent cell
+4. Each 2 x 2 block of the remaining pixels becomes four channels, channel 2 dh + dw, so that latent cell
    (i, j) holds the pixels (8i + 4dh, 8j + 4dw).
 
 The release's continuous runner omits the padding of rule 3, so that its 61 frames are selected as
 floor(61 i / 16) = 0, 3, 7, 11, 15, 19, ...; `padding="none"` reproduces it.
 
 These are the rules of the packing `space` with a codec of strides 4 and 8. The others keep rules 1
-and 2 and take one pixel of each latent cell: `single` that of the same frame, in one channel, and
-`time` those of all pixel frames that the latent frame encodes, a channel each (Wan 2.1).
+and 2 and take one pixel of each latent cell. `single` takes it from the same frame, in one channel.
+`time` takes it from every pixel frame that the latent frame encodes, a channel each (Wan 2.1).
 `observed` is 0 everywhere, and refuses a mask that says otherwise.
 """
 

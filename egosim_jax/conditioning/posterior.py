@@ -2,9 +2,8 @@
 
 A VAE gives mean and deviation of the latents of a video. EgoSim takes the means, in training and at
 generation. DWM draws at each training update, for the target as for the conditions, and at
-generation the latents of the hands but not of the prior (its release). CogVideoX-Fun's own
-pipeline, by which the paper was evaluated, also adds noise to the pixels of the prior that are not
-black.
+generation the latents of the hands but not of the prior (its release). The paper was evaluated with
+CogVideoX-Fun's own pipeline, which also adds noise to the pixels of the prior that are not black.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ In both, id 0 pads and id 1 ends a prompt. `byt5` needs no files: the tokens are
 of the prompt, byte x as id x + 3, after the ids for padding, end and unknown (Xue et al. 2022).
 A folder in the layout of google/umt5-xxl gives the tokenizer of the released text encoder. Its
 `tokenizer.json` is read as it is: the T5 class of transformers 5 would rebuild it, and lose its
-byte fallback and its id for unknown on the way. Where there is none, its `spiece.model` is read.
+byte fallback and its id for unknown on the way. Without that file, `spiece.model` is read.
 """
 
 from __future__ import annotations

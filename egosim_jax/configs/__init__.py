@@ -36,7 +36,7 @@ def get(name: str) -> ModelConfig:
 
 
 def sampled(config: ModelConfig, sampling: str) -> ModelConfig:
-    """Return a model with one of its named samplings, of which most models have none.
+    """Return a model with one of its named samplings; most models have no named sampling.
 
     An unknown name raises `InputError` with the nearest.
     """
@@ -100,7 +100,7 @@ def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
 def weights_of(name: str, given: Path | None) -> Path:
     """Return the folder of a config's weights: the given one, else shipped ones, else fetched ones.
 
-    Raises `InputError`, with the command that fetches them, if there are none.
+    Raises `InputError`, with the command that fetches them, if no weights are found.
     """
     folder = given or shipped_weights(name)
     if folder is None and hub.is_fetched(fetched := hub.fetched_folder(name)):

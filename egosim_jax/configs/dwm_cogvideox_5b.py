@@ -2,7 +2,7 @@
 
 The prior is the video of the static scene along the camera path, observed everywhere, and the hands
 are shaded meshes on black. 50 DDIM steps with guidance away from the empty prompt; the sampling
-`paper` is that of the paper's tables. (Kim et al. 2026, Dexterous World Models.)
+`paper` reproduces the paper's tables. (Kim et al. 2026, Dexterous World Models.)
 """
 
 from pathlib import Path
@@ -42,7 +42,7 @@ NEGATIVE_PROMPT = (
     "The video is not of a high quality, it has a low resolution. Watermark present in each frame. "
     "The background is solid. Strange body and strange trajectory. Distortion. "
 )
-"""Prompt that the paper's evaluation guides away from: that of CogVideoX-Fun's pipeline."""
+"""Negative prompt of the paper's evaluation, from CogVideoX-Fun's pipeline."""
 SAMPLINGS = {
     "released": {
         "solver": CONFIG.solver,
@@ -55,6 +55,6 @@ SAMPLINGS = {
         "encoding_noise": EncodingNoise(hands=True, prior_pixels=0.0563),
     },
 }
-"""Named samplings: the release's, and that of the scripts behind the paper's tables.
+"""Named samplings: the release's, and the one in the scripts behind the paper's tables.
 
 The paper's is CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior."""

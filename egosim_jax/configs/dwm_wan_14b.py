@@ -23,7 +23,7 @@ from egosim_jax.types import VideoSpec
 
 @dataclass(frozen=True, kw_only=True)
 class DWMWanDiTConfig(WanDiTConfig):
-    """Wan's transformer, of which DWM adapts every linear layer and trains the patch embedding."""
+    """Wan's transformer; DWM adapts every linear layer and trains the patch embedding."""
 
     table: ClassVar[str] = "egosim_jax.convert.tables.dwm_wan_dit"
     """Module of the conversion table."""

@@ -86,16 +86,16 @@ class ModelConfig:
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
     unconditional_prompt: str | None = None
-    """Prompt whose embeddings stand for no prompt; None: embeddings of zeros (EgoSim).
+    """Negative prompt of the unconditional branch; None: embeddings of zeros (EgoSim).
 
-    Guidance pushes away from it, and a prompt that is dropped in training is replaced by it.
+    Training replaces a dropped prompt by it.
     """
     strength: float | None = None
-    """Share of the steps that are taken, from the prior with that much noise (SDEdit).
+    """Fraction of the steps to run, starting from the noised prior (SDEdit).
 
-    The prior is then no condition. None: all steps, from noise alone."""
+    The prior is then not a condition. None: all steps, from pure noise."""
     steps: int | tuple[int | float, ...] = 50
-    """Number of denoising steps, or the timesteps to visit, as the denoiser is given them."""
+    """Number of denoising steps, or the timesteps to visit."""
 
     def __post_init__(self) -> None:
         """Check that networks, input channels and video fit each other."""
@@ -246,7 +246,7 @@ class Networks(nnx.Module):
     def build(
         cls, config: ModelConfig, *, only: Collection[str] | None = None, rngs: nnx.Rngs
     ) -> Networks:
-        """Build the networks of a config, or `only` those of some names, with random weights."""
+        """Build the networks of a config, or `only` some by name, with random weights."""
         return cls(
             **{
                 name: network.build(rngs=rngs)

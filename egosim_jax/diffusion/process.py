@@ -171,8 +171,8 @@ class RectifiedFlow(Process):
     timestep_rounding: Literal["none", "bfloat16", "down"] = "none"
     """Rounding of timesteps before they are embedded.
 
-    `bfloat16` (spacing 4 above 512) is the EgoSim release's; `down`, to integers, is that of Wan's
-    own UniPC."""
+    `bfloat16` (spacing 4 above 512) is the EgoSim release's; `down`, to integers, is the rounding
+    of Wan's own UniPC."""
     prediction: Prediction = "velocity"
     """Quantity that the network predicts: `velocity`, `epsilon` or `x0`."""
 
@@ -243,7 +243,7 @@ class RectifiedFlow(Process):
 
 @dataclass(frozen=True, kw_only=True)
 class VariancePreserving(Process):
-    """The discrete process of DDPM; the defaults are those of CogVideoX 5B."""
+    """The discrete process of DDPM; the defaults are CogVideoX 5B's."""
 
     train_timesteps: int = 1000
     """Number of timesteps, T."""

@@ -145,7 +145,7 @@ def _combine(weights: Float[Array, " k"], terms: Float[Array, " k *x"]) -> Float
 def _step(path: _Path, known: list[int], target: int) -> tuple[float, Float[np.ndarray, " k"]]:
     """Return the coefficients of a step to `target` from `known[0]`, with predictions at `known`.
 
-    First that of the latents at `known[0]`, then those of the predictions.
+    First the weight of the latents at `known[0]`, then the weights of the predictions.
     """
     source, half_log_snr = known[0], path.half_log_snr
     h = half_log_snr[target] - half_log_snr[source]

@@ -255,7 +255,7 @@ class BatchJob:
         return failed
 
     def load(self, mesh: Mesh) -> Generator:
-        """Return the generator of the job's weights; random ones are those of its seed."""
+        """Return the generator of the job's weights, or of random weights from the job's seed."""
         if self.weights is None:
             print(f"{self.model.name}: random weights of seed {self.seed}", file=sys.stderr)
             return Generator(self.model, Networks.random(self.model, seed=self.seed), mesh)

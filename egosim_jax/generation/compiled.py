@@ -20,7 +20,7 @@ class CompiledFn:
 
     On a mesh, on which `shard_params` has placed the networks, all arrays have a leading batch
     axis. Raises `InputError` before compiling for a batch that the mesh does not divide. With a
-    `cache_key`, which identifies function and config, what is compiled is cached between starts
+    `cache_key`, which identifies function and config, compiled programs are cached between starts
     (`io/executables.py`).
     """
 

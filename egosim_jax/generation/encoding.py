@@ -99,7 +99,7 @@ def batch_shapes(size: int, config: ModelConfig) -> dict[str, jax.ShapeDtypeStru
 def encode_condition(
     networks: Networks, batch: Batch, noise: EncodingNoise | None = None
 ) -> Condition:
-    """Encode what is not encoded yet: videos to latents, prompts and images to embeddings.
+    """Encode the raw arrays of a batch: videos to latents, prompts and images to embeddings.
 
     An array whose network is absent is taken as it is. `noise` draws from the batch's seeds.
     """

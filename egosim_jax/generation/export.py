@@ -31,7 +31,7 @@ def write_conditions(
     """Write prior, mask and hand videos of an action in EgoSim's layout; return its metadata.csv.
 
     Other clips in the folder keep their rows there; one of the same `video_id` is replaced.
-    Without a first frame it is that of the view. Raises `InputError` if the first camera sees none
+    The first frame defaults to the view's. Raises `InputError` if the first camera sees none
     of the state, and for a `video_id` that is not a valid file name.
     """
     view = renderer.render(state, action.cameras, point_px=2)
@@ -98,8 +98,7 @@ def static_triplet(
 ) -> Triplet:
     """Return a triplet of DWM: a static scene, hand meshes along the action, and the ground truth.
 
-    The meshes are those of the action's keypoints, which have a left hand before a right one,
-    unless others are given. Raises `InputError` if lengths or sizes disagree, or for keypoints in
+    By default the meshes are posed from the action's keypoints, left hand before right hand. Raises `InputError` if lengths or sizes disagree, or for keypoints in
     another order.
     """
     cameras = action.cameras

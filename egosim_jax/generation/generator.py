@@ -74,7 +74,7 @@ def denoise(
     config: ModelConfig,
     keys: Key[Array, " b"] | None = None,
 ) -> Float[Array, "b f h w z"]:
-    """Run the sampler; the unconditional branch gets the text embeddings of no prompt.
+    """Run the sampler; the unconditional branch uses the negative-prompt embeddings.
 
     `keys`, one for each item, draw the noise that a stochastic solver adds.
     """
@@ -286,11 +286,11 @@ class Generator:
         return self._clips(self._latents(targets_of(triplets)))
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
-        """Return the initial noise of each seed, of which the last 32 bits count."""
+        """Return the initial noise of each seed; only its last 32 bits matter."""
         return self._noise(last_32_bits(seeds))
 
     def _stepping(self, seeds: T) -> tuple[T, ...]:
-        """Return what a stochastic solver gets besides the noise: the seeds."""
+        """Return the further arguments of a stochastic solver: the seeds."""
         return (seeds,) if self.config.solver.stochastic else ()
 
     def _clips(self, latents: Float[Array, "b f h w z"]) -> list[Clip]:

@@ -29,7 +29,7 @@ from egosim_jax.types import InputError
 Score = Callable[[UInt8[np.ndarray, "f h w 3"]], float]
 """Function that scores a video; higher is better."""
 STRETCH = 0.02
-"""Most by which the ratio of width to height of an image may differ from that of the clips."""
+"""Maximum relative difference between the aspect ratios of a goal image and the clips."""
 MEASURES = {"score": ("score", "{:.4f}"), "rank": ("rank", "{:.0f}")}
 
 

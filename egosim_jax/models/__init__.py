@@ -34,7 +34,7 @@ class Denoiser(Protocol):
     ) -> Float[Array, "b f h w c"]:
         """Return the prediction, in float32, for noisy latents at timesteps `t`.
 
-        They are those of `Process.timesteps`.
+        `Process.timesteps` returns them.
         """
         ...
 

@@ -36,12 +36,13 @@ Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
 
 `xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`); `cudnn`
 is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only); `hopper` is the inference kernel of
-H100 and H200, replaced by cuDNN's where it does not apply, as under differentiation; `splash` is
-that of TPUs (elsewhere it is interpreted, for tests); `auto` is the device's, where it applies."""
+H100 and H200, replaced by cuDNN's where it does not apply, as under differentiation; `splash` runs
+on TPUs (elsewhere it is interpreted, for tests); `auto` picks the device's kernel if it applies."""
 SCORES = 2**26
 """Bytes of scores that the `xla` kernel computes at a time, or one head's if these are more.
 
-A small model's heads are computed all at once, which is faster, those of a long video one by one.
+The heads of a small model are computed all at once, which is faster. The heads of a long video
+are computed one by one.
 """
 SELF_ATTENTION = "self_attention"
 """Checkpoint name of the residuals that a kernel's backward pass needs."""

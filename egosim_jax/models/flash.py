@@ -1,8 +1,8 @@
 """Attention by the vendors' flash kernels: cuDNN on NVIDIA GPUs, splash on TPUs.
 
 Both never hold the scores, forward or backward. Each wants lengths that the video's tokens or the
-image's 257 do not have; what is added to make them up is masked by lengths or by segments, never by
-a dense mask, which would be as large as the scores.
+image's 257 do not have. Padding is masked by lengths or by segments, never by a dense mask, which
+would be as large as the scores.
 """
 
 from __future__ import annotations

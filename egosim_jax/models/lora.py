@@ -140,7 +140,7 @@ def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, Change]:
 def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
     """Return the tensors named `down` and `up` by path.
 
-    Raises `InputError` naming incomplete pairs; those of weights in full are skipped.
+    Raises `InputError` naming incomplete pairs; weights that are trained in full are skipped.
     """
     names = {name for name in tensors if not name.endswith((DIFF, VALUE))}
     paths = sorted({name.rpartition(".")[0] for name in names})

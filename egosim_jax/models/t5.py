@@ -18,7 +18,7 @@ from egosim_jax.types import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class T5Sizes:
-    """Sizes of a text encoder of the T5 family; the defaults are those of its XXL models."""
+    """Sizes of a text encoder of the T5 family; the defaults are the XXL models'."""
 
     vocab: int
     """Rows of the token table; the tokenizer may use fewer."""

@@ -132,7 +132,7 @@ def inspect(
 ) -> Report:
     """Return the costs of a program that was compiled for a target.
 
-    `resident` is the size in bytes of what is on a device anyway, such as all networks' weights.
+    `resident` is the size in bytes of other data on the device, such as all networks' weights.
     """
     module, stats = HloModule.read(compiled.as_text()), compiled.memory_analysis()
     device, count = target.device, len(target.devices)

@@ -1,7 +1,7 @@
 """Renderer in JAX, which the product uses; it draws the same images as `reference`.
 
 Points: all squares of a given size are the same square moved by integer offsets. So each point is
-written into one cell only, that of its first pixel, and a pixel sees the nearest of p x p
+written into one cell only, the cell of its first pixel. A pixel sees the nearest of p x p
 neighboring cells: p^2 comparisons per pixel instead of p^2 writes per point.
 
 Hands: a shape is intersected only with the rays of the tiles that its bounding box meets.
@@ -63,7 +63,7 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
 
 @jax.jit
 def _identify(index: Int[Array, "f h w"], object_ids: Int32[Array, " n"]) -> Int32[Array, "f h w"]:
-    """Return the object id of the point that each pixel sees; 0 where there is none."""
+    """Return the object id of the point that each pixel sees; 0 where no point is visible."""
     return jnp.where(index < 0, 0, object_ids[index])
 
 
@@ -146,7 +146,7 @@ def paint(
     *,
     gamma: bool,
 ) -> UInt8[Array, "f h w 3"]:
-    """Return the image of the visible points, black where there are none."""
+    """Return the image of the visible points, black where no point is visible."""
     colors = jnp.asarray(GAMMA)[colors] if gamma else jnp.asarray(colors)
     return jnp.where(index[..., None] < 0, jnp.uint8(0), colors[index])
 

@@ -33,7 +33,7 @@ from egosim_jax.types import Cameras
 def draw_mesh(
     mesh: MovingMesh, cameras: Cameras
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Draw a mesh; return the image and its depth, black and infinite where there is none."""
+    """Draw a mesh; return the image and its depth, black and infinite off the mesh."""
     tiles = tiles_of(cameras)
     intrinsics = jnp.asarray(cameras.intrinsics_px, jnp.float32)
     frames = []

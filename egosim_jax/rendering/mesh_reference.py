@@ -14,7 +14,7 @@ from egosim_jax.types import Cameras, InputError
 def draw_mesh(
     mesh: MovingMesh, cameras: Cameras
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
-    """Draw a mesh; return the image and its depth, black and infinite where there is none.
+    """Draw a mesh; return the image and its depth, black and infinite off the mesh.
 
     Triangles with a vertex that is not finite are missing. Nothing nearer than 1 cm is drawn.
     """

@@ -66,7 +66,7 @@ def splat(
 def paint(
     index: Int[np.ndarray, "f h w"], colors: UInt8[np.ndarray, "n 3"], *, gamma: bool
 ) -> UInt8[np.ndarray, "f h w 3"]:
-    """Return the image of the visible points, black where there are none.
+    """Return the image of the visible points, black where no point is visible.
 
     `gamma` applies the original renderer's color curve, c -> c^(1/2.2).
     """
@@ -79,8 +79,8 @@ def unobserved(
 ) -> UInt8[np.ndarray, "f h w"]:
     """Return the mask, 255 where no point is seen.
 
-    Training data has masks of points twice as large as those of the image; a view of the state
-    has points of one size and a mask whose observed part is widened by a pixel: `dilate`.
+    In training data, the points of the mask are twice as large as the points of the image. A view
+    of the state has points of one size, and `dilate` widens the mask's observed part by a pixel.
     """
     drawn = index >= 0
     if not dilate:

@@ -1,1 +1,7 @@
-"""What every command shares: parsing, exit codes, interrupts, progress and worker processes."""
+"""Process-wide services of every command; nothing here knows models, scenes or files.
+
+command      parsing, error messages and exit codes
+interrupts   Ctrl-C during imports and afterwards
+progress     live or plain progress on stderr
+processes    functions run in worker processes
+"""

@@ -217,10 +217,14 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
 
 
 def _reader_ended() -> bool:
-    """Return True if nobody reads stdout any more, as behind `head`, and discard what is left."""
+    """Return True if nobody reads stdout any more, as behind `head`; discard further output."""
     try:
         number = sys.stdout.fileno()
-    except (AttributeError, OSError, ValueError):  # closed, or replaced by what is no file
+    except (
+        AttributeError,
+        OSError,
+        ValueError,
+    ):  # closed, or replaced by an object that is not a file
         return False
     pipe = select.poll()
     pipe.register(number, 0)

@@ -103,7 +103,7 @@ def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
 
 
 def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
-    """Return True if bones are in proportion: those of the palm alike, and by far the longest.
+    """Return True if bones are in proportion: palm bones alike, and by far the longest.
 
     Fingers but the thumb are looked at, by their medians; their last bones are shorter than the
     first ones. It holds for any pose, however the fingers are bent.

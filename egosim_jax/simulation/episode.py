@@ -140,7 +140,7 @@ class Episode:
 
     @classmethod
     def load(cls, path: Path | str) -> Episode:
-        """Read a folder or a .zip. Raises `InputError` for what is damaged or not valid."""
+        """Read a folder or a .zip. Raises `InputError` if it is damaged or not valid."""
         path = Path(path)
         with _named(quote_path(path)):
             if path.is_dir():
@@ -168,7 +168,7 @@ class Episode:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Episode:
-        """Read the byte format. Raises `InputError` for what is damaged or not valid."""
+        """Read the byte format. Raises `InputError` if it is damaged or not valid."""
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             try:

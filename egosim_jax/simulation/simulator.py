@@ -30,13 +30,13 @@ class VideoGenerator(Protocol):
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Generate the frames of a clip, as many and as large as those of the view."""
+        """Generate the frames of a clip, as many and as large as the view's frames."""
         ...
 
 
 @runtime_checkable
 class StreamedGenerator(VideoGenerator, Protocol):
-    """Generator of videos whose first frames are known before the last ones."""
+    """Generator that yields the first frames of a video before it has the last ones."""
 
     def stream(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
@@ -72,7 +72,7 @@ class Simulator:
     fusion: Fusion = field(default_factory=Fusion)
     """Settings of the fusion."""
     show: Callable[[UInt8[np.ndarray, "g h w 3"]], None] | None = None
-    """Function that gets the frames of a clip in groups, as soon as they are known."""
+    """Callback for each decoded group of frames."""
 
     @property
     def renderer(self) -> Renderer:
@@ -96,7 +96,7 @@ class Simulator:
         return Step(view=view, clip=clip, state=self.update(state, clip, action))
 
     def update(self, state: SceneState, clip: Clip, action: Action) -> SceneState:
-        """Return the state after a clip: what is perceived in it, fused into the state before."""
+        """Perceive a clip and fuse it into the state."""
         if self.perception is None:
             return state
         return fuse(state, self.perception(clip, action, state), fusion=self.fusion)

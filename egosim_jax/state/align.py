@@ -1,8 +1,8 @@
 """Alignment of a reconstruction with the world by its cameras.
 
 Alignments are 4 x 4 matrices `world_from_reconstruction`, rigid or with one scale, applied as
-p -> s R p + t. Source: EgoSim, section 3.3 (Sim(3) Umeyama alignment); the methods are those of the
-released `reconstruct_from_artifacts`, whose default is rigid.
+p -> s R p + t. Source: EgoSim, section 3.3 (Sim(3) Umeyama alignment); the released
+`reconstruct_from_artifacts` has the same methods, and rigid as its default.
 """
 
 from __future__ import annotations

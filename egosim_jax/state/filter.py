@@ -31,7 +31,7 @@ InteractedFrames = dict[int, Bool[np.ndarray, " f"]]
 
 
 def is_hand(name: str) -> bool:
-    """Return whether a name is that of a hand or arm: by words, so not `handle` or `armchair`."""
+    """Return whether a name means a hand or arm, by whole words: not `handle` or `armchair`."""
     return bool(_HANDS.search(name.lower())) and not is_held(name)
 
 

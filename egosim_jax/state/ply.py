@@ -41,7 +41,7 @@ class _Element:
     name: str
     count: int
     fields: list[tuple[str, str]] = field(default_factory=list)
-    """Names and dtypes of the properties; for a list, those of its length."""
+    """Names and dtypes of the properties; for a list, the name and dtype of its length."""
     lists: bool = False
     items: str = ""
     """Dtype of the items of its last list."""
@@ -89,7 +89,7 @@ def has_triangles(path: Path) -> bool:
 def read_triangles(path: Path) -> np.ndarray:
     """Return the triangles of a binary PLY file, `t 3`: vertex indices of the element `face`.
 
-    Raises `InputError` if there are none, or other polygons, or further properties of faces.
+    Raises `InputError` without triangles, with other polygons, or with further face properties.
     """
     name = quote_path(path)
     points = read_points(path)

@@ -1,7 +1,7 @@
 """Layers of CogVideoX's video transformer.
 
-With shift, scale and gate from the time embedding, one triple for the tokens of the text and one
-for those of the video, a block is
+Shift, scale and gate come from the time embedding: one triple for text tokens and one for video
+tokens. A block is
 
     x <- x + gate_a · Attention((1 + scale_a) · LN(x) + shift_a)
     x <- x + gate_m · MLP((1 + scale_m) · LN(x) + shift_m)
@@ -81,7 +81,7 @@ class CogVideoXDiTSizes:
         if self.in_channels < self.out_channels:
             raise InputError(
                 f"in_channels {self.in_channels} must hold the {self.out_channels} noisy channels "
-                "(out_channels) and those of the condition."
+                "(out_channels) and the condition's channels."
             )
         if self.dim % self.heads or self.head_dim % 16:
             raise InputError(

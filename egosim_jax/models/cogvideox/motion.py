@@ -2,7 +2,7 @@
 
 The poses of the hands, a vector for each pixel frame, are embedded and change shift, scale and gate
 of every block, for the tokens of each latent frame by themselves (`frame`) or for all alike, by
-their mean (`global`). What is added is 0 before training. The tokens of the text take the mean.
+their mean (`global`). The addition is 0 before training. The tokens of the text take the mean.
 
 The released class for single frames averages them too, and starts its embedding at 0, so that it
 never learns; here only the last layer starts at 0. (Kim et al. 2026, table 3.)
@@ -39,7 +39,7 @@ class MotionDiTConfig(CogVideoXDiTConfig):
     pose_dim: int = 128
     """Numbers of the hands' poses in a pixel frame."""
     frames: Literal["frame", "global"] = "frame"
-    """Poses that modulate a token: those of its latent frame, or the mean of the clip's."""
+    """Poses that modulate a token: its latent frame's poses, or the mean over the clip."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -103,7 +103,7 @@ class Motion(nnx.Module):
         """Embed the poses of 4k+1 pixel frames: k+1 latent frames, or one for all."""
         x = self.down(jax.nn.silu(self.up(poses)))
         stride = 2 if self.frames == "frame" else 1
-        if self.frames == "frame":  # the first latent frame is that of one pixel frame
+        if self.frames == "frame":  # the first latent frame encodes one pixel frame only
             x = jnp.concatenate([jnp.repeat(x[:, :1], 3, axis=1), x], axis=1)
         x = jax.nn.silu(self.first(windows(x, stride)))
         x = self.second(windows(x, stride))

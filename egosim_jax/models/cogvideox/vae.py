@@ -46,7 +46,7 @@ CUBE = (3, 3, 3)
 
 @dataclass(frozen=True, kw_only=True)
 class CogVideoXVAEConfig:
-    """Sizes of the video VAE; the defaults are those of CogVideoX 5B."""
+    """Sizes of the video VAE; the defaults are CogVideoX 5B's."""
 
     table: ClassVar[str] = "egosim_jax.convert.tables.cogvideox_vae"
     """Module of the conversion table."""
@@ -73,7 +73,7 @@ class CogVideoXVAEConfig:
         check_counts({name: getattr(self, name) for name in ("z_dim", "res_blocks", "groups")})
         if len(self.dims) != 4 or self.temporal_levels != 2:
             raise InputError(
-                f"{len(self.dims)} levels, {self.temporal_levels} of which halve the frame rate, "
+                f"{len(self.dims)} levels with {self.temporal_levels} that halve the frame rate "
                 "do not give strides of 4 frames and 8 pixels: dims needs 4 entries and "
                 "temporal_levels must be 2."
             )
@@ -190,7 +190,7 @@ class Encoder(nnx.Module):
     def __call__(
         self, x: Float[Array, "b f h w 3"], cache: Cache
     ) -> tuple[Float[Array, "b g y x m"], Cache]:
-        """Encode the chunk after those of the cache."""
+        """Encode the chunk that follows the cached ones."""
         return _run(self, [*self.levels, *self.middle], x, None, cache)
 
 
@@ -216,7 +216,7 @@ class Decoder(nnx.Module):
     def __call__(
         self, z: Float[Array, "b f h w z"], cache: Cache
     ) -> tuple[Float[Array, "b g y x 3"], Cache]:
-        """Decode the chunk after those of the cache."""
+        """Decode the chunk that follows the cached ones."""
         return _run(self, [*self.middle, *self.levels], z, z, cache)
 
 
@@ -229,7 +229,7 @@ def _blocks(
     spatial_norm: bool,
     rngs: nnx.Rngs,
 ) -> list[ResidualBlock]:
-    """Build residual blocks, the first of which changes the number of channels."""
+    """Build residual blocks; the first one changes the number of channels."""
     return [
         ResidualBlock(out if block else dim, out, config, spatial_norm=spatial_norm, rngs=rngs)
         for block in range(count)
@@ -309,9 +309,9 @@ class CogVideoXVAE(nnx.Module):
     def standardize(self, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
         """Fold a measured deviation of the latents into the layers that write and read them.
 
-        `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
-        the latents of `encode` have a mean square of 1 in each channel, and decoding what is
-        encoded gives the same video as before. Their mean stays: the decoder's first convolution
+        `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
+        returns. Afterwards the latents of `encode` have a mean square of 1 in each channel, and
+        encoding then decoding gives the same video as before. Their mean stays: the decoder's first convolution
         pads with zeros, so that no bias could replace it.
         """
         size = self.config.scale * jnp.sqrt(jnp.square(mean) + jnp.square(std))

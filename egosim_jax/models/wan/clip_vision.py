@@ -30,7 +30,7 @@ from egosim_jax.types import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class CLIPVisionConfig:
-    """Sizes of the image encoder; the defaults are those of ViT-H/14."""
+    """Sizes of the image encoder; the defaults are ViT-H/14's."""
 
     table: ClassVar[str] = "egosim_jax.convert.tables.clip_vision"
     """Module of the conversion table."""

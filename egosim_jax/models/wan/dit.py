@@ -41,7 +41,7 @@ from egosim_jax.sharding import constrain
 from egosim_jax.types import InputError
 
 TOKENS, VECTORS = ("batch", "tokens", None), ("batch", None, None)
-"""Logical axes of the residual stream, and of what is the same for all tokens."""
+"""Logical axes of the residual stream, and of arrays that all tokens share."""
 
 
 @dataclass(frozen=True, kw_only=True)

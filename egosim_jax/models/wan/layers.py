@@ -84,7 +84,7 @@ class WanDiTSizes:
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products and the residual stream."""
     products: Products | None = None
-    """Dtype of the factors of matrix products, attention's included; None: that of the others.
+    """Dtype of the factors of matrix products, attention's included; None: `dtype`.
 
     With bfloat16 sums and all else stay in `dtype`."""
     attention: Kernel = "auto"
@@ -99,7 +99,7 @@ class WanDiTSizes:
         if self.in_channels < self.out_channels:
             raise InputError(
                 f"in_channels {self.in_channels} must hold the {self.out_channels} noisy channels "
-                "(out_channels) and those of the condition."
+                "(out_channels) and the condition's channels."
             )
         if self.dim % self.heads or self.head_dim % 2 or self.head_dim < 6:
             raise InputError(
@@ -143,7 +143,7 @@ def linear(
 
 
 def modulation_table(rows: int, dim: int, rngs: nnx.Rngs) -> nnx.Param:
-    """Make learned shifts, scales and gates, which are added to those of the time."""
+    """Make learned shifts, scales and gates, which are added to the time embedding's."""
     table = jax.random.normal(rngs.params(), (rows, dim)) / dim**0.5
     return nnx.Param(table, axes=(None, "embed"))
 

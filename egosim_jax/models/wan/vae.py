@@ -47,7 +47,7 @@ from egosim_jax.types import InputError, VideoGrid
 
 @dataclass(frozen=True, kw_only=True)
 class WanVAEConfig:
-    """Sizes of the video VAE; the defaults are those of the release."""
+    """Sizes of the video VAE; the defaults are the release's."""
 
     table: ClassVar[str] = "egosim_jax.convert.tables.wan_vae"
     """Module of the conversion table."""
@@ -142,7 +142,7 @@ class Encoder(nnx.Module):
         self.conv_out = Conv(cube, dims[-1], moments, dtype=dtype, kernel_init=now, rngs=rngs)
 
     def __call__(self, x: Input, cache: Cache) -> Output:
-        """Encode the frames that follow those of the cache."""
+        """Encode the frames that follow the cached ones."""
         return _run(self, [*self.levels, *self.middle], x, cache)
 
 
@@ -171,7 +171,7 @@ class Decoder(nnx.Module):
         self.conv_out = Conv(cube, dim, 3, dtype=dtype, kernel_init=now, rngs=rngs)
 
     def __call__(self, x: Input, cache: Cache) -> Output:
-        """Decode the latent frames that follow those of the cache."""
+        """Decode the latent frames that follow the cached ones."""
         return _run(self, [*self.middle, *self.levels], x, cache)
 
 
@@ -281,8 +281,8 @@ class WanVAE(nnx.Module):
     def standardize(self, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
         """Fold a measured latent mean and deviation into the two quantization convolutions.
 
-        `mean` and `std` are those of the means that `moments` gives over a data set. Afterwards
-        these have mean 0 and deviation 1, the log variances shrink by 2 log std, and decoding what
+        `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
+        returns. Afterwards the means have mean 0 and deviation 1, the log variances shrink by 2 log std, and decoding what
         is encoded gives the same video as before.
         """
         encode, decode = self.to_moments, self.from_latents

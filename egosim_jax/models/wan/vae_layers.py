@@ -143,7 +143,7 @@ class Downsample(nnx.Module):
         )
 
     def __call__(self, x: Input, cache: Cache) -> Output:
-        """Downsample; the cache is that of the temporal convolution."""
+        """Downsample; the cache belongs to the temporal convolution."""
         x = self.space.downsample2x(x)
         if self.time is None:
             return x, None
@@ -166,7 +166,7 @@ class Upsample(nnx.Module):
         self.space = Conv((3, 3), dim, dim // 2, dtype=dtype, kernel_init=once, rngs=rngs)
 
     def __call__(self, x: Input, cache: Cache) -> Output:
-        """Upsample; the cache is that of the temporal convolution, which never sees frame 0."""
+        """Upsample; the cache belongs to the temporal convolution, which never sees frame 0."""
         if self.time is not None:
             first, rest = (x[:, :1], x[:, 1:]) if cache is None else (x[:, :0], x)
             rest, cache = causal_conv(self.time, rest, cache)
