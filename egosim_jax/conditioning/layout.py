@@ -111,8 +111,8 @@ class ChannelLayout:
     ) -> Float[Array, "b f h w c"]:
         """Return the channels after the noisy ones, which are the same at every denoising step.
 
-        Their dtype is the prior's, or else the hands', or else the noisy latents'. Only the shape of
-        the noisy latents is used, not their values.
+        Their dtype is the prior's, or else the hands', or else the noisy latents'. The noisy
+        latents give their shape, not their values.
         """
         found = (condition.prior, condition.hands, noisy)
         dtype = next(array.dtype for array in found if array is not None)

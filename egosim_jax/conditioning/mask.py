@@ -9,8 +9,8 @@ Wan 2.1 inpainting models use the opposite. For a mask video of the model's size
    index floor(i in / out). In space this takes every fourth pixel. In time, the release first
    repeats the last frame up to 4f + 1 frames for f latent frames, though a clip has
    4f - 3, and floor(i (4f + 1) / f) = 4i: latent frame i is decided by pixel frame 4i.
-4. Each 2 x 2 block of the remaining pixels becomes four channels, channel 2 dh + dw, so that latent cell
-   (i, j) holds the pixels (8i + 4dh, 8j + 4dw).
+4. Each 2 x 2 block of the remaining pixels becomes four channels, channel 2 dh + dw, so that
+   latent cell (i, j) holds the pixels (8i + 4dh, 8j + 4dw).
 
 The release's continuous runner omits the padding of rule 3, so that its 61 frames are selected as
 floor(61 i / 16) = 0, 3, 7, 11, 15, 19, ...; `padding="none"` reproduces it.

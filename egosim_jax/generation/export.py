@@ -98,8 +98,8 @@ def static_triplet(
 ) -> Triplet:
     """Return a triplet of DWM: a static scene, hand meshes along the action, and the ground truth.
 
-    By default the meshes are posed from the action's keypoints, left hand before right hand. Raises `InputError` if lengths or sizes disagree, or for keypoints in
-    another order.
+    By default the meshes are posed from the action's keypoints, left hand before right hand. Raises
+    `InputError` if lengths or sizes disagree, or for keypoints in another order.
     """
     cameras = action.cameras
     shape = len(cameras.world_from_camera), cameras.height, cameras.width

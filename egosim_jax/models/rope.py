@@ -34,10 +34,11 @@ def rotations_at(
 ) -> Float[Array, "n k 2"]:
     """For every token, in the order (frame, row, column), what turns each channel of a head.
 
-    `positions` are the coordinates of frames, rows and columns, and `split` is the number of
-    pairs that rotate with each. Channels x_2j and x_2j+1 have the same cosine c; their sines are -s and s, so
-    that a turned channel is its own value times the cosine plus the other's of the pair times the
-    sine. Angles are taken in float64 on the host; only one small table per axis enters the program.
+    `positions` are the coordinates of frames, rows and columns, and `split` is the number of pairs
+    that rotate with each. Channels x_2j and x_2j+1 have the same cosine c; their sines are -s and
+    s, so that a turned channel is its own value times the cosine plus the other's of the pair times
+    the sine. Angles are taken in float64 on the host; only one small table per axis enters the
+    program.
     """
     size = tuple(len(p) for p in positions)
     parts = []

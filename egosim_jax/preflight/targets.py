@@ -1,4 +1,4 @@
-"""Target machines to compile for, none of which needs to be present.
+"""Target machines to compile for; the machine need not be present.
 
 XLA's compilers for NVIDIA GPUs and for TPUs come with jax's packages and run anywhere. A TPU slice
 is given to them by its name, a GPU by the properties that its driver would report.

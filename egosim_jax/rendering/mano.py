@@ -167,11 +167,11 @@ def mano_hands(
 ) -> MovingMesh:
     """Return the meshes of a left and a right hand, in this order, in the colors of their sides.
 
-    Without a model of the left hand, its poses are read as right-hand poses, as HaMeR estimates them.
-    The right hand is posed, mirrored in x, then moved by the translation. So the global orientation is in
-    mirrored axes of the world: where HaMeR's is G and R turns its camera to the world, it is
-    (M R M) G with M = diag(-1, 1, 1). `add_mean` is for poses relative to the mean pose. Raises
-    `InputError` for another number of hands.
+    Without a model of the left hand, its poses are read as right-hand poses, as HaMeR estimates
+    them. The right hand is posed, mirrored in x, then moved by the translation. So the global
+    orientation is in mirrored axes of the world: where HaMeR's is G and R turns its camera to the
+    world, it is (M R M) G with M = diag(-1, 1, 1). `add_mean` is for poses relative to the mean
+    pose. Raises `InputError` for another number of hands.
     """
     if poses.global_orient.shape[1] != 2:
         raise InputError(

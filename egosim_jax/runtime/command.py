@@ -224,7 +224,7 @@ def _reader_ended() -> bool:
         AttributeError,
         OSError,
         ValueError,
-    ):  # closed, or replaced by an object that is not a file
+    ):  # closed, or replaced by another object
         return False
     pipe = select.poll()
     pipe.register(number, 0)

@@ -200,7 +200,7 @@ def _has_neighbor(
 
 
 def transfer_colors(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
-    """Return the colors of new points, taken from the nearest old point that they replace, if any."""
+    """Return the colors of new points, from the nearest old point that they replace, if any."""
     import open3d as o3d
 
     colors = new.colors.copy()

@@ -2,7 +2,8 @@
 
 Noisy latents of 16 channels and a condition of 17 (mask and masked video) or 33 channels (DWM:
 mask, static scene, hands) are split into patches of 1 x 2 x 2 cells. Text and video are one stream
-of tokens, text first. All tokens attend to all, padding included. The blocks are in `layers`. (Yang et al. 2024, CogVideoX; section 4.1 of DWM for the input channels.)
+of tokens, text first. All tokens attend to all, padding included. The blocks are in `layers`. (Yang
+et al. 2024, CogVideoX; section 4.1 of DWM for the input channels.)
 """
 
 from __future__ import annotations

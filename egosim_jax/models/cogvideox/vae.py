@@ -311,8 +311,8 @@ class CogVideoXVAE(nnx.Module):
 
         `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
         returns. Afterwards the latents of `encode` have a mean square of 1 in each channel, and
-        encoding then decoding gives the same video as before. Their mean stays: the decoder's first convolution
-        pads with zeros, so that no bias could replace it.
+        encoding then decoding gives the same video as before. Their mean stays: the decoder's first
+        convolution pads with zeros, so that no bias could replace it.
         """
         size = self.config.scale * jnp.sqrt(jnp.square(mean) + jnp.square(std))
         out, shift = self.encoder.conv_out, jnp.concatenate([0 * size, -2 * jnp.log(size)])

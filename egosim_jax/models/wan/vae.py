@@ -282,8 +282,8 @@ class WanVAE(nnx.Module):
         """Fold a measured latent mean and deviation into the two quantization convolutions.
 
         `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
-        returns. Afterwards the means have mean 0 and deviation 1, the log variances shrink by 2 log std, and decoding what
-        is encoded gives the same video as before.
+        returns. Afterwards the means have mean 0 and deviation 1, the log variances shrink by 2 log
+        std, and decoding what is encoded gives the same video as before.
         """
         encode, decode = self.to_moments, self.from_latents
         encode_bias, decode_bias = cast(nnx.Param, encode.bias), cast(nnx.Param, decode.bias)
