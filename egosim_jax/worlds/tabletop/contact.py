@@ -29,7 +29,7 @@ from egosim_jax.worlds.tabletop.scene import DRAWER_M, LID_DEGREES, Scene, movin
 from egosim_jax.worlds.tabletop.solids import surface_of
 from egosim_jax.worlds.tabletop.support import (
     RANKS,
-    least_opening,
+    min_opening,
     move,
     moves,
     push_aside,
@@ -215,7 +215,7 @@ def _rest(scene: Scene, body: Body) -> Scene:
     if body.shape != "lidded box":
         return scene
     beyond = scene.openings[body.name] * LID_DEGREES >= 90
-    return scene.with_opening(body.name, 1.0 if beyond else least_opening(scene, body))
+    return scene.with_opening(body.name, 1.0 if beyond else min_opening(scene, body))
 
 
 def _follow(
@@ -269,7 +269,7 @@ def _opening_at(scene: Scene, body: Body, grasp: Grasp, point_m: Float[np.ndarra
     hinge = np.array([body.size_m[1] / 2, body.size_m[2] - 0.012])
     angles = [np.arctan2(way[2] - hinge[1], hinge[0] - way[1]) for way in (held, point)]
     opening = np.degrees(angles[1] - angles[0]) / LID_DEGREES
-    return float(np.clip(opening, least_opening(scene, body), 1))
+    return float(np.clip(opening, min_opening(scene, body), 1))
 
 
 def _grasp(
@@ -359,7 +359,7 @@ def _yield_to(scene: Scene, name: str, point_m: Float[np.ndarray, " 3"]) -> Scen
         if abs(speed) < 1e-3:
             return scene
         opening = scene.openings[name] + distance / speed
-        return scene.with_opening(name, float(np.clip(opening, least_opening(scene, body), 1)))
+        return scene.with_opening(name, float(np.clip(opening, min_opening(scene, body), 1)))
     force = -normal * [1, 1, 0] / max(float(np.linalg.norm(normal[:2])), 1e-9)
     depth = -distance / max(float(np.linalg.norm(normal[:2])), 1e-9)
     center = body.world_from_body[:3, 3]

@@ -43,7 +43,7 @@ class Placed:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
+class Frame:
     """A rendering of one frame."""
 
     colors: UInt8[np.ndarray, "h w 3"]
@@ -76,15 +76,15 @@ class RayCaster:
         *,
         height: int,
         width: int,
-    ) -> Picture:
+    ) -> Frame:
         """Render from a camera. Raises `InputError` if the camera is inside an object."""
         self._refuse_inside(world_from_camera[:3, 3])
         rays = _world_rays(world_from_camera, intrinsics_px, height=height, width=width)
         middle = self._cast(world_from_camera, rays)
         depth, geometry = middle["t_hit"], middle["geometry_ids"]
-        numbers = np.array([*(item.number for item in self.placed), 0])
+        numbers = np.array([*(item.instance_id for item in self.placed), 0])
         ids = numbers[np.where(np.isfinite(depth), geometry, len(self.placed)).astype(int)]
-        return Picture(
+        return Frame(
             colors=self._colors(world_from_camera, intrinsics_px, height, width),
             depth_m=rearrange(depth, "(h w) -> h w", h=height),
             ids=rearrange(ids, "(h w) -> h w", h=height),

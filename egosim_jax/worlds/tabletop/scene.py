@@ -48,7 +48,7 @@ MIN_BODIES = 3
 MAX_BODIES = 6
 """Maximum number of bodies on a table."""
 CLOTH_COLOR = (2, 2, 2)
-"""RGB of black cloths, which no picture distinguishes from unobserved pixels of a prior."""
+"""RGB of black cloths, which no frame distinguishes from unobserved pixels of a prior."""
 CLOTH_M = (0.08, 0.30)
 """Shortest and longest side of a cloth in meters."""
 CLOTH_AREA_M = (-0.34, 0.34, 0.06, 0.52)
@@ -82,7 +82,7 @@ class Scene:
         """Return the scene with another opening of one articulated body."""
         return replace(self, openings={**self.openings, name: opening})
 
-    def number(self, name: str) -> int:
+    def instance_id(self, name: str) -> int:
         """Return the instance id of a body, or of its moving part."""
         return FIRST_BODY + 2 * [body.name for body in self.bodies].index(name)
 
@@ -90,9 +90,9 @@ class Scene:
         """Return the names of all bodies and cases by instance id."""
         found = {}
         for body in self.bodies:
-            found[self.number(body.name)] = body.name
+            found[self.instance_id(body.name)] = body.name
             if body.articulated:
-                found[self.number(body.name) + 1] = f"case of the {body.name}"
+                found[self.instance_id(body.name) + 1] = f"case of the {body.name}"
         return found
 
     def first_part_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
@@ -108,8 +108,8 @@ class Scene:
         for body in self.bodies:
             poses = [self.first_part_pose(body.name), body.world_from_body]
             for index, part in enumerate(body.parts):
-                number = self.number(body.name) + index
-                items.append(Placed(part=part, world_from_part=poses[index], number=number))
+                number = self.instance_id(body.name) + index
+                items.append(Placed(part=part, world_from_part=poses[index], instance_id=number))
         return items
 
     def free_place(
@@ -165,7 +165,7 @@ def with_cloths(scene: Scene, rng: np.random.Generator, most: int) -> Scene:
     """Return the scene with up to `most` black cloths on the table, under its bodies.
 
     In a prior they look like unobserved places, from which only the mask distinguishes them: other
-    black is either a whole body or not observed, as the picture itself shows.
+    black is either a whole body or not observed, as the frame itself shows.
     """
     if most < 0:
         raise InputError(
@@ -182,7 +182,7 @@ def with_cloths(scene: Scene, rng: np.random.Generator, most: int) -> Scene:
         pose[:3, :3] = rotation_z(rng.uniform(-np.pi, np.pi))
         pose[:2, 3] = rng.uniform(CLOTH_AREA_M[::2], CLOTH_AREA_M[1::2])
         part = Part(name="cloth", vertices_m=vertices, triangles=triangles, paint=paint)
-        cloths.append(Placed(part=part, world_from_part=pose, number=TABLE))
+        cloths.append(Placed(part=part, world_from_part=pose, instance_id=TABLE))
     return replace(scene, room=(*scene.room, *cloths))
 
 
@@ -231,7 +231,7 @@ def make_room(rng: np.random.Generator) -> tuple[Placed, ...]:
         first, second = np.clip(color, 0, 255), np.clip(color * 0.86, 0, 255)
         paint = Paint(color=_rgb(first), second=_rgb(second), pattern=pattern, scale_m=scale)
         part = Part(name=name, vertices_m=vertices, triangles=triangles, paint=paint)
-        placed.append(Placed(part=part, world_from_part=np.eye(4), number=number))
+        placed.append(Placed(part=part, world_from_part=np.eye(4), instance_id=number))
     return tuple(placed)
 
 

@@ -32,7 +32,7 @@ WALL_M, CHEST_FLOOR_M = 0.007, 0.007
 """Thickness of a chest's walls and of its floor, in meters."""
 UPRIGHT = 0.999
 """Cosine of the tilt up to which a body is upright."""
-ROUNDS = 8
+MAX_ROUNDS = 8
 """Most rounds in which bodies push each other aside."""
 RANKS = {"furniture": 3, "held": 2, "pushed": 1}
 """Ranks of bodies when they meet: the lower one moves; 0 for those at rest."""
@@ -254,7 +254,7 @@ def push_aside(scene: Scene, ranks: Mapping[str, int]) -> tuple[Scene, set[str]]
         for body in scene.bodies
     }
     moved: set[str] = set()
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         again = False
         for first, second in combinations([body.name for body in scene.bodies], 2):
             low, high = sorted((second, first), key=lambda name: ranks[name])
@@ -296,7 +296,7 @@ def settle(scene: Scene, name: str) -> Scene:
     pose[:3, :3] = stable_rotation(body)
     pose[:3, 3] = middle - pose[:3, :3] @ [0, 0, body.size_m[2] / 2]
     scene = scene.with_pose(name, pose)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         body = scene.body(name)
         for chest in scene.bodies:
             inner = inside_chest(scene, body, chest)
@@ -343,7 +343,7 @@ def _rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + cross + cross @ cross / (1 + a @ b)
 
 
-def least_opening(scene: Scene, chest: Body) -> float:
+def min_opening(scene: Scene, chest: Body) -> float:
     """Return the smallest opening of a lid that the bodies in its chest allow."""
     x, y, z = chest.size_m
     least = 0.0

@@ -45,7 +45,7 @@ def test_the_head_then_turns_away_and_back_without_hands():
 
 
 def test_a_scene_without_a_body_to_carry_has_its_scripts(monkeypatch):
-    monkeypatch.setattr(attempts, "TRIES", 0)
+    monkeypatch.setattr(attempts, "MAX_TRIES", 0)
     (clip,) = make_attempts(3, spec=SPEC)
     np.testing.assert_array_equal(clip.frames, next(make_sequence(3, spec=SPEC)).frames)
 

@@ -44,12 +44,12 @@ def test_depth_and_ids_of_a_box_against_its_slabs():
     turn = 0.7
     pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     pose[:3, 3] = [0.02, 0.3, 0]
-    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
+    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, instance_id=FIRST_BODY)])
     camera = np.eye(4)
     camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     camera[:3, 3] = [0, -0.1, 0.05]
     intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
-    image = caster.render(camera, intrinsics, height=48, width=80)
+    frame = caster.render(camera, intrinsics, height=48, width=80)
     rays = pixel_rays(intrinsics, height=48, width=80).reshape(-1, 3)
     body_from_camera = invert(pose) @ camera
     start = body_from_camera[:3, 3]
@@ -61,9 +61,9 @@ def test_depth_and_ids_of_a_box_against_its_slabs():
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
     hit = (enter <= leave) & (enter > 0)
     assert hit.sum() > 50
-    assert ((image.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
-    both = hit & np.isfinite(image.depth_m.ravel())
-    np.testing.assert_allclose(image.depth_m.ravel()[both], enter[both], rtol=1e-5)
+    assert ((frame.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
+    both = hit & np.isfinite(frame.depth_m.ravel())
+    np.testing.assert_allclose(frame.depth_m.ravel()[both], enter[both], rtol=1e-5)
 
 
 def test_a_ball_is_seen_where_its_pose_projects():
@@ -71,13 +71,13 @@ def test_a_ball_is_seen_where_its_pose_projects():
     body = make_loose("ball", "red", rng)
     pose = np.eye(4)
     pose[:3, 3] = [0.02, 0.3, 0]
-    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
+    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, instance_id=FIRST_BODY)])
     camera = np.eye(4)
     camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     camera[:3, 3] = [0.02, -0.1, body.size_m[2] / 2]
     intrinsics = np.array([[160.0, 0, 79.5], [0, 160.0, 47.5], [0, 0, 1]])
-    image = caster.render(camera, intrinsics, height=96, width=160)
-    rows, columns = np.nonzero(image.ids == FIRST_BODY)
+    frame = caster.render(camera, intrinsics, height=96, width=160)
+    rows, columns = np.nonzero(frame.ids == FIRST_BODY)
     center = pose @ [0, 0, body.size_m[2] / 2, 1]
     u, v = project(intrinsics, transform(invert(camera), center[None, :3]))
     assert abs(columns.mean() - u[0]) < 0.5
@@ -209,7 +209,9 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one():
 
 def test_a_camera_inside_an_object_is_refused():
     body = make_loose("box", "red", np.random.default_rng(0))
-    caster = RayCaster([Placed(part=body.parts[0], world_from_part=np.eye(4), number=FIRST_BODY)])
+    caster = RayCaster(
+        [Placed(part=body.parts[0], world_from_part=np.eye(4), instance_id=FIRST_BODY)]
+    )
     camera = np.eye(4)
     camera[2, 3] = body.size_m[2] / 2
     intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
