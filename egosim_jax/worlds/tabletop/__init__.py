@@ -15,9 +15,9 @@ Clips (`clips`)
     TabletopClip: clip with ground truth; to_triplet, to_action, to_episode, to_ground_truth:
     conversions; state_after: a state moved by the ground-truth motion
 
-Other modules: `dataset` makes shards, `attempts` makes clips in which hands may fail, `policies` has
-policies with faults, `hand_motion` plans hands, `contact` and `support` move bodies, `bodies`,
-`hands` and `solids` have the geometry, `raycast` renders.
+Other modules: `dataset` makes shards; `attempts` makes clips in which hands may fail; `policies`
+has policies with faults; `hand_motion` plans hands; `contact` and `support` move bodies; `bodies`,
+`hands` and `solids` have the geometry; `raycast` renders.
 """
 
 from egosim_jax.worlds.tabletop.clips import (

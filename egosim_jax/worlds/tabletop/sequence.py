@@ -112,7 +112,7 @@ def make_scripts(
 ) -> Iterator[Script]:
     """Yield the scripts of the clips that `make_sequence` renders."""
     rng, scene, eye, sway = _begin(seed, kind, black_cloths)
-    if variant:  # a generator of its own: the scene and the cameras above stay the same
+    if variant:  # a separate generator: the scene and the cameras stay the same
         rng = np.random.default_rng([seed, 0 if kind == "human" else 1, 2, variant])
     hands: tuple[Hand, ...] = ()
     for number in range(clips):

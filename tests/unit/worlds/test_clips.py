@@ -1,4 +1,4 @@
-"""Static twins of tabletop clips show the scene of the first frame, and the hands' meshes."""
+"""Static priors of tabletop clips show the scene of the first frame, and the hands' meshes."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_conditions_of_dwm_are_observed_everywhere(clips):
 
 
 @pytest.mark.slow
-def test_shards_hold_static_twins(tmp_path):
+def test_shards_hold_static_priors(tmp_path):
     small = VideoSpec(frames=5, height=32, width=48)
     config = DatasetConfig(
         seeds=(5,), clips=1, spec=small, kind="human", prior="static", hands="mesh"

@@ -1,4 +1,4 @@
-"""Policies fail in the true world as their faults say."""
+"""Policies with large faults fail in the true world."""
 
 from itertools import count, islice
 

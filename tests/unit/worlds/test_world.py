@@ -269,7 +269,7 @@ def test_an_executed_clip_has_its_ground_truth(cameras):
 
 
 def differences(seeds, kind: Kind, frames=17):
-    """Return for scripts the largest and the last distance of the target, and that of others."""
+    """Return per script the target's maximum and last error, and the maximum error of others."""
     found = []
     for seed in seeds:
         rng = np.random.default_rng([seed, 0 if kind == "human" else 1])
