@@ -6,7 +6,7 @@ edge y = 0. The origin of a body is the center of its underside.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -51,11 +51,11 @@ class Paint:
 
     color: tuple[int, int, int]
     """RGB of the texture."""
-    second: tuple[int, int, int]
-    """RGB of the pattern."""
-    pattern: Pattern
+    second: tuple[int, int, int] = (0, 0, 0)
+    """RGB of the pattern; a plain paint does not use it."""
+    pattern: Pattern = "plain"
     """Alternation between both colors."""
-    scale_m: float
+    scale_m: float = 0.03
     """Period of the pattern in meters."""
 
     def at(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -257,7 +257,7 @@ def build_loose(
 ) -> Body:
     """Return a loose body at the origin; `size` is its extent along x, y and z in meters."""
     vertices, triangles = split_edges(*_outline(shape, size))
-    paint = Paint(color=COLORS[color], second=darker(COLORS[color]), pattern=pattern, scale_m=0.03)
+    paint = Paint(color=COLORS[color], second=darker(COLORS[color]), pattern=pattern)
     part = Part(
         name=shape, vertices_m=vertices, triangles=triangles, paint=paint, smooth=shape != "box"
     )
@@ -289,16 +289,13 @@ def make_drawer(color: str) -> Body:
         box((right - 0.004, -y + 0.002, low), (right, y - 0.012, high - 0.02)),
         box((-0.02, -y - 0.026, height / 2 - 0.006), (0.02, -y - 0.006, height / 2 + 0.006)),
     )
-    body, second = COLORS[color], darker(COLORS[color])
-    plain = Paint(color=body, second=second, pattern="plain", scale_m=0.05)
-    light = replace(plain, color=(205, 190, 165))
     return Body(
         name=f"{color} cabinet",
         shape="drawer",
         size_m=(width, depth, height),
         parts=(
-            Part(name="drawer", vertices_m=tray[0], triangles=tray[1], paint=light),
-            Part(name="case", vertices_m=case[0], triangles=case[1], paint=plain),
+            _plain_part("drawer", tray, (205, 190, 165)),
+            _plain_part("case", case, COLORS[color]),
         ),
         world_from_body=np.eye(4),
     )
@@ -319,20 +316,19 @@ def make_lidded_box(color: str) -> Body:
         box((-x, -y, height + 0.001), (x, y, height + lid)),
         box((-0.018, -y - 0.014, height + 0.002), (0.018, -y, height + lid - 0.001)),
     )
-    body, second = COLORS[color], darker(COLORS[color])
-    plain = Paint(color=second, second=body, pattern="plain", scale_m=0.05)
     return Body(
         name=f"{color} chest",
         shape="lidded box",
         size_m=(width, depth, height + lid),
         parts=(
-            Part(
-                name="lid",
-                vertices_m=cover[0],
-                triangles=cover[1],
-                paint=replace(plain, color=body),
-            ),
-            Part(name="case", vertices_m=case[0], triangles=case[1], paint=plain),
+            _plain_part("lid", cover, COLORS[color]),
+            _plain_part("case", case, darker(COLORS[color])),
         ),
         world_from_body=np.eye(4),
     )
+
+
+def _plain_part(
+    name: str, shape: tuple[np.ndarray, np.ndarray], color: tuple[int, int, int]
+) -> Part:
+    return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=Paint(color=color))

@@ -112,17 +112,14 @@ def render_clip(
     bare: bool = False,
 ) -> TabletopClip:
     """Render a clip of the scenes and arms of its frames; `bare` without arms and target."""
-    rendered, joints, paints = [], [], {}
-    for scene, present, pose in zip(scenes, arms, cameras.world_from_camera, strict=True):
-        placed = place(scene, present)
-        joints.append(
-            [np.full((JOINTS[kind], 3), np.nan) if arm is None else arm[0] for arm in present]
-        )
-        paints |= paints_of(placed)
-        if bare:
-            hidden = scene.instance_id(target)
-            placed = [x for x in placed if x.instance_id < FIRST_HAND and x.instance_id != hidden]
-        rendered.append(_render(RayCaster(placed), pose, cameras))
+    if bare:
+        rendered = render_scenes(scenes, cameras, without=target)
+    else:
+        rendered = render_scenes(scenes, cameras, arms=arms)
+    missing = np.full((JOINTS[kind], 3), np.nan)
+    paints = {}
+    for scene, present in zip(scenes, arms, strict=True):
+        paints |= paints_of(place(scene, present))
     first, state = first_view(scenes[0], cameras)
     bodies = scenes[0].bodies
     return TabletopClip(
@@ -136,7 +133,7 @@ def render_clip(
         frames=np.stack([frame.colors for frame in rendered]),
         depth_m=np.stack([frame.depth_m for frame in rendered]),
         ids=np.stack([frame.ids for frame in rendered]),
-        joints_m=np.array(joints),
+        joints_m=np.array([[arm[0] if arm else missing for arm in present] for present in arms]),
         sides=sides,
         scene=scenes[0],
         world_from_body={
@@ -161,10 +158,11 @@ def render_scenes(
     """Render the scenes and arms of some frames, optionally `without` one body."""
     hidden = None if without is None else scenes[0].instance_id(without)
     rendered = []
-    for index, (scene, pose) in enumerate(zip(scenes, cameras.world_from_camera, strict=True)):
-        placed = place(scene, () if arms is None else arms[index])
-        caster = RayCaster([item for item in placed if item.instance_id != hidden])
-        rendered.append(_render(caster, pose, cameras))
+    for scene, present, pose in zip(
+        scenes, arms or [()] * len(scenes), cameras.world_from_camera, strict=True
+    ):
+        placed = [item for item in place(scene, present) if item.instance_id != hidden]
+        rendered.append(_render(RayCaster(placed), pose, cameras))
     return rendered
 
 

@@ -281,8 +281,8 @@ def _grasp(
     for body in contact.scene.bodies:
         last_tip, last_middle = _distances(contact.scene, body, before_m)
         tip, middle = _distances(contact.scene, body, after_m)
-        # Fingers stop about their radius away from a surface. A hand that touches a body and gets no
-        # nearer therefore holds it too.
+        # Fingers stop about their radius away from a surface: a hand that touches a body and gets
+        # no nearer holds it too.
         firm = tip <= FIRM_M or (last_tip <= PAD_M and tip >= last_tip)
         # A hand that just released the body and moves away does not grasp it again.
         firm &= (hand, body.name) not in contact.released or middle <= last_middle

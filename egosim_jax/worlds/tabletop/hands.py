@@ -162,11 +162,9 @@ def hand_meshes(
         arm = join(
             _limb(wrist - 0.02 * along, knuckle, 0.026, 0.026), _limb(wrist, elbow_m, 0.027, 0.034)
         )
-        enamel = Paint(color=ENAMEL, second=ENAMEL, pattern="plain", scale_m=0.1)
-        rubber = Paint(color=RUBBER, second=RUBBER, pattern="plain", scale_m=0.1)
         return (
-            _part("gripper", join(*fingers), rubber),
-            _part("wrist", join(palm, arm), enamel),
+            _part("gripper", join(*fingers), RUBBER),
+            _part("wrist", join(palm, arm), ENAMEL),
         )
     radii = np.array([0.026, 0.016, 0.0125, 0.0115, 0.0095] + [0.0105, 0.0095, 0.0085, 0.0075] * 4)
     pieces = [
@@ -184,15 +182,14 @@ def hand_meshes(
     towards = (elbow_m - wrist) / np.linalg.norm(elbow_m - wrist)
     cuff = wrist + 0.07 * towards
     pieces += [_limb(wrist, cuff, 0.023, 0.025)]
-    skin = Paint(color=SKIN, second=SKIN, pattern="plain", scale_m=0.1)
-    sleeve = Paint(color=SLEEVE, second=(58, 72, 92), pattern="plain", scale_m=0.1)
     return (
-        _part("hand", join(*pieces), skin),
-        _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), sleeve),
+        _part("hand", join(*pieces), SKIN),
+        _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), SLEEVE),
     )
 
 
-def _part(name: str, shape: tuple[np.ndarray, np.ndarray], paint: Paint) -> Part:
+def _part(name: str, shape: tuple[np.ndarray, np.ndarray], color: tuple[int, int, int]) -> Part:
+    paint = Paint(color=color)
     return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=paint, smooth=True)
 
 

@@ -173,7 +173,7 @@ def with_cloths(scene: Scene, rng: np.random.Generator, max_cloths: int) -> Scen
             f"{max_cloths} cloths cannot be put on a table: the number must be at least 0. "
             "(--black-cloths)"
         )
-    paint = Paint(color=CLOTH_COLOR, second=CLOTH_COLOR, pattern="plain", scale_m=1.0)
+    paint = Paint(color=CLOTH_COLOR)
     cloths = []
     for number in range(rng.integers(max_cloths + 1)):
         x, y = rng.uniform(*CLOTH_M, 2) / 2

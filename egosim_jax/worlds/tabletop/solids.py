@@ -95,13 +95,11 @@ def solids_of(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, 
         return (
             Solid(form="box", size_m=front, origin_m=(0.0, -y / 2 - 0.002, 0.011)),
             Solid(
-                form="box",
-                size_m=handle,
-                origin_m=(0.0, -y / 2 - 0.016, z / 2 - 0.006),
-                handle=True,
+                form="box", size_m=handle,
+                origin_m=(0.0, -y / 2 - 0.016, z / 2 - 0.006), handle=True,
             ),
             Solid(form="box", size_m=size_m, part=1),
-        )
+        )  # fmt: skip
     if shape == "lidded box":
         lid = LID_M
         return (

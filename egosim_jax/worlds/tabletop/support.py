@@ -82,23 +82,18 @@ def footprints(scene: Scene, body: Body) -> list[Footprint]:
 
 
 def _footprint(body: Body) -> Footprint:
-    low, high = bottom_and_top(body)
-    pose = body.world_from_body
-    if body.shape != "box" and abs(pose[2, 2]) > UPRIGHT:
-        return Footprint(
-            corners_m=pose[None, :2, 3], radius_m=body.size_m[0] / 2, low_m=low, high_m=high
-        )
-    if body.shape == "ball":
-        center = transform(pose, np.array([[0, 0, body.size_m[0] / 2]]))
-        return Footprint(
-            corners_m=center[:, :2], radius_m=body.size_m[0] / 2, low_m=low, high_m=high
-        )
     from scipy.spatial import ConvexHull
 
-    flat = transform(pose, body.parts[0].vertices_m)[:, :2]
-    return Footprint(
-        corners_m=flat[ConvexHull(flat).vertices], radius_m=0.0, low_m=low, high_m=high
-    )
+    low, high = bottom_and_top(body)
+    pose, radius = body.world_from_body, body.size_m[0] / 2
+    if body.shape != "box" and abs(pose[2, 2]) > UPRIGHT:
+        corners = pose[None, :2, 3]
+    elif body.shape == "ball":
+        corners = transform(pose, np.array([[0, 0, radius]]))[:, :2]
+    else:
+        flat, radius = transform(pose, body.parts[0].vertices_m)[:, :2], 0.0
+        corners = flat[ConvexHull(flat).vertices]
+    return Footprint(corners_m=corners, radius_m=radius, low_m=low, high_m=high)
 
 
 def _box_footprint(solid: Solid, pose: np.ndarray) -> Footprint:
