@@ -41,15 +41,16 @@ def make_attempts(
     back, without hands. If no variant of the scene carries a body, the clips are the scripted ones
     of `make_sequence`.
     """
-    world = {"spec": spec, "kind": kind, "black_cloths": black_cloths}
-    script = _carrying(seed, **world)
+    settings = {"spec": spec, "kind": kind, "black_cloths": black_cloths}
+    script = _carrying(seed, **settings)
     if script is None:
-        yield from make_sequence(seed, clips=clips, **world)
+        yield from make_sequence(seed, clips=clips, **settings)
         return
     rng = np.random.default_rng([seed, 0 if kind == "human" else 1, 4])
     joints = POLICIES[int(rng.integers(len(POLICIES)))].plan(script, rng)
     angle = float(np.radians(rng.choice([-1, 1]) * rng.uniform(*TURN_DEGREES)))
-    cameras, prompt, true = script.cameras, script.caption, World(scene=script.scene, seed=seed)
+    cameras, prompt = script.cameras, script.caption
+    true_world = World(scene=script.scene, seed=seed)
     view = replace(cameras, world_from_camera=cameras.world_from_camera[-1:])
     for number in range(clips):
         if number:
@@ -57,7 +58,7 @@ def make_attempts(
             cameras, prompt = turn_camera(view, first, last, spec.frames), LOOK_AROUND_PROMPT
             joints = np.full_like(joints, np.nan)
         action = Action(cameras=cameras, joints_m=joints, kind=kind, prompt=prompt)
-        clip, true = true.execute(action)
+        clip, true_world = true_world.execute(action)
         yield clip
 
 
@@ -73,10 +74,8 @@ def turn_camera(cameras: Cameras, first: float, last: float, frames: int) -> Cam
 
 def _carrying(seed: int, *, spec: VideoSpec, kind: Kind, black_cloths: int | None) -> Script | None:
     """Return the first variant of a scene's script that carries a body, or None."""
-    for k in range(MAX_TRIES):
-        script = next(
-            make_scripts(seed, spec=spec, kind=kind, black_cloths=black_cloths, variant=k)
-        )
-        if script.intent.verb == "carry":
-            return script
-    return None
+    scripts = (
+        next(make_scripts(seed, spec=spec, kind=kind, black_cloths=black_cloths, variant=variant))
+        for variant in range(MAX_TRIES)
+    )
+    return next((script for script in scripts if script.intent.verb == "carry"), None)

@@ -155,21 +155,23 @@ def make_shards(
     parts = out / "parts"
     open_folder(out, config if states is true_states else {"dataset": config, "states": states})
     if (out / MANIFEST).exists():
-        have = read_manifest(out).grid
-        if have != grid:
+        found = read_manifest(out).grid
+        if found != grid:
             raise InputError(
                 f"{quote_path(out)} holds clips for another latent grid: it must be {grid}, not "
-                f"{have}. Choose another folder. (--out)"
+                f"{found}. Choose another folder. (--out)"
             )
-        shutil.rmtree(parts, ignore_errors=True)  # a run may end between gather and this removal
+        # A run may have been killed after it wrote the manifest and before it removed the parts.
+        shutil.rmtree(parts, ignore_errors=True)
         yield from config.seeds
         return
     parts.mkdir(exist_ok=True)
+    # Clips are written in order: the last part of a scene shows that the scene is complete.
     missing = [seed for seed in config.seeds if not _part(parts, seed, config.clips - 1).exists()]
     yield from (seed for seed in config.seeds if seed not in missing)
     calls = [(config, seed, parts, states) for seed in missing]
-    for number, _ in run_in_processes(_make, calls, workers=workers):
-        yield missing[number]
+    for index, _ in run_in_processes(_make, calls, workers=workers):
+        yield missing[index]
     _gather(config, grid, parts, out)
 
 
@@ -193,12 +195,7 @@ def _gather(config: DatasetConfig, grid: VideoGrid, parts: Path, out: Path) -> N
     }  # fmt: skip
     complete = parts / "shards"
     with ShardWriter(
-        complete,
-        kind="frames",
-        spec=config.spec,
-        grid=grid,
-        provenance=provenance,
-        overwrite=True,
+        complete, kind="frames", spec=config.spec, grid=grid, provenance=provenance, overwrite=True
     ) as writer:
         for path in (_part(parts, s, n) for s in config.seeds for n in range(config.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)

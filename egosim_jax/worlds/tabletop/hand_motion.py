@@ -45,10 +45,10 @@ NEAR_M = 0.26
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """The configuration of a hand at one moment."""
+    """Configuration of a hand at one moment."""
 
     point_m: Float[np.ndarray, " 3"]
-    """Point between the grasping fingertips in meters."""
+    """Pinch point in meters."""
     yaw: float
     """Rotation about the vertical in radians; 0 points away from the wearer."""
     pitch: float
@@ -246,7 +246,7 @@ def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
         return Grip(point_m=point, yaw=0.0, pitch=np.radians(40), closure=closure_for(kind, 0.016))
     width, offset = body.size_m[0], np.zeros(3)
     height = 0.62 * body.size_m[2]
-    if body.shape == "ring":  # it is grasped by its near rim
+    if body.shape == "ring":  # the hand grasps its near rim
         width, offset = body.size_m[2], np.array([0, -(body.size_m[0] - body.size_m[2]) / 2, 0])
     if body.shape == "cone":
         height, width = 0.45 * body.size_m[2], 0.55 * width
@@ -305,6 +305,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
     start, grasp = hand.grip, grip_on(scene, intent, kind, hand.side)
     body, wide = scene.body(intent.name), opened(kind)
     above = replace(_shift(grasp, [0, -0.02, 0.03]), closure=wide)
+    # A farther target takes longer to reach, so that no reach is much faster than others.
     reach = 0.10 + 0.6 * min(0.4, float(np.linalg.norm(start.point_m - grasp.point_m)))
     begin, end = reach + 0.10, 0.76
     first = scene.openings.get(intent.name, 0.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from einops import rearrange, reduce
@@ -64,10 +65,8 @@ class RayCaster:
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         for item in self.placed:
             vertices = transform(item.world_from_part, item.part.vertices_m)
-            self.scene.add_triangles(
-                o3d.core.Tensor(vertices.astype(np.float32)),
-                o3d.core.Tensor(item.part.triangles.astype(np.uint32)),
-            )
+            triangles = item.part.triangles.astype(np.uint32)
+            self.scene.add_triangles(_tensor(vertices.astype(np.float32)), _tensor(triangles))
 
     def render(
         self,
@@ -92,10 +91,8 @@ class RayCaster:
 
     def _refuse_inside(self, eye_m: np.ndarray) -> None:
         """Raise `InputError` if a ray from the camera crosses surfaces an odd number of times."""
-        import open3d as o3d
-
         ray = np.concatenate([eye_m, [0, 0, 1]]).astype(np.float32)[None]
-        if self.scene.count_intersections(o3d.core.Tensor(ray), nthreads=1).item() % 2:
+        if self.scene.count_intersections(_tensor(ray), nthreads=1).item() % 2:
             place = ", ".join(f"{value:.3f}" for value in eye_m)
             raise InputError(
                 f"The camera at ({place}) m is inside an object; it must be outside all objects. "
@@ -144,19 +141,20 @@ class RayCaster:
     def _shadowed(
         self, points: Float32[np.ndarray, "n 3"], sun: Float32[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " n"]:
-        import open3d as o3d
-
         rays = np.concatenate([points, np.broadcast_to(sun, points.shape)], axis=1)
-        return self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
+        return self.scene.test_occlusions(_tensor(rays), nthreads=1).numpy()
 
     def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
         """Cast rays from the camera, in one thread: clips are made in parallel processes."""
-        import open3d as o3d
-
         eye = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
-        both = o3d.core.Tensor(np.concatenate([eye, rays], axis=1))
-        hits = self.scene.cast_rays(both, nthreads=1)
+        hits = self.scene.cast_rays(_tensor(np.concatenate([eye, rays], axis=1)), nthreads=1)
         return {name: tensor.numpy() for name, tensor in hits.items()}
+
+
+def _tensor(values: np.ndarray) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor(values)
 
 
 def _world_rays(

@@ -25,7 +25,7 @@ FIELD_OF_VIEW = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Script:
-    """One scripted clip before it is rendered."""
+    """One scripted clip, not rendered."""
 
     intent: Intent
     """Action of the clip and its target."""

@@ -253,7 +253,7 @@ def push_aside(scene: Scene, ranks: Mapping[str, int]) -> tuple[Scene, set[str]]
                 continue
             moved |= {low, *riders(scene, low)}
             scene = shift(scene, low, found)
-            ranks[low] = max(ranks[low], RANKS["pushed"])
+            ranks[low] = max(ranks[low], RANKS["pushed"])  # it now pushes bodies at rest
             again = True
         if not again:
             break
@@ -264,6 +264,7 @@ def _apart(scene: Scene, low: str, high: str) -> Float[np.ndarray, " 2"] | None:
     """Return the motion in meters that separates the body `low` from `high`; None if apart."""
     body, other = scene.body(low), scene.body(high)
     gap = np.linalg.norm((body.world_from_body - other.world_from_body)[:2, 3])
+    # Bounding circles skip the exact test of bodies far apart.
     if gap > sum(np.hypot(*b.size_m[:2]) / 2 + 0.1 * b.articulated for b in (body, other)) + 0.1:
         return None
     inner = inside_chest(scene, body, other) if other.articulated else None
