@@ -82,8 +82,6 @@ def footprints(scene: Scene, body: Body) -> list[Footprint]:
 
 
 def _footprint(body: Body) -> Footprint:
-    from scipy.spatial import ConvexHull
-
     low, high = bottom_and_top(body)
     pose, radius = body.world_from_body, body.size_m[0] / 2
     if body.shape != "box" and abs(pose[2, 2]) > UPRIGHT:
@@ -91,6 +89,8 @@ def _footprint(body: Body) -> Footprint:
     elif body.shape == "ball":
         corners = transform(pose, np.array([[0, 0, radius]]))[:, :2]
     else:
+        from scipy.spatial import ConvexHull
+
         flat, radius = transform(pose, body.parts[0].vertices_m)[:, :2], 0.0
         corners = flat[ConvexHull(flat).vertices]
     return Footprint(corners_m=corners, radius_m=radius, low_m=low, high_m=high)
