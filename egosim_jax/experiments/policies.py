@@ -101,7 +101,7 @@ class Task:
         pose[:3, 3] = np.asarray(script.intent.goal_m)
         arms = self.last_arms(action)
         there = render_scenes([self._with(pose)] * LAST_FRAMES, last, arms=arms)
-        goal = np.stack([picture.ids == number for picture in there])
+        goal = np.stack([frame.ids == number for frame in there])
         bare = render_scenes([script.scene] * LAST_FRAMES, last, without=name)
         background = np.stack([frame.colors for frame in bare])
         paints = paints_of(place(script.scene, arms[-1]))
