@@ -39,8 +39,8 @@ from egosim_jax.worlds.tabletop import (
     to_action,
     to_episode,
 )
-from egosim_jax.worlds.tabletop.attempts import LOOKING, turn
-from egosim_jax.worlds.tabletop.clips import film_scenes
+from egosim_jax.worlds.tabletop.attempts import LOOK_AROUND_PROMPT, turn_camera
+from egosim_jax.worlds.tabletop.clips import render_scenes
 
 CASES = ("seen", "unseen")
 """Moves in view, and moves while the wearer looks elsewhere."""
@@ -192,7 +192,7 @@ def _away(script: Script) -> float | None:
         [moment.scene.body(script.intent.name).world_from_body[:3, 3] for moment in script.moments]
     )
     for sign in (1.0, -1.0):
-        turned = turn(script.cameras, 0.0, sign * np.radians(AWAY_DEGREES), len(places))
+        turned = turn_camera(script.cameras, 0.0, sign * np.radians(AWAY_DEGREES), len(places))
         local = transform(invert(turned.world_from_camera[-1]), places)
         angles = np.degrees(np.arctan2(np.abs(local[:, 0]), local[:, 2]))
         if angles.min() > OUTSIDE_DEGREES:
@@ -211,13 +211,17 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
     if case == "seen":
         poses = script.cameras.world_from_camera[-1:]
         view, hands = replace(script.cameras, world_from_camera=poses), [joints, missing, missing]
-        cameras = [script.cameras, turn(view, 0.0, angle, frames), turn(view, angle, 0.0, frames)]
-        prompts = [prompt, LOOKING, LOOKING]
+        cameras = [
+            script.cameras,
+            turn_camera(view, 0.0, angle, frames),
+            turn_camera(view, angle, 0.0, frames),
+        ]
+        prompts = [prompt, LOOK_AROUND_PROMPT, LOOK_AROUND_PROMPT]
     else:
         view, hands = script.cameras, [missing, joints, missing]
         ends = ((0.0, angle), (angle, angle), (angle, 0.0))
-        cameras = [turn(view, first, last, frames) for first, last in ends]
-        prompts = [LOOKING] * 3
+        cameras = [turn_camera(view, first, last, frames) for first, last in ends]
+        prompts = [LOOK_AROUND_PROMPT] * 3
     world, clips = World(scene=script.scene, seed=seed), []
     for path, joint, text in zip(cameras, hands, prompts, strict=True):
         action = Action(cameras=path, joints_m=missing, kind=script.kind, prompt=text)
@@ -225,16 +229,16 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
         clips.append(clip)
     target, last = script.intent.name, cameras[-1]
     back = replace(last, world_from_camera=last.world_from_camera[-FRAMES_BACK:])
-    number = script.scene.number(target)
+    number = script.scene.instance_id(target)
     return Story(
         seed=seed,
         clips=tuple(clips),
         target=target,
         before=np.stack(
-            [image.ids == number for image in film_scenes([script.scene] * FRAMES_BACK, back)]
+            [frame.ids == number for frame in render_scenes([script.scene] * FRAMES_BACK, back)]
         ),
         background=np.stack(
-            [p.colors for p in film_scenes([world.scene] * FRAMES_BACK, back, without=target)]
+            [p.colors for p in render_scenes([world.scene] * FRAMES_BACK, back, without=target)]
         ),
     )
 

@@ -28,9 +28,9 @@ from egosim_jax.runtime.progress import track
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Cameras, Clip, SceneState, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Scene, Script, World, make_scripts
-from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, film_scenes, paints_of, place
-from egosim_jax.worlds.tabletop.policies import POLICIES, WITHIN_M, error_m, succeeded
-from egosim_jax.worlds.tabletop.world import arms_of, sides_of
+from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, paints_of, place, render_scenes
+from egosim_jax.worlds.tabletop.policies import MAX_ERROR_M, POLICIES, goal_error_m, succeeded
+from egosim_jax.worlds.tabletop.world import arms_of
 
 SHEET_SCENES = 2
 """Scenes on the contact sheet."""
@@ -85,7 +85,7 @@ class Task:
     def outcome(self, world_from_body: np.ndarray) -> dict[str, float]:
         """Return success and distance to the goal in meters of the object at a pose."""
         moved = self._with(world_from_body).body(self.script.intent.name)
-        error = error_m(moved, np.asarray(self.script.intent.goal_m))
+        error = goal_error_m(moved, np.asarray(self.script.intent.goal_m))
         return {"success": float(succeeded(error)), "error_m": error[0]}
 
     def outcome_seen(
@@ -96,27 +96,29 @@ class Task:
         An object that is not shown, or hidden by the hand where it should be, has no distance.
         """
         script, name, pose = self.script, self.script.intent.name, np.eye(4)
-        number, last = script.scene.number(name), self.last_cameras
+        number, last = script.scene.instance_id(name), self.last_cameras
         pose[:3, :3] = script.scene.body(name).world_from_body[:3, :3]
         pose[:3, 3] = np.asarray(script.intent.goal_m)
         arms = self.last_arms(action)
-        there = film_scenes([self._with(pose)] * LAST_FRAMES, last, arms=arms)
-        goal = np.stack([image.ids == number for image in there])
-        bare = film_scenes([script.scene] * LAST_FRAMES, last, without=name)
-        background = np.stack([image.colors for image in bare])
+        there = render_scenes([self._with(pose)] * LAST_FRAMES, last, arms=arms)
+        goal = np.stack([frame.ids == number for frame in there])
+        bare = render_scenes([script.scene] * LAST_FRAMES, last, without=name)
+        background = np.stack([frame.colors for frame in bare])
         paints = paints_of(place(script.scene, arms[-1]))
         errors = region.centroid_errors(region.find(number, frames, background, paints), goal)
         if not len(errors):
             return {"success": 0.0}
-        depth = np.median(np.stack([image.depth_m for image in there])[goal])
+        depth = np.median(np.stack([frame.depth_m for frame in there])[goal])
         error = float(np.median(errors) * depth / last.intrinsics_px[0, 0])
-        return {"success": float(error <= WITHIN_M[0]), "error_m": error}
+        return {"success": float(error <= MAX_ERROR_M[0]), "error_m": error}
 
     def last_frames(self, action: Action) -> UInt8[np.ndarray, "f h w 3"]:
         """Return the last frames of the ground truth of an action."""
         scenes, _ = World(scene=self.script.scene).move(action)
-        images = film_scenes(scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action))
-        return np.stack([image.colors for image in images])
+        rendered = render_scenes(
+            scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action)
+        )
+        return np.stack([frame.colors for frame in rendered])
 
     @property
     def last_cameras(self) -> Cameras:
@@ -127,7 +129,7 @@ class Task:
     def last_arms(self, action: Action) -> list[list[Arm | None]]:
         """Return joints and meshes of the hands in the last frames."""
         joints = action.joints_m[-LAST_FRAMES:]
-        return arms_of(joints, action.kind, sides_of(joints, action.kind))
+        return arms_of(joints, action.kind)
 
     def _with(self, world_from_body: np.ndarray) -> Scene:
         return self.script.scene.with_pose(self.script.intent.name, world_from_body)
@@ -243,7 +245,7 @@ def _perceived(task: Task, videos: Videos, *, perceive: Perception, fps: int) ->
 def _pose_in(state: SceneState, script: Script) -> np.ndarray:
     """Return the pose of the carried object in a state: its first one, moved as perceived."""
     name = script.intent.name
-    moved = state.world_from_object.get(script.scene.number(name), np.eye(4))
+    moved = state.world_from_object.get(script.scene.instance_id(name), np.eye(4))
     return moved @ script.scene.body(name).world_from_body
 
 

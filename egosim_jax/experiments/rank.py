@@ -19,7 +19,6 @@ from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
-from egosim_jax.worlds.tabletop.twins import with_conditions
 
 MEASURES = {"top1": ("top-1 %", "{:.1f}"), "spearman": ("Spearman", "{:.3f}")}
 DEFINITIONS = {
@@ -87,7 +86,8 @@ def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
 
 
 def _triplet(clip: TabletopClip, generator: Generator) -> Triplet:
-    return with_conditions(clip, to_triplet(clip), *conditions_of(generator.config))
+    prior, hands = conditions_of(generator.config)
+    return to_triplet(clip, prior=prior, hands=hands)
 
 
 def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
@@ -99,11 +99,11 @@ def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
 
     def different() -> Iterator[int]:
         seen: set[str] = set()
-        for action in range(MAX_TRIES):
-            caption = next(make_sequence(seed, spec=small, action=action)).caption
+        for variant in range(MAX_TRIES):
+            caption = next(make_sequence(seed, spec=small, variant=variant)).caption
             if caption not in seen:
                 seen.add(caption)
-                yield action
+                yield variant
 
     found = list(islice(different(), number))
     if len(found) < number:
@@ -111,7 +111,7 @@ def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
             f"Scene {seed} has {len(found)} different actions, not {number}: ask for fewer. "
             "(--candidates)"
         )
-    return [next(make_sequence(seed, spec=spec, action=action)) for action in found]
+    return [next(make_sequence(seed, spec=spec, variant=variant)) for variant in found]
 
 
 def _summary(goals: Sequence[dict], method: str) -> dict[str, dict[str, float]]:

@@ -16,8 +16,8 @@ from egosim_jax.evaluation.metrics.report import score
 from egosim_jax.generation.generator import Generator, batches
 from egosim_jax.types import Kind, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
+from egosim_jax.worlds.tabletop.clips import HandsName, PriorName
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
-from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
 
 DroppedCondition = Literal["prior", "mask", "hands"]
 MEASURES = {
@@ -79,7 +79,7 @@ class HeldOutClip:
             fixed_camera=fixed_camera,
         )
         clip, bare = next(scene()), next(scene(bare=True))
-        return cls(clip, with_conditions(clip, to_triplet(clip), prior, hands), bare.frames)
+        return cls(clip, to_triplet(clip, prior=prior, hands=hands), bare.frames)
 
     def evaluate(self, video: np.ndarray) -> dict[str, float]:
         """Return every measure of a video of this clip."""

@@ -12,7 +12,7 @@ from egosim_jax.geometry import invert, project, transform
 from egosim_jax.interactive.play.moves import first_goal
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop import opening
+from egosim_jax.worlds.tabletop import start_of_sequence
 from tests.browser import browse, playing
 
 SEED = 0
@@ -41,7 +41,7 @@ def test_the_denoising_steps_are_those_that_are_given(monkeypatch):
 
 def pixels_of_places():
     """Columns and rows, in the clip, of the suggested object and of the place that it is for."""
-    scene, camera, *_ = opening(SEED, spec=VIDEO)
+    scene, camera, *_ = start_of_sequence(SEED, spec=VIDEO)
     name, goal = first_goal(scene, "right")
     body = scene.body(name)
     assert name.startswith("red")

@@ -12,7 +12,7 @@ from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.perception import registry
 from egosim_jax.simulation.simulator import Simulator, VideoGenerator
 from egosim_jax.types import VideoSpec, check_seed
-from egosim_jax.worlds.tabletop import opening
+from egosim_jax.worlds.tabletop import start_of_sequence
 
 
 @runtime_checkable
@@ -83,7 +83,7 @@ class GeneratedWorld:
 def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
     """Return the start of a seed's scene in the tabletop world."""
     check_seed(seed, name="seed")
-    _, camera, first, state = opening(seed, spec=video, kind=spec.kind)
+    _, camera, first, state = start_of_sequence(seed, spec=video, kind=spec.kind)
     name = next(iter(state.names.values()))
     who = "The gripper" if spec.kind == "robot" else f"The {spec.sides[0]} hand"
     return Start(

@@ -31,7 +31,7 @@ from egosim_jax.types import (
     VideoSpec,
     View,
 )
-from egosim_jax.worlds.tabletop import TabletopClip, World, opening, to_ground_truth
+from egosim_jax.worlds.tabletop import TabletopClip, World, start_of_sequence, to_ground_truth
 
 REMEMBERED = 256
 """Last used worlds that are kept, so that an episode is not executed from its start each time."""
@@ -85,7 +85,7 @@ class TrueWorld:
             keys.append(key)
         known, world = self._last_known(keys)
         if world is None:
-            scene = opening(start.seed, spec=self.video, kind=kind)[0]
+            scene = start_of_sequence(start.seed, spec=self.video, kind=kind)[0]
             world = World(scene=scene, seed=start.seed)
         for action in start.past[known:]:
             world = world.move(action, joints_m=places_of(action))[1]

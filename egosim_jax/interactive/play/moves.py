@@ -144,7 +144,7 @@ def intent_of(
 def remembered(scene: Scene, state: SceneState) -> Scene:
     """Return a first scene with its bodies where a state remembers them."""
     for body in scene.bodies:
-        motion = state.world_from_object.get(scene.number(body.name))
+        motion = state.world_from_object.get(scene.instance_id(body.name))
         if motion is None:
             continue
         part = motion @ scene.first_part_pose(body.name)

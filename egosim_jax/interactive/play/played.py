@@ -26,10 +26,10 @@ from egosim_jax.interactive.play.moves import Pose, first_goal, ready, remembere
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import Action, Cameras, InputError, SceneState
-from egosim_jax.worlds.tabletop import Scene, World, opening
-from egosim_jax.worlds.tabletop.clips import film_scenes
+from egosim_jax.worlds.tabletop import Scene, World, start_of_sequence
+from egosim_jax.worlds.tabletop.clips import render_scenes
 from egosim_jax.worlds.tabletop.hands import Side
-from egosim_jax.worlds.tabletop.world import arms_of, sides_of
+from egosim_jax.worlds.tabletop.world import arms_of
 
 Frames = UInt8[np.ndarray, "f h w 3"]
 Filmed = tuple[World, Frames]
@@ -227,12 +227,12 @@ def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
     own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
     if not own or start.state.step:
         return None
-    return opening(start.seed, spec=world.video)[0]
+    return start_of_sequence(start.seed, spec=world.video)[0]
 
 
 def _film(before: Future[Filmed], action: Action) -> Filmed:
     """Execute an action in the true world, and film it."""
     scenes, world = before.result()[0].move(action)
-    arms = arms_of(action.joints_m, action.kind, sides_of(action.joints_m, action.kind))
-    pictures = film_scenes(scenes, action.cameras, arms=arms)
-    return world, np.stack([picture.colors for picture in pictures])
+    arms = arms_of(action.joints_m, action.kind)
+    rendered = render_scenes(scenes, action.cameras, arms=arms)
+    return world, np.stack([frame.colors for frame in rendered])

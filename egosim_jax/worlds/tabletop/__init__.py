@@ -1,36 +1,41 @@
 """The tabletop world: a table with a few objects, and hands or a gripper that manipulate one.
 
-All ground truth is exact: frames are ray cast, and joints, poses, depth and ids come from the
-same geometry. A seed gives a sequence of clips; the first frame of each clip is the last frame of
-the clip before.
+Its scenes, hands, physics, renderings and datasets belong here. All ground truth is exact: frames
+are ray cast, and joints, poses, depth and ids come from the same geometry.
+
+Sequences of a seed (`sequence`)
+    make_sequence: rendered clips with ground truth; make_scripts: the same clips, not rendered;
+    Script: one of them; start_of_sequence: first scene, camera, frame and state
+Any action (`world`)
+    World: executes actions
+Scenes (`scene`, `scene_spec`)
+    Scene: all bodies and their poses; sample_scene: a random one; Object, make_scene: your own;
+    read_scene, write_scene: scenes as JSON
+Clips (`clips`)
+    TabletopClip: clip with ground truth; to_triplet, to_action, to_episode, to_ground_truth:
+    conversions; state_after: a state moved by the ground-truth motion
+
+Other modules: `dataset` makes shards; `attempts` makes clips in which hands may fail; `policies`
+has policies with faults; `hand_motion` plans hands; `contact` and `support` move bodies; `bodies`,
+`hands` and `solids` have the geometry; `raycast` renders.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-
-from egosim_jax.geometry import look_at
-from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec
-from egosim_jax.worlds.tabletop import hand_motion
 from egosim_jax.worlds.tabletop.clips import (
     TabletopClip,
-    film,
-    first_view,
-    provenance,
     state_after,
     to_action,
     to_episode,
     to_ground_truth,
     to_triplet,
 )
-from egosim_jax.worlds.tabletop.described import Object, make_scene, read_scene, write_scene
-from egosim_jax.worlds.tabletop.hand_motion import Hand, Intent, Moment
-from egosim_jax.worlds.tabletop.raycast import Picture
-from egosim_jax.worlds.tabletop.scene import Scene, sample_scene, with_cloths
+from egosim_jax.worlds.tabletop.scene import Scene, sample_scene
+from egosim_jax.worlds.tabletop.scene_spec import Object, make_scene, read_scene, write_scene
+from egosim_jax.worlds.tabletop.sequence import (
+    Script,
+    make_scripts,
+    make_sequence,
+    start_of_sequence,
+)
 from egosim_jax.worlds.tabletop.world import World
 
 __all__ = [
@@ -42,9 +47,9 @@ __all__ = [
     "make_scene",
     "make_scripts",
     "make_sequence",
-    "opening",
     "read_scene",
     "sample_scene",
+    "start_of_sequence",
     "state_after",
     "to_action",
     "to_episode",
@@ -52,159 +57,3 @@ __all__ = [
     "to_triplet",
     "write_scene",
 ]
-
-FIELD_OF_VIEW = 60.0
-"""Horizontal field of view in degrees."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Script:
-    """One scripted clip before it is rendered."""
-
-    intent: Intent
-    """Action of the clip and its target."""
-    moments: list[Moment]
-    """Scene and hands at every frame."""
-    cameras: Cameras
-    """Camera of every frame."""
-    kind: Kind
-    """Human hands or a robot gripper."""
-    caption: str
-    """Prompt that describes the action."""
-
-    @property
-    def scene(self) -> Scene:
-        """Scene before the clip."""
-        return self.moments[0].scene
-
-    @property
-    def action(self) -> Action:
-        """Action of the clip, to be executed in its scene."""
-        joints = [
-            [hand.grip.pose(self.kind, hand.side)[0] for hand in moment.hands]
-            for moment in self.moments
-        ]
-        return Action(
-            cameras=self.cameras, joints_m=np.array(joints), kind=self.kind, prompt=self.caption
-        )
-
-
-def make_sequence(
-    seed: int,
-    *,
-    spec: VideoSpec,
-    clips: int = 1,
-    kind: Kind = "human",
-    bare: bool = False,
-    black_cloths: int | None = None,
-    fixed_camera: bool = False,
-    action: int = 0,
-) -> Iterator[TabletopClip]:
-    """Yield the clips of a seed, each `spec.frames` long; a robot has one gripper.
-
-    Equal seeds give equal clips at equal sizes, and the same events at any size. `bare` renders the
-    same clips without hands and manipulated body, which gives their background. `black_cloths` is
-    the most that lie on the table; they change nothing else. A `fixed_camera` stays where it is in
-    the first frame. Each number of the `action` gives other events in the same scene, under the
-    same cameras.
-    """
-    scripts = make_scripts(
-        seed,
-        spec=spec,
-        clips=clips,
-        kind=kind,
-        black_cloths=black_cloths,
-        fixed_camera=fixed_camera,
-        action=action,
-    )
-    for number, script in enumerate(scripts):
-        yield film(
-            [moment.scene for moment in script.moments],
-            [[hand_motion.hand_parts(hand, kind) for hand in m.hands] for m in script.moments],
-            script.cameras,
-            sides=tuple(hand.side for hand in script.moments[0].hands),
-            kind=kind,
-            seed=seed,
-            number=number,
-            verb=script.intent.verb,
-            target=script.intent.name,
-            caption=script.caption,
-            bare=bare,
-        )
-
-
-def make_scripts(
-    seed: int,
-    *,
-    spec: VideoSpec,
-    clips: int = 1,
-    kind: Kind = "human",
-    black_cloths: int | None = None,
-    fixed_camera: bool = False,
-    action: int = 0,
-) -> Iterator[Script]:
-    """Yield the scripts of the clips of `make_sequence`."""
-    rng, scene, eye, sway = _begin(seed, kind, black_cloths)
-    if action:
-        rng = np.random.default_rng([seed, 0 if kind == "human" else 1, 2, action])
-    hands: tuple[Hand, ...] = ()
-    for number in range(clips):
-        intent = hand_motion.choose(scene, rng, hand=hands[0] if hands else None)
-        if not hands:
-            hands = (hand_motion.start_hand(scene, intent, kind, rng),)
-            if kind == "human" and rng.random() < 0.35:
-                hands = (*hands, hand_motion.waiting_hand(hands[0].side, rng))
-        moments = hand_motion.act(scene, hands, intent, kind, frames=spec.frames)
-        times = number + np.linspace(0, 1, spec.frames)
-        cameras = _cameras(0 * times if fixed_camera else times, eye, sway, spec)
-        who = f"The {hands[0].side} hand" if kind == "human" else "The gripper"
-        yield Script(
-            intent=intent,
-            moments=moments,
-            cameras=cameras,
-            kind=kind,
-            caption=f"{who} {intent.caption}",
-        )
-        scene, hands = moments[-1].scene, moments[-1].hands
-
-
-def opening(
-    seed: int, *, spec: VideoSpec, kind: Kind = "human"
-) -> tuple[Scene, Cameras, Picture, SceneState]:
-    """Return scene, camera, first frame without hands and state of a seed's first clip."""
-    _, scene, eye, sway = _begin(seed, kind, None)
-    cameras = _cameras(np.zeros(1), eye, sway, spec)
-    first, state = first_view(scene, cameras)
-    return scene, cameras, first, replace(state, provenance=provenance(seed))
-
-
-def _begin(
-    seed: int, kind: Kind, black_cloths: int | None
-) -> tuple[np.random.Generator, Scene, np.ndarray, tuple[Any, Any]]:
-    """Return generator of random numbers, scene, eye and sway of the head of a seed."""
-    stream = 0 if kind == "human" else 1
-    rng = np.random.default_rng([seed, stream])
-    scene = sample_scene(rng)
-    if black_cloths is not None:
-        scene = with_cloths(scene, np.random.default_rng([seed, stream, 1]), black_cloths)
-    sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
-    eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
-    return rng, scene, eye, sway
-
-
-def _cameras(times: np.ndarray, eye: np.ndarray, sway: tuple[Any, Any], spec: VideoSpec) -> Cameras:
-    """Return cameras of a head that sways while it looks at the middle of the table."""
-    phases, rates = sway
-    swing = np.sin(phases + 2 * np.pi * 0.45 * rates * times[:, None])
-    eyes = eye + swing[:, :3] * [0.04, 0.02, 0.02]
-    targets = np.array([0.0, 0.275, 0.03]) + swing[:, 3:] * [0.04, 0.025, 0.01]
-    up = np.array([0.0, 0.0, 1.0])
-    poses = [look_at(a, b, up=up) for a, b in zip(eyes, targets, strict=True)]
-    focal = spec.width / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2))
-    middle = (spec.width - 1) / 2, (spec.height - 1) / 2
-    return Cameras(
-        world_from_camera=np.stack(poses),
-        intrinsics_px=np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]),
-        height=spec.height,
-        width=spec.width,
-    )

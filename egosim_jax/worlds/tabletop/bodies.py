@@ -6,7 +6,7 @@ edge y = 0. The origin of a body is the center of its underside.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -28,17 +28,19 @@ COLORS = {
     "white": (226, 224, 216),
     "black": (16, 16, 17),
 }
-"""RGB by the color name in captions."""
+"""RGB by color name in captions."""
 STATIC_COLOR = "black"
 """Color of bodies that are never manipulated.
 
-In a prior they look like unobserved pixels, so that only the mask distinguishes them; and a black
-body could not be segmented by its color.
+Perception cannot segment black by color, and in a prior only the mask distinguishes black from
+unobserved pixels.
 """
 TABLE_SIZE_M = (1.3, 0.62, 0.03)
 """Extent of the table top in meters."""
 REACH_M = (-0.20, 0.20, 0.15, 0.37)
 """Minimum and maximum x, then y, of placed bodies in meters: within view and reach."""
+LID_M = 0.012
+"""Thickness of a chest's lid in meters; its hinge is at the far upper edge of the case."""
 
 Pattern = Literal["plain", "stripes", "checks", "grain"]
 
@@ -49,11 +51,11 @@ class Paint:
 
     color: tuple[int, int, int]
     """RGB of the texture."""
-    second: tuple[int, int, int]
-    """RGB of the pattern."""
-    pattern: Pattern
+    second: tuple[int, int, int] = (0, 0, 0)
+    """RGB of the pattern; a plain paint does not use it."""
+    pattern: Pattern = "plain"
     """Alternation between both colors."""
-    scale_m: float
+    scale_m: float = 0.03
     """Period of the pattern in meters."""
 
     def at(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -112,7 +114,7 @@ class Body:
     size_m: tuple[float, float, float]
     """Extent along the axes of its local frame in meters."""
     parts: tuple[Part, ...]
-    """Rigid parts; the first one moves when the body is opened or carried."""
+    """Rigid parts; only the first one moves when the body is opened."""
     world_from_body: Float[np.ndarray, "4 4"]
     """Pose in the world."""
 
@@ -143,7 +145,7 @@ def box(
     if (extent <= 0).any():
         raise InputError(
             f"The box from {low} to {high} is empty: each coordinate of the second corner must "
-            "exceed that of the first."
+            "exceed the same coordinate of the first."
         )
     vertices, triangles = mesh("box", width=extent[0], height=extent[1], depth=extent[2])
     return vertices + np.array(low), triangles
@@ -162,7 +164,8 @@ def split_edges(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Duplicate vertices along edges sharper than 50 degrees.
 
-    Vertex normals, which are means over the triangles of a vertex, then keep those edges sharp.
+    A vertex normal is a mean over the triangles of the vertex, so a shared vertex would shade a
+    sharp edge as a round one.
     """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -202,34 +205,32 @@ def _outline(shape: Shape, size: tuple[float, float, float]) -> tuple[np.ndarray
         return vertices + [0, 0, tube], triangles
     if shape == "cone":
         return mesh("cone", radius=radius, height=z, resolution=40)
-    wall = 0.006
-    outside, sides = mesh("cylinder", radius=radius, height=z, resolution=40, split=1)
-    solid = outside + [0, 0, z / 2], sides
-    if shape == "cylinder":
-        return solid
-    # A cup is a cylinder whose upper end is a dark disc a little lower than its rim.
-    return _tube(radius, radius - wall, z)
+    if shape == "cup":
+        return _cup(radius, z)
+    vertices, triangles = mesh("cylinder", radius=radius, height=z, resolution=40, split=1)
+    return vertices + [0, 0, z / 2], triangles  # Open3D centers a cylinder on its origin
 
 
-def _tube(outer: float, inner: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+def _cup(outer: float, height: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mesh of a cup: a cylinder that is open at the top."""
     angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
-    floor = 0.006
+    wall = floor = 0.006
+    inner = outer - wall
     rings = [(outer, 0.0), (outer, height), (inner, height), (inner, floor)]
     vertices = np.concatenate([circle * r + [0, 0, z] for r, z in rings] + [[[0, 0, floor]]])
-    count, here = len(angles), np.arange(len(angles))
-    after = (here + 1) % count
+    count, start = len(angles), np.arange(len(angles))
+    end = (start + 1) % count
     faces = []
     for ring in range(3):
-        a, b = here + ring * count, after + ring * count
+        a, b = start + ring * count, end + ring * count
         faces += [np.stack([a, b, b + count], 1), np.stack([a, b + count, a + count], 1)]
-    faces.append(np.stack([here + 3 * count, after + 3 * count, np.full(count, 4 * count)], 1))
+    faces.append(np.stack([start + 3 * count, end + 3 * count, np.full(count, 4 * count)], 1))
     return vertices, np.concatenate(faces)
 
 
 def darker(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Return 58 % of a color's brightness."""
+    """Return a color at 58 % of its brightness."""
     red, green, blue = (int(0.58 * value) for value in color)
     return red, green, blue
 
@@ -256,8 +257,7 @@ def build_loose(
 ) -> Body:
     """Return a loose body at the origin; `size` is its extent along x, y and z in meters."""
     vertices, triangles = split_edges(*_outline(shape, size))
-    second = darker(COLORS[color])
-    paint = Paint(color=COLORS[color], second=second, pattern=pattern, scale_m=0.03)
+    paint = Paint(color=COLORS[color], second=darker(COLORS[color]), pattern=pattern)
     part = Part(
         name=shape, vertices_m=vertices, triangles=triangles, paint=paint, smooth=shape != "box"
     )
@@ -289,16 +289,13 @@ def make_drawer(color: str) -> Body:
         box((right - 0.004, -y + 0.002, low), (right, y - 0.012, high - 0.02)),
         box((-0.02, -y - 0.026, height / 2 - 0.006), (0.02, -y - 0.006, height / 2 + 0.006)),
     )
-    body, second = COLORS[color], darker(COLORS[color])
-    plain = Paint(color=body, second=second, pattern="plain", scale_m=0.05)
-    light = replace(plain, color=(205, 190, 165))
     return Body(
         name=f"{color} cabinet",
         shape="drawer",
         size_m=(width, depth, height),
         parts=(
-            Part(name="drawer", vertices_m=tray[0], triangles=tray[1], paint=light),
-            Part(name="case", vertices_m=case[0], triangles=case[1], paint=plain),
+            _plain_part("drawer", tray, (205, 190, 165)),
+            _plain_part("case", case, COLORS[color]),
         ),
         world_from_body=np.eye(4),
     )
@@ -306,7 +303,7 @@ def make_drawer(color: str) -> Body:
 
 def make_lidded_box(color: str) -> Body:
     """Return a box whose lid rotates about its far upper edge."""
-    width, depth, height, wall, lid = 0.13, 0.10, 0.06, 0.007, 0.012
+    width, depth, height, wall, lid = 0.13, 0.10, 0.06, 0.007, LID_M
     x, y = width / 2, depth / 2
     case = join(
         box((-x, -y, 0), (x, y, wall)),
@@ -319,20 +316,19 @@ def make_lidded_box(color: str) -> Body:
         box((-x, -y, height + 0.001), (x, y, height + lid)),
         box((-0.018, -y - 0.014, height + 0.002), (0.018, -y, height + lid - 0.001)),
     )
-    body, second = COLORS[color], darker(COLORS[color])
-    plain = Paint(color=second, second=body, pattern="plain", scale_m=0.05)
     return Body(
         name=f"{color} chest",
         shape="lidded box",
         size_m=(width, depth, height + lid),
         parts=(
-            Part(
-                name="lid",
-                vertices_m=cover[0],
-                triangles=cover[1],
-                paint=replace(plain, color=body),
-            ),
-            Part(name="case", vertices_m=case[0], triangles=case[1], paint=plain),
+            _plain_part("lid", cover, COLORS[color]),
+            _plain_part("case", case, darker(COLORS[color])),
         ),
         world_from_body=np.eye(4),
     )
+
+
+def _plain_part(
+    name: str, shape: tuple[np.ndarray, np.ndarray], color: tuple[int, int, int]
+) -> Part:
+    return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=Paint(color=color))

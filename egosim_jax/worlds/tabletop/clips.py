@@ -1,10 +1,15 @@
-"""Clips of the tabletop world: rendering with complete ground truth, and conversions."""
+"""Clips of the tabletop world: rendering with complete ground truth, and conversions.
+
+`to_triplet` renders the conditions of EgoSim (points of a state, skeletons) or of DWM (a static
+video, hand meshes). The static video is ray cast from the same geometry along the same cameras as
+the clip, so the two differ only by what the hands do and hide.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import no_type_check
+from typing import Literal, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -12,6 +17,9 @@ from jaxtyping import Float, Float32, Int, UInt8
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
+from egosim_jax.rendering.hand_mesh import pose_hands
+from egosim_jax.rendering.mesh import hand_mask
+from egosim_jax.rendering.mesh_reference import draw_mesh
 from egosim_jax.rendering.reference import draw_hands, render
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import (
@@ -19,6 +27,7 @@ from egosim_jax.types import (
     Action,
     Cameras,
     GroundTruth,
+    InputError,
     Kind,
     SceneState,
     Triplet,
@@ -26,16 +35,21 @@ from egosim_jax.types import (
 )
 from egosim_jax.worlds.tabletop.bodies import Part
 from egosim_jax.worlds.tabletop.hands import Side
-from egosim_jax.worlds.tabletop.raycast import Picture, Placed, RayCaster
+from egosim_jax.worlds.tabletop.raycast import Frame, Placed, RayCaster
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene
 
 POINTS_PER_PIXEL = 2
-"""Points of a clip's first state along each side of a pixel of its first frame."""
+"""Points along each side of a first-frame pixel, in the state of a clip."""
 POINT_PX = 2
-"""Size in pixels at which the points of a state are rendered."""
+"""Rendered size of the points of a state in pixels."""
+
+PriorName = Literal["state", "static"]
+"""Rendering of the scene: points of a state, or the scene as it was in the first frame."""
+HandsName = Literal["skeleton", "mesh", "mask"]
+"""Rendering of the hands: skeletons, shaded meshes, or the binary mask of the meshes."""
 
 Arm = tuple[Float[np.ndarray, "j 3"], tuple[Part, ...]]
-"""Joints of a hand in the world in meters, and the meshes of hand and forearm."""
+"""World joints of a hand in meters, and the meshes of hand and forearm."""
 
 
 @no_type_check
@@ -50,9 +64,9 @@ class TabletopClip:
     kind: Kind
     """Human hands or a robot gripper."""
     verb: str
-    """Action of the clip, such as "carry"; "execute" where any action was executed."""
+    """Verb of the script, such as "carry"; "execute" for a clip of `World.execute`."""
     target: str
-    """Name of the manipulated body; empty if none was."""
+    """Name of the manipulated body; empty if no body was manipulated."""
     caption: str
     """Prompt that describes the action."""
     cameras: Cameras
@@ -68,22 +82,22 @@ class TabletopClip:
     sides: tuple[Side, ...]
     """Side of each hand."""
     scene: Scene
-    """Arrangement of all bodies in the first frame."""
+    """Scene in the first frame."""
     world_from_body: Mapping[str, Float[np.ndarray, "f 4 4"]]
-    """Pose of every body in every frame; for an articulated body, of its moving part."""
+    """Pose of every body, or of its moving part if it is articulated, in every frame."""
     body_ids: Mapping[str, int]
     """Instance id in `ids` of every body or moving part."""
     parts: Mapping[str, Part]
     """Mesh of every body or moving part, in its own coordinates."""
     paints: Mapping[int, tuple[int, int, int]]
     """Unshaded RGB color by instance id."""
-    first: Picture
+    first: Frame
     """First frame without hands."""
     state: SceneState
-    """Points visible in the first frame without hands; a moving part and its case have own ids."""
+    """Points visible in the first frame without hands; moving part and case have separate ids."""
 
 
-def film(
+def render_clip(
     scenes: Sequence[Scene],
     arms: Sequence[Sequence[Arm | None]],
     cameras: Cameras,
@@ -98,17 +112,14 @@ def film(
     bare: bool = False,
 ) -> TabletopClip:
     """Render a clip of the scenes and arms of its frames; `bare` without arms and target."""
-    pictures, joints, paints = [], [], {}
-    for scene, here, pose in zip(scenes, arms, cameras.world_from_camera, strict=True):
-        placed = place(scene, here)
-        joints.append(
-            [np.full((JOINTS[kind], 3), np.nan) if arm is None else arm[0] for arm in here]
-        )
-        paints |= paints_of(placed)
-        if bare:
-            hidden = scene.number(target)
-            placed = [x for x in placed if x.number < FIRST_HAND and x.number != hidden]
-        pictures.append(_render(RayCaster(placed), pose, cameras))
+    if bare:
+        rendered = render_scenes(scenes, cameras, without=target)
+    else:
+        rendered = render_scenes(scenes, cameras, arms=arms)
+    missing = np.full((JOINTS[kind], 3), np.nan)
+    paints = {}
+    for scene, present in zip(scenes, arms, strict=True):
+        paints |= paints_of(place(scene, present))
     first, state = first_view(scenes[0], cameras)
     bodies = scenes[0].bodies
     return TabletopClip(
@@ -119,17 +130,17 @@ def film(
         target=target,
         caption=caption,
         cameras=cameras,
-        frames=np.stack([picture.colors for picture in pictures]),
-        depth_m=np.stack([picture.depth_m for picture in pictures]),
-        ids=np.stack([picture.ids for picture in pictures]),
-        joints_m=np.array(joints),
+        frames=np.stack([frame.colors for frame in rendered]),
+        depth_m=np.stack([frame.depth_m for frame in rendered]),
+        ids=np.stack([frame.ids for frame in rendered]),
+        joints_m=np.array([[arm[0] if arm else missing for arm in present] for present in arms]),
         sides=sides,
         scene=scenes[0],
         world_from_body={
             body.name: np.stack([scene.first_part_pose(body.name) for scene in scenes])
             for body in bodies
         },
-        body_ids={body.name: scenes[0].number(body.name) for body in bodies},
+        body_ids={body.name: scenes[0].instance_id(body.name) for body in bodies},
         parts={body.name: body.parts[0] for body in bodies},
         paints=paints,
         first=first,
@@ -137,35 +148,36 @@ def film(
     )
 
 
-def film_scenes(
+def render_scenes(
     scenes: Sequence[Scene],
     cameras: Cameras,
     *,
     arms: Sequence[Sequence[Arm | None]] | None = None,
     without: str | None = None,
-) -> list[Picture]:
-    """Render the scenes and arms of some frames, `without` one of the bodies."""
-    hidden = None if without is None else scenes[0].number(without)
-    pictures = []
-    for index, (scene, pose) in enumerate(zip(scenes, cameras.world_from_camera, strict=True)):
-        placed = place(scene, () if arms is None else arms[index])
-        caster = RayCaster([item for item in placed if item.number != hidden])
-        pictures.append(_render(caster, pose, cameras))
-    return pictures
+) -> list[Frame]:
+    """Render the scenes and arms of some frames, optionally `without` one body."""
+    hidden = None if without is None else scenes[0].instance_id(without)
+    rendered = []
+    for scene, present, pose in zip(
+        scenes, arms or [()] * len(scenes), cameras.world_from_camera, strict=True
+    ):
+        placed = [item for item in place(scene, present) if item.instance_id != hidden]
+        rendered.append(_render(RayCaster(placed), pose, cameras))
+    return rendered
 
 
 def place(scene: Scene, arms: Sequence[Arm | None]) -> list[Placed]:
-    """Return every part of a scene and of arms, which are in the world, with its pose and id."""
+    """Return every part of the scene and the arms with its pose and id; arms are in world frame."""
     return scene.placed() + [
-        Placed(part=part, world_from_part=np.eye(4), number=FIRST_HAND + 2 * index + k)
+        Placed(part=part, world_from_part=np.eye(4), instance_id=FIRST_HAND + 2 * index + k)
         for index, arm in enumerate(arms)
         for k, part in enumerate(arm[1] if arm else ())
     ]
 
 
 def paints_of(placed: Sequence[Placed]) -> dict[int, tuple[int, int, int]]:
-    """Return the unshaded RGB color of parts by instance id."""
-    return {item.number: item.part.paint.color for item in placed}
+    """Return the unshaded RGB colors of parts by instance id."""
+    return {item.instance_id: item.part.paint.color for item in placed}
 
 
 def provenance(seed: int) -> dict[str, str]:
@@ -173,12 +185,12 @@ def provenance(seed: int) -> dict[str, str]:
     return {"world": "tabletop", "seed": str(seed)}
 
 
-def _render(caster: RayCaster, pose: np.ndarray, cameras: Cameras) -> Picture:
+def _render(caster: RayCaster, pose: np.ndarray, cameras: Cameras) -> Frame:
     return caster.render(pose, cameras.intrinsics_px, height=cameras.height, width=cameras.width)
 
 
-def first_view(scene: Scene, cameras: Cameras) -> tuple[Picture, SceneState]:
-    """Render the first frame without hands, and unproject a finer rendering of it to points."""
+def first_view(scene: Scene, cameras: Cameras) -> tuple[Frame, SceneState]:
+    """Render the first frame without hands, and unproject a finer rendering to points."""
     caster, pose = RayCaster(scene.placed()), cameras.world_from_camera[0]
     first = _render(caster, pose, cameras)
     intrinsics = upsample_intrinsics(cameras.intrinsics_px, POINTS_PER_PIXEL)
@@ -208,33 +220,64 @@ def state_after(clip: TabletopClip, state: SceneState) -> SceneState:
     return replace(state, points_m=points, step=clip.number + 1)
 
 
-def to_triplet(clip: TabletopClip, state: SceneState | None = None) -> Triplet:
-    """Return the clip in EgoSim's format: prior and mask rendered from a state, hands as skeletons.
+def to_triplet(
+    clip: TabletopClip,
+    state: SceneState | None = None,
+    *,
+    prior: PriorName = "state",
+    hands: HandsName = "skeleton",
+) -> Triplet:
+    """Return the clip in EgoSim's format, with a rendering of the scene and of the hands.
 
     By default the state is the clip's own and the first frame is ray cast. A given state, such as
-    one carried over from the clip before in the closed loop, also renders the first frame, holes
-    included. Hands and objects may leave the view. Raises `InputError` if the first frame shows no
-    point.
+    the updated state of the clip before, also renders the first frame, holes included. A `static`
+    prior is observed everywhere: its mask is 0. Hands and objects may leave the view. Raises
+    `InputError` if the first frame shows no point, or for the mesh of a gripper.
     """
+    # A static prior does not need this view, but every prior refuses a clip without points.
     view = render(state or clip.state, clip.cameras, point_px=POINT_PX)
-    hands, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
-    name = f"tabletop_{clip.kind}_{clip.seed}_{clip.number}"
+    frames, mask = view.frames, view.mask
+    first = clip.first.colors if state is None else frames[0]
+    if prior == "static":
+        frames, mask = static_video(clip), np.zeros_like(mask)
+        first = frames[0]
+    if hands == "skeleton":
+        drawn, _ = draw_hands(clip.joints_m, clip.cameras, kind=clip.kind)
+    else:
+        drawn = hand_video(clip)
     return Triplet(
-        video_id=name,
+        video_id=f"tabletop_{clip.kind}_{clip.seed}_{clip.number}",
         prompt=clip.caption,
-        prior=view.frames,
-        mask=view.mask,
-        hands=hands,
-        first_frame=clip.first.colors if state is None else view.frames[0],
+        prior=frames,
+        mask=mask,
+        hands=hand_mask(drawn) if hands == "mask" else drawn,
+        first_frame=first,
         target=clip.frames,
         extra={"verb": clip.verb, "target": clip.target, "kind": clip.kind},
     )
 
 
-def to_action(clip: TabletopClip) -> Action:
-    """Return cameras, hand joints and prompt of the clip; hands that are never in view are missing.
+def static_video(clip: TabletopClip) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return the scene as it was in the clip's first frame, along its cameras, without hands."""
+    caster = RayCaster(clip.scene.placed())
+    poses = clip.cameras.world_from_camera
+    return np.stack([_render(caster, pose, clip.cameras).colors for pose in poses])
 
-    They are known to the true world only.
+
+def hand_video(clip: TabletopClip) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return the shaded meshes of the clip's hands on black. Raises `InputError` for grippers."""
+    if clip.kind != "human":
+        raise InputError(
+            f"The clip of seed {clip.seed} has hands of kind {clip.kind}, which have no mesh: only "
+            "human hands have. (--kind, --hands)"
+        )
+    return draw_mesh(pose_hands(clip.joints_m, sides=clip.sides), clip.cameras)[0]
+
+
+def to_action(clip: TabletopClip) -> Action:
+    """Return the cameras, hand joints and prompt of the clip, without hands that are never in view.
+
+    An action has no hand that its cameras do not see; `World.execute` takes such joints separately.
     """
     seen = np.asarray(near_view(clip.cameras, clip.joints_m).any(axis=0))[:, None, None]
     joints = clip.joints_m if seen.all() else np.where(seen, clip.joints_m, np.nan)
@@ -263,7 +306,8 @@ def to_episode(clips: Sequence[TabletopClip], *, fps: int) -> Episode:
 
 
 def to_ground_truth(clip: TabletopClip) -> Observation:
-    """Return the ground truth of a clip, in the form that perception gives it."""
+    """Return the ground truth of a clip, in the form of a perception result."""
+    # Hands have ids from 100 in renderings, and -1, -2, ... in an observation.
     ids = np.where(clip.ids >= FIRST_HAND, FIRST_HAND - 1 - clip.ids, clip.ids)
     return Observation(
         cameras=clip.cameras,

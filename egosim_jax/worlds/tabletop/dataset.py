@@ -1,4 +1,4 @@
-"""Datasets of the tabletop world: shards rendered in parallel, resumable scene by scene."""
+"""Datasets of the tabletop world: shards rendered in parallel, resumable per scene."""
 
 from __future__ import annotations
 
@@ -28,12 +28,18 @@ from egosim_jax.types import (
     VideoSpec,
     check_seed,
 )
-from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.attempts import make_attempts
-from egosim_jax.worlds.tabletop.twins import HandsName, PriorName, with_conditions
+from egosim_jax.worlds.tabletop.clips import (
+    HandsName,
+    PriorName,
+    TabletopClip,
+    state_after,
+    to_triplet,
+)
+from egosim_jax.worlds.tabletop.sequence import make_sequence
 
 States = Callable[[Sequence[TabletopClip]], Iterable[SceneState | None]]
-"""States that the priors of a sequence's clips are rendered from; None: the clip's own state."""
+"""Function from a sequence's clips to the states of their priors; None: the clip's own state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,21 +49,21 @@ class DatasetConfig:
     seeds: tuple[int, ...]
     """Seeds of the scenes."""
     clips: int
-    """Consecutive clips of each scene; all after the first start from the state of the last one."""
+    """Consecutive clips of each scene; each starts from the state after the clip before."""
     spec: VideoSpec
     """Length and size of the clips."""
     kind: Kind | Literal["mixed"]
     """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
     black_cloths: int | None = None
-    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    """Maximum number of black cloths on a table, which look like holes of a prior; None: 0."""
     attempts: float | None = None
-    """Share of the scenes in which a policy may fail and the head turns (`attempts.py`)."""
+    """Fraction of the scenes in which a policy may fail and the head turns (`attempts.py`)."""
     prior: PriorName = "state"
-    """Rendering of the scene: points of the state, or `static`, ray cast as it was at the start."""
+    """Rendering of the scene: points of the state, or the ray-cast scene of the first frame."""
     hands: HandsName = "skeleton"
     """Rendering of the hands: skeletons, shaded meshes, or the meshes' binary mask."""
     fixed_camera: bool | None = None
-    """True: the camera stays where it is in the first frame."""
+    """True: the camera keeps its pose of the first frame."""
 
     def kind_of(self, seed: int) -> Kind:
         """Return the kind of hands of a scene."""
@@ -92,12 +98,12 @@ class DatasetConfig:
         check_seed(min(self.seeds))
         if self.attempts is not None and not 0 <= self.attempts <= 1:
             raise InputError(
-                f"{self.attempts:g} is no share of the scenes: it must be between 0 and 1. "
+                f"{self.attempts:g} is not a fraction of the scenes: it must be between 0 and 1. "
                 "(--attempts)"
             )
         if self.attempts and self.fixed_camera:
             raise InputError(
-                "In attempts the head turns, which a fixed camera excludes: omit one of them. "
+                "A camera cannot be fixed in attempts, where the head turns: omit one of the two. "
                 "(--attempts, --fixed-camera)"
             )
         if self.hands != "skeleton" and self.kind != "human":
@@ -118,12 +124,12 @@ def write_scenes(
 ) -> Path:
     """Write the first clip of each seed as files in EgoSim's layout; return their metadata.csv."""
     clips = (next(make_sequence(seed, spec=spec, kind=kind)) for seed in seeds)
-    triplets = (with_conditions(clip, to_triplet(clip), prior, hands) for clip in clips)
+    triplets = (to_triplet(clip, prior=prior, hands=hands) for clip in clips)
     return write_clips(folder, triplets, fps=spec.fps)
 
 
 def true_states(clips: Sequence[TabletopClip]) -> Iterator[SceneState | None]:
-    """Yield the state of the first clip, then that state with its objects moved as they were."""
+    """Yield None for the first clip, then its state with the ground-truth motion of its objects."""
     state = None
     for clip in clips:
         yield state
@@ -140,29 +146,32 @@ def make_shards(
 ) -> Iterator[int]:
     """Write the shards of a dataset; yield each seed when its scene is done.
 
-    Finished scenes are kept in `out`/parts, so that the same call resumes an interrupted one.
-    The manifest names the latent `grid`, which the clips must fit. `states`, other than the default
-    a dataclass, which worker processes can be sent, is a part of the dataset's settings.
+    Finished scenes are stored in `out`/parts: the same call resumes an interrupted one. The
+    manifest records the latent `grid`, which the clips must fit. `states` is a part of the
+    dataset's settings. Pass a dataclass, which can be sent to worker processes. Raises `InputError`
+    if the clips do not fit the grid, or if `out` holds other settings.
     """
     grid.check(config.spec)
     parts = out / "parts"
     open_folder(out, config if states is true_states else {"dataset": config, "states": states})
     if (out / MANIFEST).exists():
-        have = read_manifest(out).grid
-        if have != grid:
+        found = read_manifest(out).grid
+        if found != grid:
             raise InputError(
                 f"{quote_path(out)} holds clips for another latent grid: it must be {grid}, not "
-                f"{have}. Choose another folder. (--out)"
+                f"{found}. Choose another folder. (--out)"
             )
-        shutil.rmtree(parts, ignore_errors=True)  # killed between writing shards and removing parts
+        # A run may have been killed after it wrote the manifest and before it removed the parts.
+        shutil.rmtree(parts, ignore_errors=True)
         yield from config.seeds
         return
     parts.mkdir(exist_ok=True)
+    # Clips are written in order: the last part of a scene shows that the scene is complete.
     missing = [seed for seed in config.seeds if not _part(parts, seed, config.clips - 1).exists()]
     yield from (seed for seed in config.seeds if seed not in missing)
     calls = [(config, seed, parts, states) for seed in missing]
-    for number, _ in run_in_processes(_make, calls, workers=workers):
-        yield missing[number]
+    for index, _ in run_in_processes(_make, calls, workers=workers):
+        yield missing[index]
     _gather(config, grid, parts, out)
 
 
@@ -170,7 +179,7 @@ def _make(config: DatasetConfig, seed: int, parts: Path, states: States) -> None
     clips = list(config.clips_of(seed))
     for clip, state in zip(clips, states(clips), strict=True):
         with atomic_write(_part(parts, seed, clip.number)) as temporary:
-            triplet = with_conditions(clip, to_triplet(clip, state), config.prior, config.hands)
+            triplet = to_triplet(clip, state, prior=config.prior, hands=config.hands)
             temporary.write_bytes(to_bytes(triplet_record(triplet)))
 
 
@@ -180,18 +189,13 @@ def _part(parts: Path, seed: int, number: int) -> Path:
 
 def _gather(config: DatasetConfig, grid: VideoGrid, parts: Path, out: Path) -> None:
     """Write the parts to shards, in the order of the seeds, and remove them."""
-    conditions = {"prior": config.prior, "hands": config.hands}
     provenance = {
-        "world": "tabletop", "kind": config.kind, "seeds": list(config.seeds), **conditions,
+        "world": "tabletop", "kind": config.kind, "seeds": list(config.seeds),
+        "prior": config.prior, "hands": config.hands,
     }  # fmt: skip
     complete = parts / "shards"
     with ShardWriter(
-        complete,
-        kind="frames",
-        spec=config.spec,
-        grid=grid,
-        provenance=provenance,
-        overwrite=True,
+        complete, kind="frames", spec=config.spec, grid=grid, provenance=provenance, overwrite=True
     ) as writer:
         for path in (_part(parts, s, n) for s in config.seeds for n in range(config.clips)):
             record = from_bytes(path.read_bytes(), name=path.name)

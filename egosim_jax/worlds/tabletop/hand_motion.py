@@ -1,18 +1,19 @@
 """Hand motion of a clip: reach, grasp, manipulate, release, retreat.
 
-A hand moves through keyframes, each a position of the point between its grasping fingertips, a yaw,
-a downward pitch and a closure; between two keyframes it accelerates for a quarter of the time and
-decelerates for a quarter. From grasp to release the body moves rigidly with that point and yaw, so
-that its ground-truth pose is exact.
+A hand moves through keyframes. Each has the position of the pinch point (between the grasping
+fingertips), a yaw, a downward pitch and a closure. Between two keyframes the hand accelerates for a
+quarter of the time and decelerates for a quarter. From grasp to release the body moves rigidly with
+pinch point and yaw, so its ground-truth pose is exact.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from egosim_jax.geometry import rotation_z
 from egosim_jax.types import Kind
@@ -29,25 +30,25 @@ from egosim_jax.worlds.tabletop.scene import Scene, moving_part
 
 Verb = Literal["carry", "lift", "turn", "stack", "open", "close"]
 FLAT: tuple[str, ...] = ("box", "cylinder", "lidded box", "drawer")
-"""Shapes that others can be stacked on."""
+"""Shapes that carry stacked bodies."""
 REST_M = {"right": np.array([0.13, 0.12, 0.09]), "left": np.array([-0.13, 0.12, 0.09])}
-"""Position of the grasping point of a hand at rest, in meters."""
+"""Position of the pinch point of a resting hand by side, in meters."""
 BEFORE_M = np.array([0.0, -0.09, 0.07])
-"""Way from the place of a grasp to where a hand is in front of it, in meters."""
+"""Offset from a grasp to the hand in front of it, in meters."""
 CARRY_M = (0.10, 0.20)
-"""Minimum and maximum distance that a body is carried, in meters."""
+"""Minimum and maximum distance of a carry, in meters."""
 CLOSE_SHARE = 0.04
-"""Share of a clip in which a hand closes."""
+"""Fraction of a clip in which a hand closes."""
 NEAR_M = 0.26
-"""Distance within which a hand prefers its next target, in meters."""
+"""Distance of preferred next targets from a hand, and of stacked bodies, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """The configuration of a hand at one moment."""
+    """Configuration of a hand at one moment."""
 
     point_m: Float[np.ndarray, " 3"]
-    """Point between the grasping fingertips in meters."""
+    """Pinch point in meters."""
     yaw: float
     """Rotation about the vertical in radians; 0 points away from the wearer."""
     pitch: float
@@ -57,12 +58,12 @@ class Grip:
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """Axes of the hand in the world: y along the fingers, z out of its back."""
+        """World axes of the hand: y along the fingers, z out of its back."""
         cosine, sine = np.cos(self.pitch), np.sin(self.pitch)
         return rotation_z(self.yaw) @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
 
     def pose(self, kind: Kind, side: Side) -> tuple[np.ndarray, np.ndarray]:
-        """Return joints in the world, and the unit vector of the back of the hand."""
+        """Return the world joints in meters, and the unit vector out of the back of the hand."""
         rotation = self.rotation
         local = joints_of(kind, self.closure, side)
         return (local - pinch(local)[0]) @ rotation.T + self.point_m, rotation[:, 2]
@@ -70,17 +71,17 @@ class Grip:
 
 @dataclass(frozen=True, kw_only=True)
 class Hand:
-    """One hand of the wearer at one moment."""
+    """One hand or gripper at one moment."""
 
     side: Side
-    """Side of the hand, left or right."""
+    """Left or right."""
     grip: Grip
     """Configuration of the hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intent:
-    """The action of a clip and its target."""
+    """Action of a clip and its target."""
 
     verb: Verb
     """Action of the hand."""
@@ -96,10 +97,10 @@ class Intent:
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """Scene and hands at one frame."""
+    """Scene and hands in one frame."""
 
     scene: Scene
-    """Arrangement of all bodies."""
+    """All bodies and their poses."""
     hands: tuple[Hand, ...]
     """Hands; the first one acts."""
 
@@ -112,20 +113,18 @@ class _Key:
     opening: float = 0.0
 
 
-def smooth(share: float) -> float:
-    """Ease from 0 to 1: accelerate for a quarter, keep the speed, decelerate for a quarter.
-
-    The maximum is 4/3 of the mean speed, versus 15/8 of the minimum-jerk curve: a video VAE with a
-    temporal stride of four blurs fast motion.
-    """
-    s = min(max(share, 0.0), 1.0)
+def smooth(time: float) -> float:
+    """Ease from 0 to 1: accelerate for a quarter, keep the speed, decelerate for a quarter."""
+    # The maximum speed is 4/3 of the mean; a minimum-jerk curve has 15/8. A video VAE with a
+    # temporal stride of four blurs fast motion.
+    s = min(max(time, 0.0), 1.0)
     if s < 0.25:
         return 8 / 3 * s * s
     return 4 / 3 * s - 1 / 6 if s < 0.75 else 1 - 8 / 3 * (1 - s) ** 2
 
 
 def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) -> Intent:
-    """Sample an action that the scene allows, with a target near the hand if there is one."""
+    """Sample an action that the scene allows, preferably with a target near the hand."""
     options: list[Intent] = []
     for body in scene.bodies:
         if body.static or (_covered(scene, body) and body.shape != "drawer"):
@@ -135,15 +134,15 @@ def choose(scene: Scene, rng: np.random.Generator, *, hand: Hand | None = None) 
         else:
             options += _loose_actions(scene, body, rng)
     if hand is not None:
-        here = hand.grip.point_m[:2]
-        gaps = [np.linalg.norm(scene.body(o.name).world_from_body[:2, 3] - here) for o in options]
+        start = hand.grip.point_m[:2]
+        gaps = [np.linalg.norm(scene.body(o.name).world_from_body[:2, 3] - start) for o in options]
         near = [o for o, gap in zip(options, gaps, strict=True) if gap < NEAR_M]
         options = near or options
     return options[int(rng.integers(len(options)))]
 
 
 def open_or_close(scene: Scene, body: Body) -> Intent:
-    """Return the intent to open furniture, or to close what is open."""
+    """Return the intent to open furniture, or to close it if it is open."""
     verb: Verb = "close" if scene.openings[body.name] > 0.5 else "open"
     part = "drawer of the" if body.shape == "drawer" else "lid of the"
     return Intent(verb=verb, name=body.name, caption=f"{verb}s the {part} {body.name}.")
@@ -169,6 +168,7 @@ def carry(body: Body, place_m: Float[np.ndarray, " 2"]) -> Intent:
 
 
 def _loose_actions(scene: Scene, body: Body, rng: np.random.Generator) -> list[Intent]:
+    """Return the possible actions on a loose body; a repeated one is twice as likely."""
     name = body.name
     options = [lift(body)]
     angle = float(rng.choice([-1, 1]) * rng.uniform(np.radians(50), np.radians(80)))
@@ -209,7 +209,7 @@ def _covered(scene: Scene, body: Body) -> bool:
 
 
 def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generator) -> Hand:
-    """Return the acting hand of the first clip, in the air in front of its target."""
+    """Return the acting hand at the start of the first clip, in front of its target."""
     grasp = grip_on(scene, intent, kind, "right")
     side: Side = "right" if grasp.point_m[0] + rng.normal(0, 0.04) > 0 else "left"
     before = grasp.point_m + BEFORE_M + rng.normal(0, 0.015, 3)
@@ -219,21 +219,21 @@ def start_hand(scene: Scene, intent: Intent, kind: Kind, rng: np.random.Generato
 
 
 def waiting_hand(other: Side, rng: np.random.Generator) -> Hand:
-    """Return the hand of the other side, at rest."""
+    """Return the resting hand of the other side."""
     side: Side = "left" if other == "right" else "right"
     point = REST_M[side] + rng.normal(0, 0.012, 3) + [0.06 if side == "right" else -0.06, 0, -0.03]
     return Hand(side=side, grip=relaxed(point, side, "human"))
 
 
 def relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
-    """Return the configuration of a hand that does nothing, at a place."""
+    """Return the configuration of a relaxed hand at a point."""
     inward = 0.5 if side == "right" else -0.5
     closure = 0.25 if kind == "human" else 0.0
     return Grip(point_m=point, yaw=inward, pitch=np.radians(30), closure=closure)
 
 
 def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
-    """Return the configuration in which the hand grasps the target."""
+    """Return the configuration of the hand that grasps the target."""
     body = scene.body(intent.name)
     inward = 0.5 if side == "right" else -0.5
     if body.articulated:
@@ -246,7 +246,7 @@ def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
         return Grip(point_m=point, yaw=0.0, pitch=np.radians(40), closure=closure_for(kind, 0.016))
     width, offset = body.size_m[0], np.zeros(3)
     height = 0.62 * body.size_m[2]
-    if body.shape == "ring":  # by its near rim
+    if body.shape == "ring":  # the hand grasps its near rim
         width, offset = body.size_m[2], np.array([0, -(body.size_m[0] - body.size_m[2]) / 2, 0])
     if body.shape == "cone":
         height, width = 0.45 * body.size_m[2], 0.55 * width
@@ -259,14 +259,14 @@ def act(
 ) -> list[Moment]:
     """Return scene and hands at every frame of a clip; the first hand acts, the others rest.
 
-    The first moment is the given one: the last moment of a clip is the first of the next.
+    The first moment has the scene and hands of the arguments. The next clip starts from the last
+    moment.
     """
     hand = hands[0]
     keys = _keys(scene, hand, intent, kind)
     grasp = next(key.grip for key in keys if key.held)
-    times = np.linspace(0, 1, frames)
     moments = []
-    for time in times:
+    for time in np.linspace(0, 1, frames):
         grip, held_grip, opening = _between(keys, float(time))
         now = scene
         if held_grip is not None:
@@ -281,7 +281,7 @@ def act(
 
 
 def _carry(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
-    """Return the pose at `grip` of a body that was grasped at `grasp`."""
+    """Return the pose of a body, grasped at `grasp`, with the hand at `grip`."""
     turn = rotation_z(grip.yaw - grasp.yaw)
     pose = np.eye(4)
     pose[:3, :3] = turn @ world_from_body[:3, :3]
@@ -290,29 +290,29 @@ def _carry(world_from_body: np.ndarray, grasp: Grip, grip: Grip) -> np.ndarray:
 
 
 def holding(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> tuple[float, float]:
-    """Return the times in [0, 1] at which the hand has grasped its target and releases it."""
+    """Return the times in [0, 1] at which the hand grasps its target and releases it."""
     held = [key.time for key in _keys(scene, hand, intent, kind) if key.held]
     return held[0], held[-1]
 
 
 def opened(kind: Kind) -> float:
-    """Return the closure of a hand that reaches for a body."""
+    """Return the closure of a reaching hand."""
     return closure_for(kind, 0.085) if kind == "robot" else 0.12
 
 
 def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
     """Return the keyframes of the acting hand."""
     start, grasp = hand.grip, grip_on(scene, intent, kind, hand.side)
-    wide = opened(kind)
-    body = scene.body(intent.name)
-    above = _shift(grasp, [0, -0.02, 0.03], closure=wide)
+    body, wide = scene.body(intent.name), opened(kind)
+    above = replace(_shift(grasp, [0, -0.02, 0.03]), closure=wide)
+    # A farther target takes longer to reach, so that no reach is much faster than others.
     reach = 0.10 + 0.6 * min(0.4, float(np.linalg.norm(start.point_m - grasp.point_m)))
     begin, end = reach + 0.10, 0.76
     first = scene.openings.get(intent.name, 0.0)
     keys = [
         _Key(time=0.0, grip=start, opening=first),
         _Key(time=reach, grip=above, opening=first),
-        _Key(time=begin - CLOSE_SHARE, grip=_shift(grasp, [0, 0, 0], closure=wide), opening=first),
+        _Key(time=begin - CLOSE_SHARE, grip=replace(grasp, closure=wide), opening=first),
         _Key(time=begin, grip=grasp, held=True, opening=first),
     ]
     if body.articulated:
@@ -329,10 +329,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
             time = begin + share * (end - begin)
             keys.append(_Key(time=time, grip=_shift(grasp, [0, 0, height]), held=True))
     elif intent.verb == "turn":
-        final = Grip(
-            point_m=grasp.point_m, yaw=grasp.yaw + intent.turn, pitch=grasp.pitch,
-            closure=grasp.closure,
-        )  # fmt: skip
+        final = replace(grasp, yaw=grasp.yaw + intent.turn)
         keys.append(_Key(time=end, grip=final, held=True))
     else:
         way = intent.goal_m - body.world_from_body[:3, 3]
@@ -345,7 +342,7 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
             _Key(time=end, grip=final, held=True),
         ]
     last_opening = keys[-1].opening
-    away = _shift(final, [0, -0.015, 0.02], closure=wide)
+    away = replace(_shift(final, [0, -0.015, 0.02]), closure=wide)
     rest = relaxed(_retreat(final.point_m, hand.side), hand.side, kind)
     keys += [
         _Key(time=end + 0.05, grip=away, opening=last_opening),
@@ -355,25 +352,20 @@ def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
 
 
 def _retreat(point_m: np.ndarray, side: Side) -> np.ndarray:
-    """Return a point above and towards rest, so that the hand does not occlude the target."""
+    """Return a point above and towards rest, where the hand does not occlude the target."""
     up = point_m + [0, -0.06, 0.05]
     return up + 0.3 * (REST_M[side] - up)
 
 
-def _shift(grip: Grip, by: object, *, closure: float | None = None) -> Grip:
-    return Grip(
-        point_m=grip.point_m + np.asarray(by, float),
-        yaw=grip.yaw,
-        pitch=grip.pitch,
-        closure=grip.closure if closure is None else closure,
-    )
+def _shift(grip: Grip, way_m: ArrayLike) -> Grip:
+    return replace(grip, point_m=grip.point_m + np.asarray(way_m, float))
 
 
 def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
-    """Interpolate keyframes: the grip, the grip that holds the body once grasped, the opening."""
+    """Interpolate keyframes: return the grip, the grip that carries the body, and the opening."""
     held = [key for key in keys if key.held]
     begin, end = held[0].time, held[-1].time
-    if begin < time < end:  # from rest to rest, without a stop at the keyframes between
+    if begin < time < end:  # one motion from grasp to release: no stop at the keyframes between
         time = begin + smooth((time - begin) / (end - begin)) * (end - begin)
     index = max(i for i, key in enumerate(keys) if key.time <= time + 1e-9)
     if index == len(keys) - 1:
@@ -382,12 +374,8 @@ def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
         before, after = keys[index], keys[index + 1]
         share = (time - before.time) / (after.time - before.time)
         s = share if before.held and after.held else smooth(share)
-        grip = Grip(
-            point_m=before.grip.point_m + s * (after.grip.point_m - before.grip.point_m),
-            yaw=before.grip.yaw + s * (after.grip.yaw - before.grip.yaw),
-            pitch=before.grip.pitch + s * (after.grip.pitch - before.grip.pitch),
-            closure=before.grip.closure + s * (after.grip.closure - before.grip.closure),
-        )
+        a, b = vars(before.grip), vars(after.grip)
+        grip = Grip(**{name: a[name] + s * (b[name] - a[name]) for name in a})
         opening = before.opening + s * (after.opening - before.opening)
     if time < begin:
         return grip, None, opening
@@ -395,6 +383,6 @@ def _between(keys: list[_Key], time: float) -> tuple[Grip, Grip | None, float]:
 
 
 def hand_parts(hand: Hand, kind: Kind) -> tuple[Float[np.ndarray, "j 3"], tuple[Part, ...]]:
-    """Return joints and meshes of a hand in the world; the forearm starts at the wearer's elbow."""
+    """Return the world joints and meshes of a hand; the forearm starts at the wearer's elbow."""
     joints, back = hand.grip.pose(kind, hand.side)
     return joints, hand_meshes(joints, elbow_of(joints, hand.side), kind, back)

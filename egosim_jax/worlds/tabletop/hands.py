@@ -1,4 +1,4 @@
-"""Hands and grippers: joints by forward kinematics, and the meshes around them.
+"""Hands and grippers: joints by forward kinematics, and their meshes.
 
 A right hand's local frame has the wrist at the origin, the fingers along y, the back of the hand
 along z and the thumb on the side of -x; a left hand is its mirror image in x. A gripper's frame has
@@ -37,7 +37,7 @@ SKIN, SLEEVE, ENAMEL, RUBBER = (216, 150, 118), (72, 88, 112), (40, 150, 160), (
 
 
 def human_joints(closure: float, side: Side) -> Float[np.ndarray, "21 3"]:
-    """Return the 21 keypoints in the local frame, from open (closure 0) to a fist (1)."""
+    """Return the 21 keypoints in the local frame in meters, from open (closure 0) to a fist (1)."""
     joints = [np.zeros(3)]
     base, lengths = THUMB_M
     aside, across = np.array([-0.62, 0.66, -0.42]), np.array([0.10, 0.72, -0.69])
@@ -61,7 +61,7 @@ def human_joints(closure: float, side: Side) -> Float[np.ndarray, "21 3"]:
 
 
 def gripper_joints(closure: float) -> Float[np.ndarray, "3 3"]:
-    """Return wrist and fingertips in the local frame, from open (closure 0) to closed (1)."""
+    """Return wrist and fingertips in the local frame in meters, from closure 0 (open) to 1."""
     length, opening = GRIPPER_M
     half = opening / 2 * (1 - closure)
     return np.array([[0, 0, 0], [-half, length, 0], [half, length, 0]])
@@ -72,24 +72,28 @@ def joints_of(kind: Kind, closure: float, side: Side) -> Float[np.ndarray, "j 3"
     return human_joints(closure, side) if kind == "human" else gripper_joints(closure)
 
 
-def pinch(joints: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+def tips_of(joints_m: Float[np.ndarray, "j 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the grasping tips: thumb, and the middle of index and middle fingertip."""
+    if len(joints_m) == 3:
+        return joints_m[1], joints_m[2]
+    return joints_m[4], (joints_m[8] + joints_m[12]) / 2
+
+
+def pinch(joints_m: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
     """Return the point between the grasping fingertips, and their distance, in meters."""
-    if len(joints) == 3:
-        thumb, fingers = joints[1], joints[2]
-    else:
-        thumb, fingers = joints[4], (joints[8] + joints[12]) / 2
+    thumb, fingers = tips_of(joints_m)
     return (thumb + fingers) / 2, float(np.linalg.norm(thumb - fingers))
 
 
 def frame_of(joints_m: Float[np.ndarray, "j 3"], kind: Kind) -> Float[np.ndarray, "4 4"]:
-    """Return the pose in the world of a hand: axes of its local frame, origin at the pinch point.
+    """Return the world pose of a hand: axes of its local frame, origin at the pinch point.
 
-    The palm gives the axes of a human hand, and of a left hand x and z are reversed, so that all
-    are right-handed.
+    The axes of a human hand follow the palm.
     """
+    # A left hand is a mirror image, with left-handed axes. Its x and z are therefore reversed here.
     if kind == "robot":
         along, across = (joints_m[1] + joints_m[2]) / 2 - joints_m[0], joints_m[2] - joints_m[1]
-        if np.linalg.norm(across) < 1e-6:  # closed: its fingers are taken to be horizontal
+        if np.linalg.norm(across) < 1e-6:  # closed: assume horizontal fingers
             across = np.cross(along, [0.0, 0.0, 1.0])
     else:
         along, across = joints_m[KNUCKLES].mean(axis=0) - joints_m[0], joints_m[17] - joints_m[5]
@@ -103,7 +107,7 @@ def frame_of(joints_m: Float[np.ndarray, "j 3"], kind: Kind) -> Float[np.ndarray
 
 
 def side_of(joints_m: Float[np.ndarray, "j 3"]) -> Side:
-    """Return the side of a human hand: fingers flex towards the palm, away from its back."""
+    """Return the side of a human hand, from the direction in which its fingers flex."""
     axes = frame_of(joints_m, "human")[:3, :3]
     bend = (joints_m[[4, 8, 12, 16, 20]] - joints_m[[1, *KNUCKLES]]).mean(axis=0)
     return "right" if bend @ axes[:, 2] <= 0 else "left"
@@ -111,6 +115,8 @@ def side_of(joints_m: Float[np.ndarray, "j 3"]) -> Side:
 
 def closure_for(kind: Kind, width_m: float) -> float:
     """Return the closure at which the fingertips are `width_m` apart, by bisection."""
+    # The fingertips of a human hand pass each other at 0.6, 11 mm apart. From [0, 0.8], bisection
+    # for a larger width stays below 0.6.
     low, high = 0.0, 1.0 if kind == "robot" else 0.8
     for _ in range(30):
         middle = (low + high) / 2
@@ -120,7 +126,7 @@ def closure_for(kind: Kind, width_m: float) -> float:
 
 
 def elbow_of(joints_m: Float[np.ndarray, "j 3"], side: Side) -> Float[np.ndarray, " 3"]:
-    """Return the position of the wearer's elbow in meters, by that of the wrist."""
+    """Return the position of the wearer's elbow in meters, for the position of the wrist."""
     outward = 0.24 if side == "right" else -0.24
     return np.array([0.5 * joints_m[0][0] + outward, -0.20, 0.5 * joints_m[0][2]])
 
@@ -139,7 +145,7 @@ def hand_meshes(
 ) -> tuple[Part, ...]:
     """Return the meshes of hand and forearm, or of gripper and wrist, in the frame of the joints.
 
-    `back` is the unit vector of the back of the hand.
+    `back` is the unit vector out of the back of the hand.
     """
     if kind == "robot":
         wrist, left, right = joints_m
@@ -156,11 +162,9 @@ def hand_meshes(
         arm = join(
             _limb(wrist - 0.02 * along, knuckle, 0.026, 0.026), _limb(wrist, elbow_m, 0.027, 0.034)
         )
-        enamel = Paint(color=ENAMEL, second=ENAMEL, pattern="plain", scale_m=0.1)
-        rubber = Paint(color=RUBBER, second=RUBBER, pattern="plain", scale_m=0.1)
         return (
-            _part("gripper", join(*fingers), rubber),
-            _part("wrist", join(palm, arm), enamel),
+            _part("gripper", join(*fingers), RUBBER),
+            _part("wrist", join(palm, arm), ENAMEL),
         )
     radii = np.array([0.026, 0.016, 0.0125, 0.0115, 0.0095] + [0.0105, 0.0095, 0.0085, 0.0075] * 4)
     pieces = [
@@ -169,7 +173,7 @@ def hand_meshes(
         if a
     ]
     wrist, knuckles = joints_m[0], joints_m[KNUCKLES]
-    # The palm: thick capsules from the wrist to each knuckle and across them.
+    # The palm: thick capsules from the wrist to each knuckle, and between neighbors.
     inward = -0.004 * back
     pieces += [_limb(wrist + inward, knuckle + inward, 0.021, 0.0135) for knuckle in knuckles]
     pieces += [_limb(a + inward, b + inward, 0.012, 0.012) for a, b in pairwise(knuckles)]
@@ -178,15 +182,14 @@ def hand_meshes(
     towards = (elbow_m - wrist) / np.linalg.norm(elbow_m - wrist)
     cuff = wrist + 0.07 * towards
     pieces += [_limb(wrist, cuff, 0.023, 0.025)]
-    skin = Paint(color=SKIN, second=SKIN, pattern="plain", scale_m=0.1)
-    sleeve = Paint(color=SLEEVE, second=(58, 72, 92), pattern="plain", scale_m=0.1)
     return (
-        _part("hand", join(*pieces), skin),
-        _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), sleeve),
+        _part("hand", join(*pieces), SKIN),
+        _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), SLEEVE),
     )
 
 
-def _part(name: str, shape: tuple[np.ndarray, np.ndarray], paint: Paint) -> Part:
+def _part(name: str, shape: tuple[np.ndarray, np.ndarray], color: tuple[int, int, int]) -> Part:
+    paint = Paint(color=color)
     return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=paint, smooth=True)
 
 

@@ -1,8 +1,8 @@
 """Scripted policies of the tabletop world with faults of graded size.
 
-Each carries a body to a goal. A policy acts on what it believes: the body and the goal may be
-elsewhere by normally distributed errors, or the body is another one. It may also open its hand too
-early, or never close it.
+Each policy carries a body to a goal. Its belief may be wrong: the positions of body and goal have
+normally distributed errors, or it takes another body. Its hand may also open too early, or never
+close.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.worlds.tabletop import Script, hand_motion
+from egosim_jax.worlds.tabletop import hand_motion
 from egosim_jax.worlds.tabletop.bodies import Body
 from egosim_jax.worlds.tabletop.hand_motion import Hand
+from egosim_jax.worlds.tabletop.sequence import Script
 
-WITHIN_M = (0.03, 0.02)
-"""Largest horizontal and vertical distance of a carried body from its goal, in meters."""
+MAX_ERROR_M = (0.03, 0.02)
+"""Maximum horizontal and vertical distance to the goal that counts as success, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,22 +28,20 @@ class Policy:
     name: str
     """Name in tables."""
     grasp_m: float = 0.0
-    """Standard deviation of the believed place of the body, along x and y, in meters."""
+    """Standard deviation of the believed body position, along x and y, in meters."""
     goal_m: float = 0.0
-    """Standard deviation of the believed goal, along x and y, in meters."""
+    """Standard deviation of the believed goal position, along x and y, in meters."""
     release: float = 1.0
-    """Share of the time of carrying after which the hand opens."""
+    """Fraction of the carrying time after which the hand opens."""
     wrong: float = 0.0
-    """Probability of taking another body."""
+    """Probability that the policy takes another body."""
     grasps: bool = True
-    """True if the hand closes at all."""
+    """False: the hand never closes."""
 
     def plan(self, script: Script, rng: np.random.Generator) -> Float[np.ndarray, "f 1 j 3"]:
-        """Return the joints of the acting hand in the scene of a script that carries a body.
-
-        Every policy draws as many numbers, so that equal generators give equal errors in units of
-        their standard deviations.
-        """
+        """Return the joints of the acting hand in meters; the script must carry a body."""
+        # Every policy draws the same number of values. Equal generators then give all policies the
+        # same errors, in units of their standard deviations.
         errors, chance, choice = rng.normal(size=(2, 2)), rng.random(), rng.random()
         scene, hand, intent = script.scene, script.moments[0].hands[0], script.intent
         others = [
@@ -83,15 +82,15 @@ POLICIES = (
     Policy(name="wrong body in half", wrong=0.5),
     Policy(name="never closes", grasps=False),
 )
-"""Policies that are ranked."""
+"""Policies of the ranking experiment, and of attempts."""
 
 
-def error_m(body: Body, goal_m: Float[np.ndarray, " 3"]) -> tuple[float, float]:
-    """Return the horizontal and the vertical distance of a body's origin from its goal."""
+def goal_error_m(body: Body, goal_m: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+    """Return the horizontal and the vertical distance of a body's origin to its goal."""
     gap = body.world_from_body[:3, 3] - goal_m
     return float(np.hypot(gap[0], gap[1])), abs(float(gap[2]))
 
 
 def succeeded(error_m: tuple[float, float]) -> bool:
-    """Return whether a body is near enough to its goal."""
-    return error_m[0] <= WITHIN_M[0] and error_m[1] <= WITHIN_M[1]
+    """Return whether a horizontal and a vertical distance to the goal count as success."""
+    return error_m[0] <= MAX_ERROR_M[0] and error_m[1] <= MAX_ERROR_M[1]

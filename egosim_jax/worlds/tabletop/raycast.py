@@ -1,14 +1,15 @@
 """Ray-cast rendering of the tabletop world: color, depth and ids, exact at every pixel center.
 
 A surface of color c and normal n is shaded as c * (ambient + sun * max(0, n . l)) in the light and
-as c * ambient in shadow. Colors are means over s x s rays per pixel; depth and ids are those of the
-ray through the pixel's center.
+as c * ambient in shadow. A pixel's color is the mean over s x s rays; its depth and id are from the
+ray through its center.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from einops import rearrange, reduce
@@ -19,7 +20,7 @@ from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
 
 SUN = np.array([-0.25, -0.50, 0.83])
-"""Direction towards the light, which shines from behind the wearer's left shoulder."""
+"""Direction towards the light, behind the wearer's left shoulder."""
 AMBIENT = 0.62
 """Intensity of the ambient light."""
 SUNLIGHT = 0.48
@@ -38,13 +39,13 @@ class Placed:
     """Mesh and texture of a body to render."""
     world_from_part: Float[np.ndarray, "4 4"]
     """Pose in the world."""
-    number: int
-    """Instance id in renderings, from 1; 0 means that nothing was hit."""
+    instance_id: int
+    """Instance id in renderings, at least 1; 0 is a ray without a hit."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
-    """A rendering of one frame."""
+class Frame:
+    """A rendered frame: color, depth and ids."""
 
     colors: UInt8[np.ndarray, "h w 3"]
     """RGB of every pixel."""
@@ -55,7 +56,7 @@ class Picture:
 
 
 class RayCaster:
-    """A renderer of the placed parts of one moment."""
+    """Renderer of the placed parts of one moment."""
 
     def __init__(self, placed: Sequence[Placed]):
         import open3d as o3d
@@ -64,10 +65,8 @@ class RayCaster:
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         for item in self.placed:
             vertices = transform(item.world_from_part, item.part.vertices_m)
-            self.scene.add_triangles(
-                o3d.core.Tensor(vertices.astype(np.float32)),
-                o3d.core.Tensor(item.part.triangles.astype(np.uint32)),
-            )
+            triangles = item.part.triangles.astype(np.uint32)
+            self.scene.add_triangles(_tensor(vertices.astype(np.float32)), _tensor(triangles))
 
     def render(
         self,
@@ -76,15 +75,15 @@ class RayCaster:
         *,
         height: int,
         width: int,
-    ) -> Picture:
+    ) -> Frame:
         """Render from a camera. Raises `InputError` if the camera is inside an object."""
         self._refuse_inside(world_from_camera[:3, 3])
         rays = _world_rays(world_from_camera, intrinsics_px, height=height, width=width)
         middle = self._cast(world_from_camera, rays)
         depth, geometry = middle["t_hit"], middle["geometry_ids"]
-        numbers = np.array([*(item.number for item in self.placed), 0])
-        ids = numbers[np.where(np.isfinite(depth), geometry, len(self.placed)).astype(int)]
-        return Picture(
+        instance_ids = np.array([*(item.instance_id for item in self.placed), 0])
+        ids = instance_ids[np.where(np.isfinite(depth), geometry, len(self.placed)).astype(int)]
+        return Frame(
             colors=self._colors(world_from_camera, intrinsics_px, height, width),
             depth_m=rearrange(depth, "(h w) -> h w", h=height),
             ids=rearrange(ids, "(h w) -> h w", h=height),
@@ -92,10 +91,8 @@ class RayCaster:
 
     def _refuse_inside(self, eye_m: np.ndarray) -> None:
         """Raise `InputError` if a ray from the camera crosses surfaces an odd number of times."""
-        import open3d as o3d
-
         ray = np.concatenate([eye_m, [0, 0, 1]]).astype(np.float32)[None]
-        if self.scene.count_intersections(o3d.core.Tensor(ray), nthreads=1).item() % 2:
+        if self.scene.count_intersections(_tensor(ray), nthreads=1).item() % 2:
             place = ", ".join(f"{value:.3f}" for value in eye_m)
             raise InputError(
                 f"The camera at ({place}) m is inside an object; it must be outside all objects. "
@@ -112,9 +109,10 @@ class RayCaster:
         points = np.where(sky, 0, hits["t_hit"])[:, None] * rays + pose[:3, 3].astype(np.float32)
         albedo, normals = self._surface(points, hits)
         facing = np.einsum("nc,nc->n", normals, rays)
-        normals = np.where(facing[:, None] > 0, -normals, normals)
+        normals = np.where(facing[:, None] > 0, -normals, normals)  # towards the camera
         sun = (SUN / np.linalg.norm(SUN)).astype(np.float32)
         cosine = np.clip(normals @ sun, 0, None)
+        # Shadow rays start 1 mm off the surface, which would otherwise shadow itself.
         lit = ~self._shadowed(points + np.float32(1e-3) * normals, sun)
         light = albedo * (AMBIENT + SUNLIGHT * cosine * lit)[:, None]
         light[sky] = SKY
@@ -127,40 +125,41 @@ class RayCaster:
         """Return albedo and normal at ray hits; arbitrary where a ray hits nothing."""
         albedo, normals = np.zeros_like(points), hits["primitive_normals"]
         for number, item in enumerate(self.placed):
-            (here,) = np.nonzero(hits["geometry_ids"] == number)
-            if not len(here):
+            (hit,) = np.nonzero(hits["geometry_ids"] == number)
+            if not len(hit):
                 continue
             pose, part = item.world_from_part.astype(np.float32), item.part
-            albedo[here] = part.paint.at((points[here] - pose[:3, 3]) @ pose[:3, :3])
+            albedo[hit] = part.paint.at((points[hit] - pose[:3, 3]) @ pose[:3, :3])
             if part.smooth:
-                corners = part.vertex_normals[part.triangles[hits["primitive_ids"][here]]]
-                u, v = hits["primitive_uvs"][here].T
+                corners = part.vertex_normals[part.triangles[hits["primitive_ids"][hit]]]
+                u, v = hits["primitive_uvs"][hit].T
                 mixed = np.einsum("nk,nkc->nc", np.stack([1 - u - v, u, v], axis=1), corners)
                 length = np.maximum(np.linalg.norm(mixed, axis=1), 1e-9)
-                normals[here] = mixed / length[:, None] @ pose[:3, :3].T
+                normals[hit] = mixed / length[:, None] @ pose[:3, :3].T
         return albedo, normals
 
     def _shadowed(
         self, points: Float32[np.ndarray, "n 3"], sun: Float32[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " n"]:
-        import open3d as o3d
-
         rays = np.concatenate([points, np.broadcast_to(sun, points.shape)], axis=1)
-        return self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
+        return self.scene.test_occlusions(_tensor(rays), nthreads=1).numpy()
 
     def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-        """Cast rays from the camera, in one thread because clips are made in parallel."""
-        import open3d as o3d
-
+        """Cast rays from the camera, in one thread: clips are made in parallel processes."""
         eye = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
-        both = o3d.core.Tensor(np.concatenate([eye, rays], axis=1))
-        hits = self.scene.cast_rays(both, nthreads=1)
+        hits = self.scene.cast_rays(_tensor(np.concatenate([eye, rays], axis=1)), nthreads=1)
         return {name: tensor.numpy() for name, tensor in hits.items()}
+
+
+def _tensor(values: np.ndarray) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor(values)
 
 
 def _world_rays(
     pose: np.ndarray, intrinsics_px: np.ndarray, *, height: int, width: int
 ) -> Float32[np.ndarray, "n 3"]:
-    """Return world directions of camera rays of unit z, so that distances along them are depths."""
+    """Return world directions of camera rays with unit z, whose hit distances are depths."""
     rays = pixel_rays(intrinsics_px, height=height, width=width)
     return rearrange(rays @ pose[:3, :3].T, "h w c -> (h w) c").astype(np.float32)

@@ -1,4 +1,4 @@
-"""The arrangement of a tabletop scene: poses of all bodies, free space, and random scenes."""
+"""Scenes of the tabletop world: poses of all bodies, free places, and random scenes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from egosim_jax.geometry import rotation_z
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import (
     COLORS,
+    LID_M,
     LOOSE,
     REACH_M,
     TABLE_SIZE_M,
@@ -29,7 +30,7 @@ from egosim_jax.worlds.tabletop.raycast import Placed
 TABLE, FLOOR, WALL, FIRST_BODY, FIRST_HAND = 1, 2, 3, 10, 100
 """Instance ids in renderings.
 
-Body i has 10 + 2 i and its case, if it has one, 11 + 2 i; hand i has 100 + 2 i and its forearm
+Body i has 10 + 2 i, and its case, if any, 11 + 2 i. Hand i has 100 + 2 i, and its forearm
 101 + 2 i.
 """
 DRAWER_M = 0.075
@@ -48,26 +49,26 @@ MIN_BODIES = 3
 MAX_BODIES = 6
 """Maximum number of bodies on a table."""
 CLOTH_COLOR = (2, 2, 2)
-"""RGB of black cloths, which no picture distinguishes from unobserved pixels of a prior."""
+"""RGB of black cloths, which look like unobserved pixels of a prior."""
 CLOTH_M = (0.08, 0.30)
-"""Shortest and longest side of a cloth in meters."""
+"""Minimum and maximum side length of a cloth in meters."""
 CLOTH_AREA_M = (-0.34, 0.34, 0.06, 0.52)
-"""Minimum and maximum x, then y, of the centers of cloths: within view or at its border."""
+"""Minimum and maximum x, then y, of the centers of cloths in meters: in view or at its border."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """The arrangement of all bodies at one moment."""
+    """All bodies and their poses at one moment."""
 
     bodies: tuple[Body, ...]
     """Bodies on the table, with their poses."""
     room: tuple[Placed, ...]
     """Table, floor and walls."""
     openings: Mapping[str, float]
-    """Opening of each articulated body by name: 0 closed, 1 open."""
+    """Opening of each articulated body by name, from closed (0) to open (1)."""
 
     def body(self, name: str) -> Body:
-        """Return the body of that name."""
+        """Return the body with a name."""
         return next(body for body in self.bodies if body.name == name)
 
     def with_pose(self, name: str, world_from_body: Float[np.ndarray, "4 4"]) -> Scene:
@@ -82,7 +83,7 @@ class Scene:
         """Return the scene with another opening of one articulated body."""
         return replace(self, openings={**self.openings, name: opening})
 
-    def number(self, name: str) -> int:
+    def instance_id(self, name: str) -> int:
         """Return the instance id of a body, or of its moving part."""
         return FIRST_BODY + 2 * [body.name for body in self.bodies].index(name)
 
@@ -90,9 +91,9 @@ class Scene:
         """Return the names of all bodies and cases by instance id."""
         found = {}
         for body in self.bodies:
-            found[self.number(body.name)] = body.name
+            found[self.instance_id(body.name)] = body.name
             if body.articulated:
-                found[self.number(body.name) + 1] = f"case of the {body.name}"
+                found[self.instance_id(body.name) + 1] = f"case of the {body.name}"
         return found
 
     def first_part_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
@@ -106,23 +107,25 @@ class Scene:
         """Return every part of room and bodies with its pose, without hands."""
         items = list(self.room)
         for body in self.bodies:
-            poses = [self.first_part_pose(body.name), body.world_from_body]
-            for index, part in enumerate(body.parts):
-                number = self.number(body.name) + index
-                items.append(Placed(part=part, world_from_part=poses[index], number=number))
+            first = self.instance_id(body.name)
+            poses = self.first_part_pose(body.name), body.world_from_body
+            items += [
+                Placed(part=part, world_from_part=pose, instance_id=first + index)
+                for index, (part, pose) in enumerate(zip(body.parts, poses, strict=False))
+            ]
         return items
 
     def free_place(
         self, body: Body, rng: np.random.Generator, *, away_m: tuple[float, float] = (0, np.inf)
     ) -> Float[np.ndarray, " 2"] | None:
-        """Sample a free x and y for a body at a distance in `away_m` from its place; None if none.
+        """Sample a free x and y for a body in meters, or None if 200 samples fail.
 
-        Distances are in meters.
+        `away_m` is the minimum and maximum distance from its present place, in meters.
         """
-        here = body.world_from_body[:2, 3]
+        start = body.world_from_body[:2, 3]
         for _ in range(200):
             place = rng.uniform([REACH_M[0], REACH_M[2]], [REACH_M[1], REACH_M[3]])
-            if not away_m[0] <= np.linalg.norm(place - here) <= away_m[1]:
+            if not away_m[0] <= np.linalg.norm(place - start) <= away_m[1]:
                 continue
             if all(
                 np.linalg.norm(place - other.world_from_body[:2, 3])
@@ -135,7 +138,7 @@ class Scene:
 
 
 def footprint(body: Body) -> float:
-    """Return the radius in meters of the circle that a body occupies, open drawer included."""
+    """Return the radius of the circle that a body occupies in meters, open drawer included."""
     reach = DRAWER_M + 0.03 if body.shape == "drawer" else 0.0
     return float(np.hypot(body.size_m[0], body.size_m[1]) / 2 + reach / 2)
 
@@ -147,7 +150,7 @@ def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
         pose[1, 3] = -DRAWER_M * opening
         return pose
     angle = np.radians(LID_DEGREES) * opening
-    hinge = np.array([0.0, body.size_m[1] / 2, body.size_m[2] - 0.012])
+    hinge = np.array([0.0, body.size_m[1] / 2, body.size_m[2] - LID_M])
     cosine, sine = np.cos(angle), np.sin(angle)
     pose[:3, :3] = [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
     pose[:3, 3] = hinge - pose[:3, :3] @ hinge
@@ -155,34 +158,32 @@ def moving_part(body: Body, opening: float) -> Float[np.ndarray, "4 4"]:
 
 
 def sample_scene(rng: np.random.Generator) -> Scene:
-    """Sample a scene of three to six bodies of different colors, at most one articulated."""
+    """Sample a scene of 3 to 6 bodies in different colors, at most one of them articulated."""
     while len((scene := _scatter(rng)).bodies) < MIN_BODIES:
-        pass  # no free place was found for enough bodies
+        pass  # sample again: too few bodies found a free place
     return scene
 
 
-def with_cloths(scene: Scene, rng: np.random.Generator, most: int) -> Scene:
-    """Return the scene with up to `most` black cloths on the table, under its bodies.
-
-    In a prior they look like unobserved places, from which only the mask distinguishes them: other
-    black is either a whole body or not observed, as the picture itself shows.
-    """
-    if most < 0:
+def with_cloths(scene: Scene, rng: np.random.Generator, max_cloths: int) -> Scene:
+    """Return the scene with up to `max_cloths` black cloths on the table, under its bodies."""
+    # Without cloths a model need not read the mask: black in a prior is unobserved unless it has
+    # the outline of a black body.
+    if max_cloths < 0:
         raise InputError(
-            f"{most} cloths cannot be put on a table: the number must be at least 0. "
+            f"{max_cloths} cloths cannot be put on a table: the number must be at least 0. "
             "(--black-cloths)"
         )
-    paint = Paint(color=CLOTH_COLOR, second=CLOTH_COLOR, pattern="plain", scale_m=1.0)
+    paint = Paint(color=CLOTH_COLOR)
     cloths = []
-    for number in range(rng.integers(most + 1)):
+    for number in range(rng.integers(max_cloths + 1)):
         x, y = rng.uniform(*CLOTH_M, 2) / 2
-        height = 5e-4 * (number + 1)  # one above the other, where they overlap
+        height = 5e-4 * (number + 1)  # 0.5 mm apart, so overlapping cloths have no equal depth
         vertices, triangles = box((-x, -y, 0), (x, y, height))
         pose = np.eye(4)
         pose[:3, :3] = rotation_z(rng.uniform(-np.pi, np.pi))
         pose[:2, 3] = rng.uniform(CLOTH_AREA_M[::2], CLOTH_AREA_M[1::2])
         part = Part(name="cloth", vertices_m=vertices, triangles=triangles, paint=paint)
-        cloths.append(Placed(part=part, world_from_part=pose, number=TABLE))
+        cloths.append(Placed(part=part, world_from_part=pose, instance_id=TABLE))
     return replace(scene, room=(*scene.room, *cloths))
 
 
@@ -231,7 +232,7 @@ def make_room(rng: np.random.Generator) -> tuple[Placed, ...]:
         first, second = np.clip(color, 0, 255), np.clip(color * 0.86, 0, 255)
         paint = Paint(color=_rgb(first), second=_rgb(second), pattern=pattern, scale_m=scale)
         part = Part(name=name, vertices_m=vertices, triangles=triangles, paint=paint)
-        placed.append(Placed(part=part, world_from_part=np.eye(4), number=number))
+        placed.append(Placed(part=part, world_from_part=np.eye(4), instance_id=number))
     return tuple(placed)
 
 

@@ -1,9 +1,9 @@
 """Solids of the tabletop world: distance and normal at any point, for contacts.
 
-Each body is a union of a few solids in the frames of its parts: a loose body is one, furniture has
-a case, a moving part and its handle. The distance is negative inside. Boxes, cylinders and cones
-are intersections of half-spaces (a cylinder's side is one of them), whose largest distance is
-exact but at edges, where it is too small by up to a factor of sqrt(3).
+Each body is a union of solids in the frames of its parts: a loose body has one, furniture has a
+case, a moving part and its handle. The distance is negative inside. Boxes, cylinders and cones are
+intersections of half-spaces and round sides. Their distance is the maximum over these: exact except
+outside an edge, where it is too small by up to a factor of sqrt(3).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from egosim_jax.geometry import invert, transform
-from egosim_jax.worlds.tabletop.bodies import Body, Shape
+from egosim_jax.worlds.tabletop.bodies import LID_M, Body, Shape
 from egosim_jax.worlds.tabletop.scene import Scene
 
 Form = Literal["box", "cylinder", "ball", "cone", "ring"]
@@ -33,14 +33,14 @@ class Solid:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Center of its underside in the frame of the part, in meters."""
     part: int = 0
-    """Index of the part among those of the body; 0 is the one that moves."""
+    """Index of the body's part; part 0 moves."""
     handle: bool = False
-    """True for what a hand grasps to open and close furniture."""
+    """True for the handle of furniture."""
 
     def at(
         self, points_m: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """Return distance in meters and outward unit normal of the surface nearest to points."""
+        """Return the distance in meters and outward unit normal of the surface at points."""
         local = points_m - np.asarray(self.origin_m)
         x, y, z = self.size_m
         if self.form == "ball":
@@ -75,39 +75,33 @@ def _from_center(
 
 def _largest(faces: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     distances = np.stack([distance for distance, _ in faces])
-    chosen, every = distances.argmax(axis=0), np.arange(distances.shape[1])
-    return distances[chosen, every], np.stack([normal for _, normal in faces])[chosen, every]
+    chosen, index = distances.argmax(axis=0), np.arange(distances.shape[1])
+    return distances[chosen, index], np.stack([normal for _, normal in faces])[chosen, index]
 
 
 FORMS: dict[Shape, Form] = {
     "box": "box", "cylinder": "cylinder", "cup": "cylinder", "ball": "ball", "cone": "cone",
     "ring": "ring",
 }  # fmt: skip
-"""Solid of each loose body; a cup is as solid as a cylinder."""
-
-
-def solids_of(body: Body) -> tuple[Solid, ...]:
-    """Return the solids of a body, in the frames of its parts."""
-    return _solids(body.shape, body.size_m)
+"""Form of each loose shape; a cup counts as a full cylinder."""
 
 
 @cache
-def _solids(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, ...]:
+def solids_of(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, ...]:
+    """Return the solids of a body, in the frames of its parts."""
     x, y, z = size_m
     if shape == "drawer":
         front, handle = (x - 0.022, 0.008, z - 0.022), (0.04, 0.02, 0.012)
         return (
             Solid(form="box", size_m=front, origin_m=(0.0, -y / 2 - 0.002, 0.011)),
             Solid(
-                form="box",
-                size_m=handle,
-                origin_m=(0.0, -y / 2 - 0.016, z / 2 - 0.006),
-                handle=True,
+                form="box", size_m=handle,
+                origin_m=(0.0, -y / 2 - 0.016, z / 2 - 0.006), handle=True,
             ),
             Solid(form="box", size_m=size_m, part=1),
-        )
+        )  # fmt: skip
     if shape == "lidded box":
-        lid = 0.012
+        lid = LID_M
         return (
             Solid(form="box", size_m=(x, y, lid), origin_m=(0.0, 0.0, z - lid)),
             Solid(
@@ -122,12 +116,12 @@ def _solids(shape: Shape, size_m: tuple[float, float, float]) -> tuple[Solid, ..
 def surface_of(
     scene: Scene, body: Body, points_m: Float[np.ndarray, "n 3"], *, handle: bool = False
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Return distance, outward normal in the world, and whether the part moves, at each point.
+    """Return the signed distance, world normal and whether the part moves, at each point.
 
-    Of all solids of a body, or of those that a hand grasps: its handle, if it has one.
+    With `handle`, only the handle of furniture counts; a loose body counts completely.
     """
     found = []
-    for solid in solids_of(body):
+    for solid in solids_of(body.shape, body.size_m):
         if handle and body.articulated and not solid.handle:
             continue
         moving = solid.part == 0
@@ -135,5 +129,5 @@ def surface_of(
         distance, normal = solid.at(transform(invert(pose), points_m))
         found.append((distance, normal @ pose[:3, :3].T, np.full(len(points_m), moving)))
     distances = np.stack([distance for distance, *_ in found])
-    nearest, every = distances.argmin(axis=0), np.arange(len(points_m))
-    return tuple(np.stack(values)[nearest, every] for values in zip(*found, strict=True))  # type: ignore[return-value]
+    nearest, index = distances.argmin(axis=0), np.arange(len(points_m))
+    return tuple(np.stack(values)[nearest, index] for values in zip(*found, strict=True))  # type: ignore[return-value]

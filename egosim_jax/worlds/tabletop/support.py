@@ -1,41 +1,41 @@
 """Bodies at rest: supports, stable orientations, and bodies that push each other aside.
 
-Everything is quasi-static: a body that nothing holds is at rest on the highest surface under its
-center, in the stable orientation nearest to its own, and a fall takes no time. Bodies overlap where
-both their footprints and their heights do; the one of lower rank then moves horizontally by the
-smallest distance that separates them (separating axes). Furniture never moves.
+Everything is quasi-static. A body in no hand rests on the highest surface under its center, in the
+nearest stable orientation; a fall takes no time. Two bodies overlap if both their footprints and
+their height ranges do. The body of lower rank then moves horizontally by the minimum separating
+distance (separating axis test). Furniture never moves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import invert, transform
-from egosim_jax.worlds.tabletop.bodies import TABLE_SIZE_M, Body
+from egosim_jax.worlds.tabletop.bodies import LID_M, TABLE_SIZE_M, Body
 from egosim_jax.worlds.tabletop.scene import LID_DEGREES, Scene
 from egosim_jax.worlds.tabletop.solids import Solid, solids_of
 
 FLOOR_M = -0.74
 """Height of the floor in meters."""
 TOUCH_M = 0.004
-"""Heights or footprints that overlap by less than this only touch, in meters."""
+"""Height ranges that overlap by less than this only touch, in meters."""
 OVERLAP_M = 0.001
 """Footprints that overlap by less than this are apart, in meters."""
 LID_OPEN = 0.6
-"""Opening from which a chest receives bodies."""
+"""Minimum opening of a chest that receives bodies."""
 WALL_M, CHEST_FLOOR_M = 0.007, 0.007
 """Thickness of a chest's walls and of its floor, in meters."""
 UPRIGHT = 0.999
-"""Cosine of the tilt up to which a body is upright."""
-ROUNDS = 8
-"""Most rounds in which bodies push each other aside."""
+"""Minimum cosine of the tilt of an upright body."""
+MAX_ROUNDS = 8
+"""Maximum number of rounds in which bodies push each other aside."""
 RANKS = {"furniture": 3, "held": 2, "pushed": 1}
-"""Ranks of bodies when they meet: the lower one moves; 0 for those at rest."""
+"""Ranks of bodies when they meet: the lower one moves; a body at rest has 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +52,8 @@ class Footprint:
     """Height of its upper side in meters."""
 
 
-def moves(body: Body) -> bool:
-    """Return whether a body can be moved; furniture cannot."""
-    return not body.articulated
-
-
 def bottom_and_top(body: Body) -> tuple[float, float]:
-    """Return the lowest and highest height of a loose body in meters."""
+    """Return the minimum and maximum height of a loose body in meters."""
     if body.world_from_body[2, 2] > 1 - 1e-9:
         low = float(body.world_from_body[2, 3])
         return low, low + body.size_m[2]
@@ -67,18 +62,18 @@ def bottom_and_top(body: Body) -> tuple[float, float]:
 
 
 def footprints(scene: Scene, body: Body) -> list[Footprint]:
-    """Return the footprints of a body: one, or those of a cabinet's case and open drawer."""
+    """Return the footprints of a body; a cabinet has one of its case and one of its open drawer."""
     if not body.articulated:
         return [_footprint(body)]
     found = []
-    for solid in solids_of(body):
+    for solid in solids_of(body.shape, body.size_m):
         moving = solid.part == 0
         if solid.handle or (
             moving and (body.shape == "lidded box" or not scene.openings[body.name])
         ):
             continue
         pose = scene.first_part_pose(body.name) if moving else body.world_from_body
-        if moving:  # the tray, of which the front is the solid
+        if moving:  # the solid is only the front of the drawer: extend it to the tray
             y = body.size_m[1]
             solid = Solid(form="box", size_m=(solid.size_m[0], y, solid.size_m[2]),
                           origin_m=(0.0, -0.006, solid.origin_m[2]))  # fmt: skip
@@ -88,22 +83,17 @@ def footprints(scene: Scene, body: Body) -> list[Footprint]:
 
 def _footprint(body: Body) -> Footprint:
     low, high = bottom_and_top(body)
-    pose = body.world_from_body
+    pose, radius = body.world_from_body, body.size_m[0] / 2
     if body.shape != "box" and abs(pose[2, 2]) > UPRIGHT:
-        return Footprint(
-            corners_m=pose[None, :2, 3], radius_m=body.size_m[0] / 2, low_m=low, high_m=high
-        )
-    if body.shape == "ball":
-        center = transform(pose, np.array([[0, 0, body.size_m[0] / 2]]))
-        return Footprint(
-            corners_m=center[:, :2], radius_m=body.size_m[0] / 2, low_m=low, high_m=high
-        )
-    from scipy.spatial import ConvexHull
+        corners = pose[None, :2, 3]
+    elif body.shape == "ball":
+        corners = transform(pose, np.array([[0, 0, radius]]))[:, :2]
+    else:
+        from scipy.spatial import ConvexHull
 
-    flat = transform(pose, body.parts[0].vertices_m)[:, :2]
-    return Footprint(
-        corners_m=flat[ConvexHull(flat).vertices], radius_m=0.0, low_m=low, high_m=high
-    )
+        flat, radius = transform(pose, body.parts[0].vertices_m)[:, :2], 0.0
+        corners = flat[ConvexHull(flat).vertices]
+    return Footprint(corners_m=corners, radius_m=radius, low_m=low, high_m=high)
 
 
 def _box_footprint(solid: Solid, pose: np.ndarray) -> Footprint:
@@ -116,7 +106,7 @@ def _box_footprint(solid: Solid, pose: np.ndarray) -> Footprint:
 
 
 def separation(a: Footprint, b: Footprint) -> Float[np.ndarray, " 2"] | None:
-    """Return the shortest horizontal motion of `a` that separates it from `b`; None if apart."""
+    """Return the shortest horizontal motion in meters of `a` out of `b`; None if they are apart."""
     if min(a.high_m, b.high_m) - max(a.low_m, b.low_m) < TOUCH_M:
         return None
     best, way = np.inf, np.zeros(2)
@@ -134,7 +124,7 @@ def separation(a: Footprint, b: Footprint) -> Float[np.ndarray, " 2"] | None:
 
 
 def _axes(a: Footprint, b: Footprint) -> list[np.ndarray]:
-    """Return the normals of the polygons' edges, and the ways from discs to nearest corners."""
+    """Return the candidate separating axes: edge normals, and directions from discs to corners."""
     axes = []
     for one, other in ((a, b), (b, a)):
         if not one.radius_m:
@@ -150,9 +140,9 @@ def _axes(a: Footprint, b: Footprint) -> list[np.ndarray]:
 
 
 def inside_chest(scene: Scene, body: Body, chest: Body) -> Float[np.ndarray, " 2"] | None:
-    """Return the motion that puts a body between the walls of an open chest below it.
+    """Return the motion in meters that puts a body between the walls of an open chest below it.
 
-    None if the chest is closed, if the center is not above it, or if the body does not fit.
+    Return None if the chest is closed, the body's center is not above it, or the body does not fit.
     """
     if chest.shape != "lidded box" or scene.openings[chest.name] < LID_OPEN:
         return None
@@ -166,10 +156,11 @@ def inside_chest(scene: Scene, body: Body, chest: Body) -> Float[np.ndarray, " 2
 
 
 def support_below(scene: Scene, body: Body) -> tuple[float, str | None]:
-    """Return height in meters and name of what is under a body's center; None: table or floor."""
+    """Return the height in meters and name of a body's support; None: table or floor."""
     low, _ = bottom_and_top(body)
     center = footprints(scene, body)[0].corners_m.mean(axis=0)
     x, y, _ = TABLE_SIZE_M
+    # A body already below the table top fell off its edge, and belongs to the floor.
     on_table = abs(center[0]) <= x / 2 and 0 <= center[1] <= y
     best: tuple[float, str | None] = (0.0 if on_table and low > FLOOR_M / 2 else FLOOR_M, None)
     for other in scene.bodies:
@@ -186,14 +177,11 @@ def support_below(scene: Scene, body: Body) -> tuple[float, str | None]:
 
 
 def _tops(scene: Scene, body: Body) -> list[Footprint]:
-    """Return the flat upper sides of a body: none of a ball, a cone or a cylinder on its side."""
+    """Return the flat upper sides of a body; a ball, a cone or a tilted cylinder has none."""
     if body.articulated:
         found = footprints(scene, body)
         if body.shape == "lidded box" and scene.openings[body.name] < LID_OPEN:
-            lid = found[0]
-            return [
-                Footprint(**{**vars(lid), "high_m": body.world_from_body[2, 3] + body.size_m[2]})
-            ]
+            return [replace(found[0], high_m=body.world_from_body[2, 3] + body.size_m[2])]
         return found
     upright = abs(body.world_from_body[2, 2]) > UPRIGHT
     flat = body.shape == "box" or (upright and body.shape in ("cylinder", "cup", "ring"))
@@ -210,10 +198,10 @@ def _contains(outline: Footprint, point_m: Float[np.ndarray, " 2"]) -> bool:
 
 
 def supporters(scene: Scene) -> dict[str, str]:
-    """Return which body each loose body rests on, if it is not the table."""
+    """Return the supporting body of each loose body by name, without bodies on the table."""
     found = {}
     for body in scene.bodies:
-        if moves(body):
+        if not body.articulated:
             height, name = support_below(scene, body)
             if name is not None and abs(bottom_and_top(body)[0] - height) < TOUCH_M:
                 found[body.name] = name
@@ -221,7 +209,7 @@ def supporters(scene: Scene) -> dict[str, str]:
 
 
 def riders(scene: Scene, name: str) -> list[str]:
-    """Return the bodies that rest on a body, directly or on others."""
+    """Return the names of the bodies that rest on a body, directly or on others."""
     found, resting_on = [name], supporters(scene)
     for below in found:
         found += [top for top, under in resting_on.items() if under == below and top not in found]
@@ -229,7 +217,7 @@ def riders(scene: Scene, name: str) -> list[str]:
 
 
 def move(scene: Scene, name: str, world_from_body: Float[np.ndarray, "4 4"]) -> Scene:
-    """Return the scene in which a body is at a pose, and all that rests on it moved with it."""
+    """Move a body to a pose, together with all bodies that rest on it."""
     motion = world_from_body @ invert(scene.body(name).world_from_body)
     for rider in riders(scene, name):
         scene = scene.with_pose(rider, motion @ scene.body(rider).world_from_body)
@@ -237,24 +225,24 @@ def move(scene: Scene, name: str, world_from_body: Float[np.ndarray, "4 4"]) -> 
 
 
 def shift(scene: Scene, name: str, way_m: Float[np.ndarray, " 2"]) -> Scene:
-    """Return the scene in which a body, and all that rests on it, moved horizontally."""
+    """Move a body horizontally, together with all bodies that rest on it."""
     pose = scene.body(name).world_from_body.copy()
     pose[:2, 3] += way_m
     return move(scene, name, pose)
 
 
 def push_aside(scene: Scene, ranks: Mapping[str, int]) -> tuple[Scene, set[str]]:
-    """Separate bodies that overlap; return the scene and the names of those that moved.
+    """Separate overlapping bodies; return the scene and the names of the moved bodies.
 
-    `ranks` are of the bodies that just moved. Those that cannot be separated in a few rounds, such
-    as a body between a hand and a wall, keep overlapping.
+    `ranks` has the bodies that just moved. Bodies that a few rounds cannot separate, such as a body
+    between a hand and furniture, keep overlapping.
     """
     ranks = {
         body.name: RANKS["furniture"] if body.articulated else ranks.get(body.name, 0)
         for body in scene.bodies
     }
     moved: set[str] = set()
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         again = False
         for first, second in combinations([body.name for body in scene.bodies], 2):
             low, high = sorted((second, first), key=lambda name: ranks[name])
@@ -265,7 +253,7 @@ def push_aside(scene: Scene, ranks: Mapping[str, int]) -> tuple[Scene, set[str]]
                 continue
             moved |= {low, *riders(scene, low)}
             scene = shift(scene, low, found)
-            ranks[low] = max(ranks[low], RANKS["pushed"])
+            ranks[low] = max(ranks[low], RANKS["pushed"])  # it now pushes bodies at rest
             again = True
         if not again:
             break
@@ -273,14 +261,15 @@ def push_aside(scene: Scene, ranks: Mapping[str, int]) -> tuple[Scene, set[str]]
 
 
 def _apart(scene: Scene, low: str, high: str) -> Float[np.ndarray, " 2"] | None:
-    """Return the motion that separates the body `low` from `high`; None if they are apart."""
+    """Return the motion in meters that separates the body `low` from `high`; None if apart."""
     body, other = scene.body(low), scene.body(high)
     gap = np.linalg.norm((body.world_from_body - other.world_from_body)[:2, 3])
+    # Bounding circles skip the exact test of bodies far apart.
     if gap > sum(np.hypot(*b.size_m[:2]) / 2 + 0.1 * b.articulated for b in (body, other)) + 0.1:
         return None
     inner = inside_chest(scene, body, other) if other.articulated else None
     if inner is not None:
-        deep = bottom_and_top(body)[0] < other.world_from_body[2, 3] + other.size_m[2] - 0.012
+        deep = bottom_and_top(body)[0] < other.world_from_body[2, 3] + other.size_m[2] - LID_M
         return inner if deep and np.abs(inner).max() > OVERLAP_M else None
     outline = footprints(scene, body)[0]
     ways = [separation(outline, f) for f in footprints(scene, other)]
@@ -289,14 +278,15 @@ def _apart(scene: Scene, low: str, high: str) -> Float[np.ndarray, " 2"] | None:
 
 
 def settle(scene: Scene, name: str) -> Scene:
-    """Return the scene in which a body that nothing holds is at rest."""
+    """Return the scene after a body in no hand came to rest."""
     body = scene.body(name)
     pose = body.world_from_body.copy()
+    # Rotate about the center, not about the origin on the underside.
     middle = transform(pose, np.array([[0, 0, body.size_m[2] / 2]]))[0]
     pose[:3, :3] = stable_rotation(body)
     pose[:3, 3] = middle - pose[:3, :3] @ [0, 0, body.size_m[2] / 2]
     scene = scene.with_pose(name, pose)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         body = scene.body(name)
         for chest in scene.bodies:
             inner = inside_chest(scene, body, chest)
@@ -311,12 +301,12 @@ def settle(scene: Scene, name: str) -> Scene:
         found = [way for way in ways if way is not None]
         if not found:
             break
-        scene = shift(scene, name, found[0])  # it slides off what is not under its center
+        scene = shift(scene, name, found[0])  # it slides off bodies that do not support it
     return scene
 
 
 def stable_rotation(body: Body) -> Float[np.ndarray, "3 3"]:
-    """Return the stable orientation nearest to a loose body's own."""
+    """Return the stable orientation of a loose body that is nearest to its present one."""
     rotation = body.world_from_body[:3, :3]
     down = -rotation[2]  # in the frame of the body
     flat = down * [1, 1, 0]
@@ -337,27 +327,24 @@ def stable_rotation(body: Body) -> Float[np.ndarray, "3 3"]:
 
 
 def _rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """Return the smallest rotation that takes one unit vector to another, not to its opposite."""
+    """Return the smallest rotation from one unit vector to another; they must not be opposite."""
     x, y, z = np.cross(a, b)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + cross + cross @ cross / (1 + a @ b)
 
 
-def least_opening(scene: Scene, chest: Body) -> float:
-    """Return the smallest opening of a lid that the bodies in its chest allow."""
+def min_opening(scene: Scene, chest: Body) -> float:
+    """Return the minimum opening of a lid above the bodies in its chest."""
     x, y, z = chest.size_m
-    least = 0.0
+    opened, minimum = scene.with_opening(chest.name, 1.0), 0.0
     for body in scene.bodies:
-        if (
-            not moves(body)
-            or inside_chest(scene.with_opening(chest.name, 1.0), body, chest) is None
-        ):
+        if body.articulated or inside_chest(opened, body, chest) is None:
             continue
         points = transform(
             invert(chest.world_from_body) @ body.world_from_body, body.parts[0].vertices_m
         )
         points = points[(np.abs(points[:, 0]) <= x / 2) & (np.abs(points[:, 1]) < y / 2)]
-        angles = np.arctan2(points[:, 2] - (z - 0.012), y / 2 - points[:, 1])
+        angles = np.arctan2(points[:, 2] - (z - LID_M), y / 2 - points[:, 1])
         if len(angles):
-            least = max(least, float(np.degrees(angles.max())) / LID_DEGREES)
-    return least
+            minimum = max(minimum, float(np.degrees(angles.max())) / LID_DEGREES)
+    return minimum

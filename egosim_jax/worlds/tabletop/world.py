@@ -1,10 +1,10 @@
 """True tabletop world: executes any action, exactly and without randomness.
 
     world = World(scene=make_scene(objects=[...]))
-    clip, world = world.execute(action)     # clip: frames, depth, ids, poses; world: afterwards
+    clip, world = world.execute(action)  # clip: frames, depth, ids, poses; world: after the action
 
 A world is a value: executing an action returns a new one, and the same action in the same world
-gives the same clip. `docs/world.md` says what is modeled (`contact.py`, `support.py`).
+gives the same clip. `docs/world.md` describes the physics of `contact.py` and `support.py`.
 """
 
 from __future__ import annotations
@@ -17,41 +17,41 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
-from egosim_jax.worlds.tabletop.clips import Arm, TabletopClip, film, first_view, provenance
+from egosim_jax.worlds.tabletop.clips import Arm, TabletopClip, first_view, provenance, render_clip
 from egosim_jax.worlds.tabletop.contact import Contact, Grasp, advance, start
 from egosim_jax.worlds.tabletop.hands import Side, arm_of, side_of
-from egosim_jax.worlds.tabletop.raycast import Picture
+from egosim_jax.worlds.tabletop.raycast import Frame
 from egosim_jax.worlds.tabletop.scene import Scene
 
 EXECUTED = "execute"
 """Verb of clips of executed actions."""
 MOVED_M = 1e-4
-"""A body that moved less than this, in meters or radians, was not moved by an action."""
+"""Motion below which a body counts as unmoved, in meters or radians."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """True tabletop world at one moment: the scene, and what the hands hold."""
+    """True tabletop world at one moment: the scene and the grasps."""
 
     scene: Scene
-    """Arrangement of all bodies."""
+    """All bodies and their poses."""
     grasps: tuple[Grasp, ...] = ()
     """Bodies in hands."""
     seed: int = 0
-    """Seed that clips are named by; a scene made by hand has any."""
+    """Seed in the names of clips; arbitrary for a scene of your own."""
     number: int = 0
     """Number of actions executed so far."""
 
     def move(
         self, action: Action, *, joints_m: Float[np.ndarray, "f n j 3"] | None = None
     ) -> tuple[list[Scene], World]:
-        """Return the scene at every frame, without pictures, and the world afterwards.
+        """Return the scene at every frame, not rendered, and the world after the action.
 
-        A hand that holds a body keeps it if it starts near where it ended, and else lets it fall. A
-        hand is missing where its joints are NaN. `joints_m` replaces the joints of the action, for
-        hands that are out of view, which an action refuses; `InputError` if it has another shape
-        than an action of these cameras and hands.
+        A hand keeps the body that it holds if it starts near where it ended; otherwise the body
+        falls. A hand is missing where its joints are NaN. `joints_m` replaces the joints of the
+        action; an action refuses hands out of view, `joints_m` does not. Raises `InputError` if
+        the shape of `joints_m` does not match the cameras and the kind of hands.
         """
         joints = np.asarray(action.joints_m if joints_m is None else joints_m, float)
         frames, number = len(action.cameras.world_from_camera), JOINTS[action.kind]
@@ -71,18 +71,17 @@ class World:
     def execute(
         self, action: Action, *, joints_m: Float[np.ndarray, "f n j 3"] | None = None
     ) -> tuple[TabletopClip, World]:
-        """Return the clip of an action with its ground truth, and the world afterwards.
+        """Return the clip of an action with its ground truth, and the world after the action.
 
-        `joints_m` is that of `move`. Raises `InputError` if a camera is inside an object.
+        `joints_m` is as in `move`. Raises `InputError` if a camera is inside an object.
         """
         scenes, after = self.move(action, joints_m=joints_m)
         joints = action.joints_m if joints_m is None else joints_m
-        sides = sides_of(joints, action.kind)
-        clip = film(
+        clip = render_clip(
             scenes,
-            arms_of(joints, action.kind, sides),
+            arms_of(joints, action.kind),
             action.cameras,
-            sides=sides,
+            sides=sides_of(joints, action.kind),
             kind=action.kind,
             seed=self.seed,
             number=self.number,
@@ -92,16 +91,15 @@ class World:
         )
         return clip, after
 
-    def observe(self, cameras: Cameras) -> tuple[Picture, SceneState]:
-        """Return the first camera's picture without hands, and the points that it shows."""
+    def observe(self, cameras: Cameras) -> tuple[Frame, SceneState]:
+        """Return the first camera's frame without hands, and the state of its visible points."""
         first, state = first_view(self.scene, cameras)
         return first, replace(state, step=self.number, provenance=provenance(self.seed))
 
 
-def arms_of(
-    joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, sides: tuple[Side, ...]
-) -> list[list[Arm | None]]:
+def arms_of(joints_m: Float[np.ndarray, "f n j 3"], kind: Kind) -> list[list[Arm | None]]:
     """Return joints and meshes of every hand in every frame; None where a hand is missing."""
+    sides = sides_of(joints_m, kind)
     return [
         [
             (joints, arm_of(joints, kind, side)) if np.isfinite(joints).all() else None
@@ -112,7 +110,7 @@ def arms_of(
 
 
 def sides_of(joints_m: Float[np.ndarray, "f n j 3"], kind: Kind) -> tuple[Side, ...]:
-    """Return the side of each hand where it first appears; that of a gripper is where it is."""
+    """Return the side of each hand in its first frame; a gripper at x < 0 is a left one."""
     sides: list[Side] = []
     for path in np.moveaxis(joints_m, 1, 0):
         seen = path[np.isfinite(path).all(axis=(1, 2))]
@@ -124,7 +122,7 @@ def sides_of(joints_m: Float[np.ndarray, "f n j 3"], kind: Kind) -> tuple[Side, 
 
 
 def _most_moved(scenes: list[Scene]) -> str:
-    """Return the name of the body that moved most, or an empty one if none did."""
+    """Return the name of the body that moved most; empty if no body moved."""
     amounts = {}
     for body in scenes[0].bodies:
         path = np.stack([scene.first_part_pose(body.name) for scene in scenes])

@@ -18,7 +18,7 @@ from egosim_jax.io.video import probe_video, read_video, write_video
 from egosim_jax.state.snapshot import save, write_ply
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
-from egosim_jax.worlds.tabletop.twins import hand_video, static_video, with_conditions
+from egosim_jax.worlds.tabletop.clips import hand_video, static_video
 from tests.mano import model_pickle, random_model
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
@@ -193,7 +193,7 @@ def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, fixed, tmp_path):
 
 
 def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
-    twin = with_conditions(clip, to_triplet(clip), "static", "mesh")
+    twin = to_triplet(clip, prior="static", hands="mesh")
     twins = [replace(twin, video_id=name) for name in ("a", "b")]
     items = read_metadata(write_folders(tmp_path / "root", twins, name="s", fps=24))
     packed = {"videos": (None, "first"), "frames": (SPEC, "first"), "rate": (SPEC, "rate")}
@@ -222,7 +222,7 @@ def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
 
 
 def test_videos_of_several_rates_are_not_one_set_of_dwm(clip, tmp_path):
-    twin = with_conditions(clip, to_triplet(clip), "static", "mesh")
+    twin = to_triplet(clip, prior="static", hands="mesh")
     items = []
     for name, fps in (("a", 8), ("b", 12)):
         path = write_folders(tmp_path / name, [replace(twin, video_id=name)], name=name, fps=fps)
@@ -262,7 +262,7 @@ def test_hands_of_mano_replace_those_of_keypoints(clip, fixed, tmp_path):
 
 
 def test_shards_become_folders_of_dwm_are_mixed_and_aligned(clip, tmp_path, capsys):
-    twin = with_conditions(clip, to_triplet(clip), "static", "mesh")
+    twin = to_triplet(clip, prior="static", hands="mesh")
     path = write_folders(tmp_path / "root", [replace(twin, video_id="0")], name="a", fps=8)
     for name in ("one", "two"):
         list(pack(read_metadata(path), out=tmp_path / name, spec=SPEC, provenance={}))

@@ -1,4 +1,4 @@
-"""Attempts follow the true world: what a hand does not hold stays, and the head turns."""
+"""Attempts follow the true world: only held bodies move, and the head turns."""
 
 from dataclasses import replace
 
@@ -44,14 +44,14 @@ def test_the_head_then_turns_away_and_back_without_hands():
     assert triplet.mask[-1].mean() > triplet.mask[0].mean()  # next to the table nothing is observed
 
 
-def test_a_scene_without_a_body_to_carry_has_its_scripts(monkeypatch):
-    monkeypatch.setattr(attempts, "TRIES", 0)
+def test_a_scene_without_a_body_to_carry_has_scripted_clips(monkeypatch):
+    monkeypatch.setattr(attempts, "MAX_TRIES", 0)
     (clip,) = make_attempts(3, spec=SPEC)
     np.testing.assert_array_equal(clip.frames, next(make_sequence(3, spec=SPEC)).frames)
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (0.5, 5), (1.0, 16)])
-def test_their_share_of_the_scenes_is_as_asked(monkeypatch, share, expected):
+def test_attempts_are_the_requested_fraction_of_scenes(monkeypatch, share, expected):
     monkeypatch.setattr(
         "egosim_jax.worlds.tabletop.dataset.make_attempts", lambda *a, **k: iter(["attempt"])
     )
@@ -64,6 +64,6 @@ def test_their_share_of_the_scenes_is_as_asked(monkeypatch, share, expected):
 
 
 @pytest.mark.parametrize("more", [{"attempts": 1.5}, {"attempts": 0.5, "fixed_camera": True}])
-def test_what_cannot_be_attempted_is_refused(more):
+def test_an_invalid_fraction_or_a_fixed_camera_is_refused(more):
     with pytest.raises(InputError, match="--attempts"):
         DatasetConfig(seeds=(0,), clips=1, spec=SPEC, kind="human", **more)

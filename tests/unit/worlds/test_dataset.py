@@ -10,6 +10,8 @@ from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
 SPEC = VideoSpec(frames=5, height=32, width=48)
 CONFIG = DatasetConfig(seeds=(3, 4), clips=2, spec=SPEC, kind="human")
+ROBOT = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
+GRID = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
 
 
 @pytest.mark.slow
@@ -29,19 +31,17 @@ def test_an_interrupted_run_resumes_and_gives_the_same_shards(tmp_path):
 
 
 def test_a_finished_folder_is_not_written_again(tmp_path):
-    config = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
-    list(make_shards(config, out=tmp_path, workers=1))
+    list(make_shards(ROBOT, out=tmp_path, workers=1))
     before = (tmp_path / "manifest.json").stat().st_mtime_ns
-    assert list(make_shards(config, out=tmp_path, workers=1)) == [5]
+    assert list(make_shards(ROBOT, out=tmp_path, workers=1)) == [5]
     assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
 
 
 def test_a_folder_of_an_earlier_version_is_continued(tmp_path):
-    config = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
-    list(make_shards(config, out=tmp_path, workers=1))
+    list(make_shards(ROBOT, out=tmp_path, workers=1))
     record = tmp_path / "config.json"
     record.write_text(record.read_text("utf-8").replace("DatasetConfig", "Plan"), "utf-8")
-    assert list(make_shards(config, out=tmp_path, workers=1)) == [5]
+    assert list(make_shards(ROBOT, out=tmp_path, workers=1)) == [5]
 
 
 @dataclass(frozen=True)
@@ -82,18 +82,15 @@ def test_a_dataset_that_is_empty_or_of_a_negative_seed_is_refused(seeds, message
 
 
 def test_the_manifest_has_the_grid_that_the_clips_fit(tmp_path):
-    grid = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
     spec = VideoSpec(frames=3, height=24, width=40)
     config = DatasetConfig(seeds=(5,), clips=1, spec=spec, kind="robot")
     with pytest.raises(InputError, match="3 frames cannot be encoded"):
         list(make_shards(config, out=tmp_path, workers=1))
-    list(make_shards(config, out=tmp_path, workers=1, grid=grid))
-    assert ShardReader(tmp_path).manifest.grid == grid
+    list(make_shards(config, out=tmp_path, workers=1, grid=GRID))
+    assert ShardReader(tmp_path).manifest.grid == GRID
 
 
 def test_a_finished_dataset_of_another_grid_is_refused(tmp_path):
-    grid = VideoGrid(temporal_stride=2, spatial_stride=4, patch=2)
-    config = DatasetConfig(seeds=(5,), clips=1, spec=SPEC, kind="robot")
-    list(make_shards(config, out=tmp_path, workers=1))
+    list(make_shards(ROBOT, out=tmp_path, workers=1))
     with pytest.raises(InputError, match="another latent grid"):
-        list(make_shards(config, out=tmp_path, workers=1, grid=grid))
+        list(make_shards(ROBOT, out=tmp_path, workers=1, grid=GRID))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.geometry import invert, pixel_rays, project, transform
+from egosim_jax.geometry import invert, pixel_rays, project, rotation_z, transform
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import hand_motion, make_sequence, state_after, to_triplet
 from egosim_jax.worlds.tabletop.bodies import box, make_loose, split_edges
@@ -14,6 +14,7 @@ from egosim_jax.worlds.tabletop.raycast import Placed, RayCaster
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, TABLE, Scene, sample_scene
 
 SPEC = VideoSpec(frames=5, height=48, width=80)
+INTRINSICS = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +30,22 @@ def points_of(clip, frame):
     return transform(cameras.world_from_camera[frame], local.reshape(-1, 3)).reshape(local.shape)
 
 
+def caster_of(body, place_m=(0, 0, 0), turn=0.0):
+    """Return the ray caster of a body, and the body's pose."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_z(turn), place_m
+    placed = Placed(part=body.parts[0], world_from_part=pose, instance_id=FIRST_BODY)
+    return RayCaster([placed]), pose
+
+
+def level_camera(place_m):
+    """Return the pose of a camera that looks along y."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pose[:3, 3] = place_m
+    return pose
+
+
 def test_the_table_is_planar(clips):
     for clip in clips:
         for frame in range(SPEC.frames):
@@ -38,19 +55,11 @@ def test_the_table_is_planar(clips):
 
 
 def test_depth_and_ids_of_a_box_against_its_slabs():
-    rng = np.random.default_rng(0)
-    body = make_loose("box", "red", rng)
-    pose = np.eye(4)
-    turn = 0.7
-    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    pose[:3, 3] = [0.02, 0.3, 0]
-    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
-    camera = np.eye(4)
-    camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    camera[:3, 3] = [0, -0.1, 0.05]
-    intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
-    image = caster.render(camera, intrinsics, height=48, width=80)
-    rays = pixel_rays(intrinsics, height=48, width=80).reshape(-1, 3)
+    body = make_loose("box", "red", np.random.default_rng(0))
+    caster, pose = caster_of(body, (0.02, 0.3, 0), turn=0.7)
+    camera = level_camera((0, -0.1, 0.05))
+    frame = caster.render(camera, INTRINSICS, height=48, width=80)
+    rays = pixel_rays(INTRINSICS, height=48, width=80).reshape(-1, 3)
     body_from_camera = invert(pose) @ camera
     start = body_from_camera[:3, 3]
     way = rays @ body_from_camera[:3, :3].T
@@ -61,23 +70,18 @@ def test_depth_and_ids_of_a_box_against_its_slabs():
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
     hit = (enter <= leave) & (enter > 0)
     assert hit.sum() > 50
-    assert ((image.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
-    both = hit & np.isfinite(image.depth_m.ravel())
-    np.testing.assert_allclose(image.depth_m.ravel()[both], enter[both], rtol=1e-5)
+    assert ((frame.ids.ravel() == FIRST_BODY) != hit).mean() < 1e-3
+    both = hit & np.isfinite(frame.depth_m.ravel())
+    np.testing.assert_allclose(frame.depth_m.ravel()[both], enter[both], rtol=1e-5)
 
 
 def test_a_ball_is_seen_where_its_pose_projects():
-    rng = np.random.default_rng(0)
-    body = make_loose("ball", "red", rng)
-    pose = np.eye(4)
-    pose[:3, 3] = [0.02, 0.3, 0]
-    caster = RayCaster([Placed(part=body.parts[0], world_from_part=pose, number=FIRST_BODY)])
-    camera = np.eye(4)
-    camera[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    camera[:3, 3] = [0.02, -0.1, body.size_m[2] / 2]
+    body = make_loose("ball", "red", np.random.default_rng(0))
+    caster, pose = caster_of(body, (0.02, 0.3, 0))
+    camera = level_camera((0.02, -0.1, body.size_m[2] / 2))
     intrinsics = np.array([[160.0, 0, 79.5], [0, 160.0, 47.5], [0, 0, 1]])
-    image = caster.render(camera, intrinsics, height=96, width=160)
-    rows, columns = np.nonzero(image.ids == FIRST_BODY)
+    frame = caster.render(camera, intrinsics, height=96, width=160)
+    rows, columns = np.nonzero(frame.ids == FIRST_BODY)
     center = pose @ [0, 0, body.size_m[2] / 2, 1]
     u, v = project(intrinsics, transform(invert(camera), center[None, :3]))
     assert abs(columns.mean() - u[0]) < 0.5
@@ -143,7 +147,7 @@ def test_black_cloths_change_the_table_alone(clips):
     np.testing.assert_array_equal(again.frames, clips[0].frames)
 
 
-def test_fewer_than_no_cloths_are_refused():
+def test_a_negative_number_of_cloths_is_refused():
     with pytest.raises(InputError, match="--black-cloths"):
         next(make_sequence(3, spec=SPEC, black_cloths=-1))
 
@@ -209,14 +213,12 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one():
 
 def test_a_camera_inside_an_object_is_refused():
     body = make_loose("box", "red", np.random.default_rng(0))
-    caster = RayCaster([Placed(part=body.parts[0], world_from_part=np.eye(4), number=FIRST_BODY)])
-    camera = np.eye(4)
+    caster, camera = caster_of(body)[0], np.eye(4)
     camera[2, 3] = body.size_m[2] / 2
-    intrinsics = np.array([[60.0, 0, 39.5], [0, 60.0, 23.5], [0, 0, 1]])
     with pytest.raises(InputError, match="inside an object"):
-        caster.render(camera, intrinsics, height=48, width=80)
+        caster.render(camera, INTRINSICS, height=48, width=80)
     camera[0, 3] = 0.2
-    assert (caster.render(camera, intrinsics, height=48, width=80).ids == 0).all()
+    assert (caster.render(camera, INTRINSICS, height=48, width=80).ids == 0).all()
 
 
 def test_a_state_outside_the_view_is_refused(clips):
@@ -250,13 +252,13 @@ def test_cameras_that_are_not_rigid_are_refused(clips, change, message):
         replace(clips[0].cameras, world_from_camera=poses)
 
 
-def test_a_camera_without_a_image_is_refused(clips):
+def test_invalid_intrinsics_are_refused(clips):
     with pytest.raises(InputError, match="invalid intrinsics or image size"):
         replace(clips[0].cameras, intrinsics_px=np.diag([0.0, 60.0, 1.0]))
 
 
 def act_on(verb, kind="human"):
-    """Return the first action of that verb among the seeds, and its moments."""
+    """Return the first scene and intent with a verb among the seeds, and the moments."""
     for seed in range(200):
         rng = np.random.default_rng(seed)
         scene = sample_scene(rng)

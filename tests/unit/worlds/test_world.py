@@ -263,13 +263,13 @@ def test_an_executed_clip_has_its_ground_truth(cameras):
     assert clip.frames.shape == (5, 32, 48, 3)
     assert clip.target == ""
     assert (clip.number, after.number) == (0, 1)
-    image, state = start.observe(action.cameras)
-    np.testing.assert_array_equal(image.colors, clip.first.colors)
+    first, state = start.observe(action.cameras)
+    np.testing.assert_array_equal(first.colors, clip.first.colors)
     np.testing.assert_array_equal(state.points_m, clip.state.points_m)
 
 
 def differences(seeds, kind: Kind, frames=17):
-    """Return for scripts the largest and the last distance of the target, and that of others."""
+    """Return per script the target's maximum and last error, and the maximum error of others."""
     found = []
     for seed in seeds:
         rng = np.random.default_rng([seed, 0 if kind == "human" else 1])

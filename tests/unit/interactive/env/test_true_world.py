@@ -31,7 +31,7 @@ def carry():
     joints = POLICIES[0].plan(script, np.random.default_rng(0))
     body = script.scene.body(script.intent.name)
     offset = script.intent.goal_m - body.world_from_body[:3, 3]
-    number = script.scene.number(script.intent.name)
+    number = script.scene.instance_id(script.intent.name)
     return seed, joints.reshape(VIDEO.frames, -1), MoveObject(number=number, offset_m=tuple(offset))
 
 

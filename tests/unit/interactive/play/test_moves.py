@@ -9,7 +9,7 @@ from egosim_jax.geometry import rotation_z
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.play.moves import Pose, drive, intent_of, perform, reach, remembered
 from egosim_jax.types import VideoSpec
-from egosim_jax.worlds.tabletop import World, opening
+from egosim_jax.worlds.tabletop import World, start_of_sequence
 from egosim_jax.worlds.tabletop.hand_motion import Grip
 
 VIDEO = VideoSpec(frames=17, height=24, width=40, fps=8)
@@ -17,7 +17,7 @@ VIDEO = VideoSpec(frames=17, height=24, width=40, fps=8)
 
 @pytest.fixture(scope="module")
 def scene():
-    return opening(0, spec=VIDEO)[0]
+    return start_of_sequence(0, spec=VIDEO)[0]
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -57,28 +57,28 @@ def test_the_true_world_puts_an_object_where_it_is_carried(scene):
     assert intent.caption == "picks up the red box and puts it down to the left."
     poses = [before, *perform(scene, intent, before, "right", 17)]
     rows = np.clip([pose.row("right", np.zeros(6)) for pose in poses], *spec.bounds)
-    camera = opening(0, spec=VIDEO)[1]
+    camera = start_of_sequence(0, spec=VIDEO)[1]
     action, _ = spec.to_action(rows, camera=camera, prompt=intent.caption)
     after = World(scene=scene).move(action)[1].scene.body("red box")
     np.testing.assert_allclose(after.world_from_body[:2, 3], place, atol=0.01)
 
 
 def test_the_state_remembers_where_an_object_was_put(scene):
-    state = opening(0, spec=VIDEO)[3]
+    state = start_of_sequence(0, spec=VIDEO)[3]
     motion = np.eye(4)
     motion[:2, 3] = 0.1, -0.05
-    number = scene.number("red box")
+    number = scene.instance_id("red box")
     moved = remembered(scene, replace(state, world_from_object={number: motion}))
     gap = moved.body("red box").world_from_body - scene.body("red box").world_from_body
     np.testing.assert_allclose(gap[:3, 3], [0.1, -0.05, 0])
 
 
 def test_the_state_remembers_how_far_a_drawer_is_open():
-    scene, _, _, state = opening(1, spec=VIDEO)
+    scene, _, _, state = start_of_sequence(1, spec=VIDEO)
     name = "green cabinet"
     opened = scene.with_opening(name, 0.75)
     motion = opened.first_part_pose(name) @ np.linalg.inv(scene.first_part_pose(name))
-    state = replace(state, world_from_object={scene.number(name): motion})
+    state = replace(state, world_from_object={scene.instance_id(name): motion})
     assert remembered(scene, state).openings[name] == pytest.approx(0.75)
     verb = intent_of("open or close", remembered(scene, state), name).verb
     assert verb == "close"

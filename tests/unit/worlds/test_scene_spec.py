@@ -1,4 +1,4 @@
-"""Scenes by hand: built as described, or refused with the rule, the value and the fix."""
+"""Scenes of your own are built as described, or refused with rule, value and fix."""
 
 import json
 
@@ -55,12 +55,12 @@ def test_a_scene_is_read_as_it_was_written(tmp_path):
         ({"shape": "drawer", "turn_degrees": 5}, "has a fixed size"),
     ],
 )
-def test_an_object_that_cannot_be_is_refused(change, message):
+def test_an_invalid_object_is_refused(change, message):
     with pytest.raises(InputError, match=message):
         Object(**{"shape": "box", "color": "red", "place_m": (0.1, 0.3), **change})
 
 
-def test_bodies_of_one_name_or_one_place_are_refused():
+def test_bodies_with_equal_names_or_overlap_are_refused():
     red = Object(shape="box", color="red", place_m=(0.1, 0.3))
     with pytest.raises(InputError, match="two objects named red box"):
         make_scene([red, red])
@@ -93,7 +93,7 @@ def test_bodies_of_one_name_or_one_place_are_refused():
         ),
     ],
 )
-def test_a_file_that_is_no_scene_is_refused_by_name(tmp_path, written, message):
+def test_an_invalid_scene_file_is_refused_by_name(tmp_path, written, message):
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(written))
     with pytest.raises(InputError, match=message) as error:

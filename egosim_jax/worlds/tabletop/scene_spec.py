@@ -1,12 +1,12 @@
-"""Scenes by hand: bodies with their places, in Python or as a JSON file.
+"""Scenes of your own: bodies with their places, in Python or as a JSON file.
 
     {"format": "egosim_jax.scene", "version": 1, "room": 0,
      "objects": [{"shape": "box", "color": "red", "place_m": [0.1, 0.3], "turn_degrees": 20},
                  {"shape": "cup", "color": "blue", "on": "red box"},
                  {"shape": "lidded box", "color": "green", "place_m": [-0.1, 0.3], "opening": 1}]}
 
-The name of a body is its color and shape, as "red box"; a drawer is a "cabinet", a lidded box a
-"chest". Nothing else may be in the file, and what is not given has its default.
+The name of a body is its color and shape, such as "red box"; a drawer is a "cabinet", a lidded box
+a "chest". Missing keys have their defaults; unknown keys are refused.
 """
 
 from __future__ import annotations
@@ -48,32 +48,32 @@ from egosim_jax.worlds.tabletop.support import (
 
 FORMAT, VERSION = "egosim_jax.scene", 1
 SIZE_M = (0.02, 0.20)
-"""Smallest and largest width or height of a loose body in meters."""
+"""Minimum and maximum width or height of a loose body in meters."""
 MAX_OBJECTS = 40
-"""Most bodies of a scene."""
+"""Maximum number of bodies of a scene."""
 NAMES = {"drawer": "cabinet", "lidded box": "chest"}
-"""Words for furniture in names."""
+"""Nouns for furniture in names."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Object:
-    """A body of a scene by hand."""
+    """Description of one body of a scene."""
 
     shape: Shape
     """Class of its shape."""
     color: str
     """Name of its color; a black one is never the target of a script."""
     place_m: tuple[float, float] | None = None
-    """Position x and y of its center in meters; that of the body below if `on` is given."""
+    """Position x and y of its center in meters; None: the center of the body named by `on`."""
     on: str | None = None
-    """Name of the supporting body, which precedes it; the table if not given."""
+    """Name of a supporting body earlier in the list; None: the table."""
     turn_degrees: float = 0.0
-    """Rotation about the vertical in degrees; furniture is not turned."""
+    """Rotation about the vertical in degrees; 0 for furniture."""
     width_m: float | None = None
-    """Width and depth of a loose body in meters: 0.072, of a ring 0.09."""
+    """Width and depth of a loose body in meters; None: 0.072, or 0.09 for a ring."""
     height_m: float | None = None
-    """Height of a loose body in meters: 0.075, of a ring 0.03; a ball is as high as wide."""
+    """Height of a loose body in meters; None: 0.075, 0.03 for a ring. A ball has its width."""
     pattern: Pattern = "plain"
     """Pattern of a loose body."""
     opening: float = 0.0
@@ -90,7 +90,7 @@ class Object:
         return self.shape in LOOSE
 
     def __post_init__(self) -> None:
-        """Check every value; raise `InputError`."""
+        """Raise `InputError` for an invalid value."""
         for field, value, known in (
             ("shape", self.shape, get_args(Shape)),
             ("color", self.color, tuple(COLORS)),
@@ -163,10 +163,10 @@ def _is_number(value: Any) -> bool:
 
 
 def make_scene(objects: Sequence[Object], *, room: int = 0) -> Scene:
-    """Return the scene of some bodies; `room` is the seed of the colors of table and walls.
+    """Build a scene of bodies; `room` seeds the colors of table and walls.
 
-    Raises `InputError` if two bodies have one name or overlap, or if `on` names no body before that
-    others can stand on.
+    Raises `InputError` if two bodies have equal names or overlap, or if `on` does not name an
+    earlier body that can support others.
     """
     check_seed(room, name="room")
     if not 0 < len(objects) <= MAX_OBJECTS:
@@ -204,13 +204,13 @@ def _below(scene: Scene, item: Object) -> np.ndarray:
 
 def _put_on(scene: Scene, item: Object) -> Scene:
     pose = scene.body(item.name).world_from_body.copy()
-    pose[2, 3] = -FLOOR_M  # above everything
+    pose[2, 3] = -FLOOR_M  # above all bodies: `support_below` looks down from there
     scene = scene.with_pose(item.name, pose)
     height, below = support_below(scene, scene.body(item.name))
     if below != item.on:
         raise InputError(
-            f"The {item.name} does not stand on the {item.on}: what others stand on must be flat "
-            f"and bear nothing else; it would rest on {below or 'the table'}. Change on."
+            f"The {item.name} does not stand on the {item.on}: a supporting body must be flat "
+            f"and carry no other; it would rest on {below or 'the table'}. Change on."
         )
     pose[2, 3] = height
     return scene.with_pose(item.name, pose)
@@ -232,7 +232,7 @@ def _check_apart(scene: Scene) -> None:
 
 
 def read_scene(path: Path | str) -> Scene:
-    """Read a scene from a JSON file. Raises `InputError` for what is damaged or not valid."""
+    """Read a scene from a JSON file. Raises `InputError` for a damaged or invalid file."""
     path = Path(path)
     written = read_json(path)
     name = quote_path(path)
@@ -271,8 +271,8 @@ def _object(item: Any) -> Object:
 
 
 def write_scene(path: Path | str, objects: Sequence[Object], *, room: int = 0) -> None:
-    """Write a scene as JSON, with what is not a default. Raises what `make_scene` raises."""
-    make_scene(objects, room=room)
+    """Write a scene as JSON, without default values. Raises the errors of `make_scene`."""
+    make_scene(objects, room=room)  # refuse an invalid scene before writing
     items = [
         {f.name: v for f in dataclasses.fields(Object) if (v := getattr(item, f.name)) != f.default}
         for item in objects
