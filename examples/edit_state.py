@@ -1,7 +1,7 @@
-"""Move an object in the 3D state by hand, and generate the same action from either state.
+"""Move an object in the 3D state, and generate the same action from either state.
 
-A state is arrays: what is changed in it is there in the next clip, because each clip is generated
-from a view of the state.
+A state is a set of arrays. Each clip is generated from a view of the state, so the next clip shows
+your change.
 """
 
 from dataclasses import replace

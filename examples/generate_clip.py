@@ -1,4 +1,4 @@
-"""Generate one scene with three seeds in one batch, and write clips next to ground truth."""
+"""Generate one scene with three seeds in one batch; write each clip next to the ground truth."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Close the loop around a generator of your own: here the view itself, the baseline to beat."""
+"""Close the loop around your own generator: here it returns the view, the baseline to beat."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Register a perception pipeline whose stages are one of our own and those of `classical`."""
+"""Register a perception pipeline: the stages of `classical`, and one of your own."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
 
 def print_shares(clip, action, state, observation):
-    """Print how much of the clip's last frame hands and objects take."""
+    """Print the shares of hands and objects in the clip's last frame."""
     ids = observation.require("object_ids", "print_shares")[-1]
     print(f"clip {state.step + 1}: hands {(ids < 0).mean():.1%}, objects {(ids > 0).mean():.1%}")
     return observation
@@ -21,7 +21,7 @@ class Counting:
     """Config of the pipeline; its fields are options of `egosim simulate --perception`."""
 
     def build(self, ground_truth=None):
-        """Return the pipeline; a config's fields would be its parameters."""
+        """Return the pipeline. A config with fields would pass them as parameters."""
         classical = egosim.get_perception("classical")().build()
         return Pipeline(stages=(*classical.stages, print_shares))
 

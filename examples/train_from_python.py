@@ -1,4 +1,4 @@
-"""Train by a recipe, from Python: all four networks of `debug`, and a clip of the result."""
+"""Train all four networks of `debug` by its recipe, and generate a clip with them."""
 
 from dataclasses import replace
 from pathlib import Path
