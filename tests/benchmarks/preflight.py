@@ -167,16 +167,16 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
     ]
     return "\n\n".join(
         [
-            "Peak memory of full fine-tuning of `egosim_14b`, in GiB per device, by `--remat` and by\n"
-            "clips per device at a time. The batch is 32 (64 on 64 devices). A peak that does not fit\n"
-            "is shown with the capacity:",
+            "Peak memory of full fine-tuning of `egosim_14b`, in GiB per device, by `--remat` and\n"
+            "by clips per device at a time. The batch is 32 (64 on 64 devices). A peak that does\n"
+            "not fit is shown with the capacity:",
             _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
-            "Peak memory of every recipe, in GiB per device (clips per device at a time). A batch that\n"
-            "the devices cannot share in the recipe's parts uses fewer parts\n"
+            "Peak memory of every recipe, in GiB per device (clips per device at a time). A batch\n"
+            "that the devices cannot share in the recipe's parts uses fewer parts\n"
             "(`--training.grad-accum-steps`) or is raised to one clip per device:",
             _rows(["recipe", *(f"`{target}`" for target in TARGETS)], by_target),
-            "Generation with `egosim_14b`, 50 steps, with the weights of all networks. The time is the\n"
-            "roofline, a lower bound from the devices' peak:",
+            "Generation with `egosim_14b`, 50 steps, with the weights of all networks. The time\n"
+            "is the roofline, a lower bound from the devices' peak:",
             _rows(["target", "clips", "GiB", "roofline"], generation),
         ]
     )
