@@ -161,22 +161,22 @@ def tables(known: dict[str, dict[str, Any]]) -> str:
         by_target.append([f"`{recipe}`", *shown])
     makes = [cell for cell in all_cells() if isinstance(cell, Generation) and found(cell)]
     generation = [
-        [f"`{cell.target}`", "one, shared" if cell.shared else "one a device"]
+        [f"`{cell.target}`", "one, shared" if cell.shared else "one per device"]
         + [_cell(found(cell)), f"{known[repr(cell)]['roofline_s']:.0f} s"]
         for cell in makes
     ]
     return "\n\n".join(
         [
-            "All weights of `egosim_14b` trained, batch 32 (64 on 64 devices), GiB of a device by\n"
-            "`--remat` and by clips on a device at a time; a peak that does not fit is shown with\n"
-            "the capacity:",
+            "Peak memory of full fine-tuning of `egosim_14b`, in GiB per device, by `--remat` and\n"
+            "by clips per device at a time. The batch is 32 (64 on 64 devices). A peak that does\n"
+            "not fit is shown with the capacity:",
             _rows(["target, clips", *(f"`{remat}`" for remat in REMATS)], by_remat),
-            "Every recipe, GiB of a device (clips on a device at a time). A batch that the\n"
-            "devices cannot share in the recipe's parts is taken in fewer\n"
-            "(`--training.grad-accum-steps`), or raised to one clip a device:",
+            "Peak memory of every recipe, in GiB per device (clips per device at a time). A batch\n"
+            "that the devices cannot share in the recipe's parts uses fewer parts\n"
+            "(`--training.grad-accum-steps`) or is raised to one clip per device:",
             _rows(["recipe", *(f"`{target}`" for target in TARGETS)], by_target),
-            "Generation with `egosim_14b`, 50 steps, with the weights of all networks; the time\n"
-            "is the roofline, the least that the devices' peak allows:",
+            "Generation with `egosim_14b`, 50 steps, with the weights of all networks. The time\n"
+            "is the roofline, a lower bound from the devices' peak:",
             _rows(["target", "clips", "GiB", "roofline"], generation),
         ]
     )
