@@ -1,8 +1,14 @@
-"""From rendered scene, hands, first frame and text to the conditioning inputs of the denoiser.
+"""Conditioning inputs of the denoiser: their order, packing, ranges, tokens and dropout.
 
-One rule, one place: `layout` orders the input channels, `mask` packs the mask, `video` and `image`
-set the ranges of pixels, `text` tokenizes prompts, `condition` holds the inputs, `dropout` hides
-them in training.
+Every rule that training and generation must share is here, once. Encoding by networks is not: see
+`generation/encoding.py`.
+
+    ChannelLayout        order of the input channels
+    Condition            inputs of the denoiser for a batch
+    ConditionDropout     classifier-free dropout of the inputs in training
+    pack_mask            mask video to channels of the latent grid
+    clip_pixels          first frame to the image encoder's input
+    to_model, to_uint8   pixels between uint8 and [-1, 1]
 """
 
 from egosim_jax.conditioning.condition import Condition

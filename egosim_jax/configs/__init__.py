@@ -1,4 +1,13 @@
-"""Configs of the released models by name, one file each."""
+"""Configs of models: `ModelConfig` in `model.py`, and one file for each released model.
+
+Sizes, samplings and weights of a model are chosen here. Code that runs a model is in `models` and
+`generation`.
+
+    get, names           config by name
+    sampled              config with one of its named samplings
+    weights_of           folder of a config's weights: given, shipped or fetched
+    release, releases    weights on a model hub
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configs of models, each a choice of networks, and containers of their networks."""
+"""Config of a model, and the container of its networks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import InputError, Triplet, VideoGrid, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
-"""Role of a network in a model, which is also the stem of its file of weights."""
+"""Role of a network in a model, and stem of its weights file."""
 NAMES: tuple[Name, ...] = ("dit", "vae", "text", "image")
 
 
@@ -50,7 +50,7 @@ class ModelConfig:
     """Config of a model: its networks, its conditioning and its sampling."""
 
     numerics_only: ClassVar[tuple[str, ...]] = ("steps",)
-    """Fields that may change when a training is resumed: it draws no samples with them."""
+    """Fields that may change when a training resumes, because training draws no samples."""
     name: str
     """Name of the model on the command line."""
     video: VideoSpec
@@ -155,7 +155,7 @@ class ModelConfig:
 
     @property
     def visited(self) -> int | tuple[int | float, ...]:
-        """Number of denoising steps or, with a strength, the timesteps that are visited.
+        """Number of denoising steps or, with a strength, the timesteps to visit.
 
         Raises `InputError` for a strength outside (0, 1] or of a model without a prior.
         """
@@ -232,7 +232,7 @@ class ModelConfig:
 
 
 class Networks(nnx.Module):
-    """Networks of a model, all of them or some; an attribute is None where one is absent."""
+    """Networks of a model; the attribute of an absent network is None."""
 
     dit: Denoiser
     vae: VideoCodec

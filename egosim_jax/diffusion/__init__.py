@@ -1,4 +1,13 @@
-"""Diffusion: processes from data to noise, solvers, guidance and the training objective."""
+"""Diffusion: processes from data to noise, solvers, guidance and the training objective.
+
+Pure functions of arrays and a predicting function belong here. Networks do not.
+
+    RectifiedFlow, VariancePreserving       processes
+    Euler, DDIM, UniPC, DPMSolver           solvers
+    integrate                               the sampling loop, one scan
+    Guidance                                classifier-free guidance
+    Objective                               training loss at random noise levels
+"""
 
 from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance

@@ -171,7 +171,7 @@ class BatchJob:
         """Return the ids of the windows whose clips are there, and listed as done.
 
         Raises `InputError` if one is of another window, prompt or other conditions, and would be
-        taken for this one. Lines of earlier versions do not say of which conditions.
+        taken for this one.
         """
         results, finished = read_results(self.out) or {}, set()
         for window in windows:

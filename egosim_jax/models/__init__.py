@@ -1,8 +1,13 @@
-"""Networks in flax.nnx that do no I/O and know no mesh.
+"""Networks in flax.nnx, and the Protocols that every network satisfies.
 
-A network's config builds it and names its conversion table. A model (`networks.ModelConfig`) is a
-choice of four such configs, so that a family is added by writing networks that satisfy the
-Protocols of this module.
+Networks do no I/O and know no mesh. A network's config builds it and names its conversion table; a
+`configs.model.ModelConfig` combines four of them, so a family is added by writing networks that
+satisfy the Protocols of this module.
+
+    Denoiser, VideoCodec, TextEncoder, ImageEncoder   networks
+    DenoiserConfig, VideoCodecConfig, ...             their configs
+    wan, cogvideox                                    model families
+    lora                                              low-rank adaptation
 """
 
 from __future__ import annotations

@@ -1,1 +1,9 @@
-"""Preflight: compile a program for a machine that need not be present, and read off its costs."""
+"""Compile a program for a machine that need not be present, and report its costs.
+
+Programs come from the caller. Nothing here knows models or training.
+
+    targets   target machines
+    report    memory, collectives and roofline time, and whether it fits
+    hlo       memory traffic and collectives, from the HLO text
+    flops     FLOPs of a traced program
+"""

@@ -1,8 +1,13 @@
-"""Rendering of a scene's points, of hands and of meshes along a camera path.
+"""Rendering of points, hands and meshes along a camera path.
 
-`reference` is in NumPy, `jitted` in JAX; both are a `Renderer` and draw the same images. Sources:
-EgoSim, section 3.2 (rendering of the prior) and the released `render_16fps_aligned.py`; colors and
-sizes of the hands are measured on the published videos.
+Two modules satisfy `Renderer` and draw the same images: `reference` in NumPy and `jitted` in JAX.
+Reading and writing of scenes is in `state`. Sources: EgoSim, section 3.2 (rendering of the prior),
+and the released `render_16fps_aligned.py`; colors and sizes of the hands are measured on the
+published videos.
+
+    Renderer, get        interface, and a renderer by name
+    hand_mesh, mano      meshes of hands
+    portrait, rerun_log  views of a state for humans
 """
 
 from __future__ import annotations

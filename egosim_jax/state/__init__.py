@@ -1,4 +1,11 @@
-"""Operations on the scene state: alignment, interaction filter, fusion, storage.
+"""Operations on the scene state, in NumPy and Open3D: alignment, filter, fusion, storage.
 
-NumPy and Open3D, no JAX: any generator can drive the loop.
+No module imports jax, and none reads a video: `perception` does that.
+
+    fuse        state and perceived clip to the next state
+    tsdf        depth images to a surface
+    filter      objects that the hands acted on
+    align       reconstruction to world
+    depth       first state from one RGB-D image
+    snapshot    storage as a folder; `ply` for other programs
 """

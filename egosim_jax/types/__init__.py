@@ -1,4 +1,11 @@
-"""Data types passed between the parts of the simulator, and the glossary of shapes.
+"""Data types that the parts of the simulator pass to each other, and the glossary of shapes.
+
+Frozen dataclasses with checks belong here. Operations on them do not, and no module imports jax: a
+generator in any framework can use these types.
+
+    Triplet, Clip, Action, View, SceneState, Perceived, GroundTruth   the data flow (`flow.py`)
+    Cameras, is_rigid                                                 camera paths (`cameras.py`)
+    InputError, VideoSpec, VideoGrid, MeshConfig, check_*             sizes (`settings.py`)
 
 Shapes are channel-last everywhere:
 
@@ -11,8 +18,6 @@ Videos on disk and in `Triplet` are uint8 RGB; models see RGB in [-1, 1]. A vide
 frames has k+1 latent frames: the first latent frame encodes one frame, the others four each.
 Masks are 1 (or 255) where nothing was observed and pixels must be generated, and 0 where the prior
 is kept.
-
-No module here imports JAX: generators in any framework can use these types.
 """
 
 from __future__ import annotations
