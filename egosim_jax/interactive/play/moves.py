@@ -19,7 +19,7 @@ from egosim_jax.worlds.tabletop.hand_motion import Grip, Hand, Intent
 from egosim_jax.worlds.tabletop.hands import Side, joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import DRAWER_M, Scene, moving_part
 
-Deed = Literal["carry", "lift", "open or close"]
+Interaction = Literal["carry", "lift", "open or close"]
 TRAVEL = 0.75
 """Share of a clip in which a driven hand moves; afterwards it opens or closes."""
 MIDDLE_M = (0.0, 0.25)
@@ -107,13 +107,13 @@ def reach(scene: Scene, name: str, side: Side) -> Pose:
     return Pose.of_grip(replace(grip, closure=hand_motion.opened("human")))
 
 
-def ready(scene: Scene, name: str, side: Side) -> Pose:
+def ready_pose(scene: Scene, name: str, side: Side) -> Pose:
     """Return the hand in the air in front of a body, where hands begin in the training clips."""
     grip = hand_motion.grip_on(scene, Intent(verb="lift", name=name), "human", side)
     return Pose.of_grip(hand_motion.relaxed(grip.point_m + hand_motion.BEFORE_M, side, "human"))
 
 
-def first_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] | None:
+def suggest_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] | None:
     """Return a body near the middle, and a free place across the hand, which hides it nowhere.
 
     None if there is no loose body with such a place.
@@ -130,7 +130,7 @@ def first_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] 
 
 
 def intent_of(
-    deed: Deed, scene: Scene, name: str, place_m: Float[np.ndarray, " 2"] | None = None
+    deed: Interaction, scene: Scene, name: str, place_m: Float[np.ndarray, " 2"] | None = None
 ) -> Intent:
     """Return a deed as the intent of a script, with its caption; `place_m` is where to carry to."""
     body = scene.body(name)
@@ -141,7 +141,7 @@ def intent_of(
     return hand_motion.carry(body, place_m)
 
 
-def remembered(scene: Scene, state: SceneState) -> Scene:
+def scene_from_state(scene: Scene, state: SceneState) -> Scene:
     """Return a first scene with its bodies where a state remembers them."""
     for body in scene.bodies:
         motion = state.world_from_object.get(scene.number(body.name))

@@ -18,8 +18,8 @@ import viser
 import viser.transforms as tf
 from jaxtyping import Float, UInt8
 
-from egosim_jax.interactive.play.moves import Deed, Pose, drive, intent_of, perform, reach
-from egosim_jax.interactive.play.played import Frames, Moment, Played
+from egosim_jax.interactive.play.moves import Interaction, Pose, drive, intent_of, perform, reach
+from egosim_jax.interactive.play.played_episode import Frames, Moment, PlayedEpisode
 from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError
@@ -34,7 +34,7 @@ HELP = (
     "Drag the **hand** or the **ring**, choose an object, press a button. Orbit with the mouse; "
     "the picture in the frustum is what the wearer would see."
 )
-DEEDS: tuple[tuple[str, Deed], ...] = (
+INTERACTIONS: tuple[tuple[str, Interaction], ...] = (
     ("put it on the ring", "carry"),
     ("lift it", "lift"),
     ("open or close it", "open or close"),
@@ -56,7 +56,9 @@ class LocalServer(viser.ViserServer):
 class Page:
     """Page of an episode that is played."""
 
-    def __init__(self, server: viser.ViserServer, new: Callable[[int], Played], played: Played):
+    def __init__(
+        self, server: viser.ViserServer, new: Callable[[int], PlayedEpisode], played: PlayedEpisode
+    ):
         """`new` begins an episode of a seed."""
         self._server, self._new, self.played = server, new, played
         self._changing, self._waiting = threading.Lock(), threading.Lock()
@@ -100,14 +102,14 @@ class Page:
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.set_panel_label("egosim play")
         blank = np.zeros((self.played.world.video.height, self.played.world.video.width, 3))
-        self._pictures = [
+        self._images = [
             gui.add_image(_large(blank.astype(np.uint8)), label=label, jpeg_quality=90)
             for label in ("Generated", "Ground truth")
         ]
         self._status = gui.add_markdown(HELP)
         with gui.add_folder("Act"):
             self._object: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", NOTHING)
-            self._choose("Let the hand", {label: partial(self._do, d) for label, d in DEEDS})
+            self._choose("Let the hand", {label: partial(self._do, d) for label, d in INTERACTIONS})
         with gui.add_folder("Hand"):
             self._closure = gui.add_slider("Grasp", 0.0, 1.0, 0.01, 0.25)
             self._closure.on_update(lambda _: self._draw_hand())
@@ -165,7 +167,7 @@ class Page:
             closure=float(self._closure.value),
         )
 
-    def _do(self, deed: Deed) -> None:
+    def _do(self, deed: Interaction) -> None:
         """Act on the chosen object, where the state remembers it."""
         played = self.played
         scene, name = self._believed(), self._object.value
@@ -180,7 +182,7 @@ class Page:
         self._step(poses, f"The {played.side} hand {intent.caption}")
 
     def _believed(self) -> Any:
-        scene = self.played.believed()
+        scene = self.played.current_scene()
         if scene is None:
             raise InputError(
                 "The scene is none of the tabletop world's, so nothing is known of its bodies: "
@@ -202,7 +204,7 @@ class Page:
 
         def show(frames: Frames, last: bool) -> None:
             for frame in frames:
-                self._pictures[0].image = _large(frame)
+                self._images[0].image = _large(frame)
             if last:
                 self._status.content = "Looking at what happened…"
 
@@ -241,10 +243,10 @@ class Page:
             slider.value = round(float(np.degrees(value) if number > 2 else 100 * value), 1)
         self._place(played.hand)
         self._filling = False
-        self._pictures[0].image = _large(now.frames[-1])
-        self._pictures[1].visible = now.truth is not None
+        self._images[0].image = _large(now.frames[-1])
+        self._images[1].visible = now.truth is not None
         if now.truth is not None and now.truth.done():
-            self._pictures[1].image = _large(now.truth.result()[1][-1])
+            self._images[1].image = _large(now.truth.result()[1][-1])
 
     def _place(self, hand: Pose) -> None:
         """Show the hand in a pose."""
@@ -310,9 +312,9 @@ class Page:
                 if self._shown != number:
                     return
                 then = time.monotonic()
-                self._pictures[0].image = _large(frame)
+                self._images[0].image = _large(frame)
                 if truth is not None:
-                    self._pictures[1].image = _large(truth[index])
+                    self._images[1].image = _large(truth[index])
                 time.sleep(max(0.0, pause - (time.monotonic() - then)))
 
     def _save(self) -> None:
@@ -331,7 +333,7 @@ class Page:
         self._open()
 
 
-def _video(played: Played) -> UInt8[np.ndarray, "f h w 3"]:
+def _video(played: PlayedEpisode) -> UInt8[np.ndarray, "f h w 3"]:
     """Return the clips up to the present moment, with the true ones to their right."""
     clips = []
     for moment in played.moments[1 : played.at + 1]:

@@ -5,24 +5,22 @@ from __future__ import annotations
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128)
-"""Upper bounds of the histogram of seconds."""
+"""Upper bounds of the histogram buckets, in seconds."""
 
 
 class Metrics:
-    """Metrics in their own registry, so that one process may hold several servers."""
+    """Metrics of one server, in a separate registry: a process may hold several servers."""
 
     def __init__(self) -> None:
         self.registry = registry = CollectorRegistry()
         self.sessions = Gauge("egosim_sessions", "Open sessions.", registry=registry)
-        self.queued = Gauge("egosim_queue", "Requests that wait or run.", registry=registry)
+        self.queued = Gauge("egosim_queue", "Waiting or running requests.", registry=registry)
         self.connections = Gauge("egosim_connections", "Open websockets.", registry=registry)
-        self.steps = Counter("egosim_steps", "Steps whose results were sent.", registry=registry)
-        self.refused = Counter(
-            "egosim_refused", "Requests that were refused.", ["code"], registry=registry
-        )
+        self.steps = Counter("egosim_steps", "Steps with a sent result.", registry=registry)
+        self.refused = Counter("egosim_refused", "Refused requests.", ["code"], registry=registry)
         self.first_frames = Histogram(
             "egosim_first_frames_seconds",
-            "Seconds from a streamed step's request until its first frames are sent.",
+            "Seconds from the request of a streamed step until its first frames are sent.",
             buckets=SECONDS,
             registry=registry,
         )

@@ -72,14 +72,14 @@ def generator():
 
 
 def test_callers_that_announced_themselves_share_a_program(generator):
-    batcher = Batcher(generator, most=4, wait_s=5.0)
+    batcher = Batcher(generator, max_batch=4, wait_s=5.0)
     assert [f.result() for f in run(batcher, [1, 2, 3, 4])] == [1, 2, 3, 4]
     assert [sorted(batch) for batch in generator.batches] == [[1, 2, 3, 4]]
     batcher.close()
 
 
 def test_the_largest_program_that_is_filled_runs(generator):
-    batcher = Batcher(generator, most=8, wait_s=0.0)
+    batcher = Batcher(generator, max_batch=8, wait_s=0.0)
     generator.held.clear()
     first = threading.Thread(target=ask, args=(batcher, 0))
     first.start()
@@ -95,17 +95,17 @@ def test_the_largest_program_that_is_filled_runs(generator):
 
 
 def test_a_batch_is_padded_to_the_devices_only(generator):
-    batcher = Batcher(generator, most=4, unit=2, wait_s=0.0)
+    batcher = Batcher(generator, max_batch=4, unit=2, wait_s=0.0)
     assert batcher.sizes == [2, 4]
     assert ask(batcher, 5) == 5
     assert generator.batches == [[5, 5]]
     with pytest.raises(InputError, match="a multiple of 2"):
-        Batcher(generator, most=3, unit=2)
+        Batcher(generator, max_batch=3, unit=2)
     batcher.close()
 
 
 def test_one_failing_clip_does_not_fail_the_others(generator):
-    batcher = Batcher(generator, most=2, wait_s=5.0)
+    batcher = Batcher(generator, max_batch=2, wait_s=5.0)
     found = run(batcher, [1, 13])
     assert found[0].result() == 1
     with pytest.raises(FloatingPointError, match="clip 13"):
@@ -114,7 +114,7 @@ def test_one_failing_clip_does_not_fail_the_others(generator):
 
 
 def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator):
-    batcher = Batcher(generator, most=2, wait_s=5.0)
+    batcher = Batcher(generator, max_batch=2, wait_s=5.0)
 
     def stream(seed):
         with batcher.announced():
@@ -131,7 +131,7 @@ def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator):
 
 
 def test_a_caller_that_fails_before_is_not_waited_for(generator):
-    batcher = Batcher(generator, most=2, wait_s=60.0)
+    batcher = Batcher(generator, max_batch=2, wait_s=60.0)
 
     def fail():
         with batcher.announced():

@@ -7,10 +7,10 @@ import pytest
 
 from egosim_jax.interactive.env import ActionSpec, Start, true_world
 from egosim_jax.interactive.env.chunks import make_chunk
-from egosim_jax.interactive.env.placed import PlacedAction, with_places
 from egosim_jax.interactive.env.rewards import MoveObject
 from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
+from egosim_jax.simulation.actions import PlacedAction, with_places
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_scripts
 from egosim_jax.worlds.tabletop.policies import POLICIES
@@ -131,7 +131,7 @@ def test_places_that_do_not_agree_with_the_joints_are_refused():
 
 
 def test_the_worlds_that_were_used_last_are_kept(monkeypatch):
-    monkeypatch.setattr(true_world, "REMEMBERED", 2)
+    monkeypatch.setattr(true_world, "MAX_CACHED_WORLDS", 2)
     world = TrueWorld(video=VIDEO)
     starts = [world.start(seed, JOINTS) for seed in (1, 2, 3)]
     kept = world.after(starts[0], "human")

@@ -89,7 +89,7 @@ def test_a_body_of_too_many_items_or_of_another_kind_is_refused(server):
 
 
 def test_a_body_that_comes_too_slowly_is_refused(server, monkeypatch):
-    monkeypatch.setattr(guard, "BODY_S", 0.01)
+    monkeypatch.setattr(guard, "BODY_TIMEOUT_S", 0.01)
     sent = []
 
     async def receive():

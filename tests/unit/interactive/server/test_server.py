@@ -11,7 +11,6 @@ import websockets.sync.client
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.client import Client
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.server import _Server, bind
 from egosim_jax.interactive.server.service import Service
 from egosim_jax.interactive.server.store import Limits, Store
@@ -287,7 +286,7 @@ def test_a_defect_is_logged_and_counted(server, monkeypatch, capsys):
 def test_sigterm_drains_then_ends(tmp_path):
     import uvicorn
 
-    service = Service(Store(tmp_path, painted(), Limits(), Metrics()), world="painted")
+    service = Service(Store(tmp_path, painted(), Limits()), world="painted")
     server = _Server(uvicorn.Config(lambda: None), service)
     server.handle_exit(15, None)
     for _ in range(100):

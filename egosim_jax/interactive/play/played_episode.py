@@ -21,10 +21,10 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import view_of
-from egosim_jax.interactive.env.start import Start, check_size
-from egosim_jax.interactive.play.moves import Pose, first_goal, ready, remembered
+from egosim_jax.interactive.play.moves import Pose, scene_from_state, suggest_goal
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 from egosim_jax.worlds.tabletop import Scene, World, opening
 from egosim_jax.worlds.tabletop.clips import film_scenes
@@ -67,7 +67,7 @@ class Timing:
     """Clip perceived, and state updated."""
 
 
-class Played:
+class PlayedEpisode:
     """Episode in progress; one thread at a time may change it."""
 
     def __init__(self, world: GeneratedWorld, folder: Path, start: Start, side: Side):
@@ -76,12 +76,12 @@ class Played:
         self.world = world
         self.side: Side = side
         self.scene = _true_scene(start, world)
-        self.goal = None if self.scene is None else first_goal(self.scene, side)
+        self.goal = None if self.scene is None else suggest_goal(self.scene, side)
         """Object and place that are suggested for a first clip."""
         name = f"play-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         actions = ActionSpec(sides=(side,), camera=True)
         if self.scene is not None and self.goal is not None and start.row is None:
-            row = ready(self.scene, self.goal[0], side).row(side, np.zeros(6))
+            row = ready_pose(self.scene, self.goal[0], side).row(side, np.zeros(6))
             start = replace(start, row=np.clip(row, *actions.bounds))
         self.session = Session.create(folder / name, world, actions, start)
         self._filming = ThreadPoolExecutor(1, thread_name_prefix="truth")
@@ -126,9 +126,9 @@ class Played:
         """State of the present moment."""
         return self.now.start.state
 
-    def believed(self) -> Scene | None:
+    def current_scene(self) -> Scene | None:
         """Return the scene as the state remembers it; None if the true world does not know it."""
-        return None if self.scene is None else remembered(self.scene, self.state)
+        return None if self.scene is None else scene_from_state(self.scene, self.state)
 
     def step(
         self,
