@@ -1,4 +1,4 @@
-"""Interactive use of a world, step by step: policies, remote clients, and people in a browser.
+"""Interactive use of a world, step by step: by policies, remote clients, or in the browser.
 
 Batch simulation of whole episodes is in `simulation`, offline scores are in `evaluation`.
 

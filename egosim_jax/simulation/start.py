@@ -9,6 +9,7 @@ past/1_hands.npz joints of all hands, if a hand of action 1 is out of view
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import no_type_check
@@ -89,20 +90,19 @@ class Start:
                 Image.fromarray(self.first_frame).save(temporary / FIRST_FRAME)
             for number, action in enumerate(self.past, start=1):
                 save_placed(temporary / "past", str(number), action)
-            write_json(
-                temporary / DESCRIPTION,
-                {
-                    "world_from_camera": self.camera.world_from_camera[0].tolist(),
-                    "intrinsics_px": np.asarray(self.camera.intrinsics_px, float).tolist(),
-                    "height": int(self.camera.height),
-                    "width": int(self.camera.width),
-                    "row": [] if self.row is None else self.row.tolist(),
-                    "prompt": self.prompt,
-                    "seed": int(self.seed),
-                    "steps": int(self.steps),
-                    "past": [[action.kind, action.prompt] for action in self.past],
-                },
-            )
+            description = {
+                "world_from_camera": self.camera.world_from_camera[0].tolist(),
+                "intrinsics_px": np.asarray(self.camera.intrinsics_px, float).tolist(),
+                "height": int(self.camera.height),
+                "width": int(self.camera.width),
+                "row": [] if self.row is None else self.row.tolist(),
+                "prompt": self.prompt,
+                "seed": int(self.seed),
+                "steps": int(self.steps),
+                "past": [[action.kind, action.prompt] for action in self.past],
+            }
+            text = json.dumps(description, indent=2) + "\n"
+            (temporary / DESCRIPTION).write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path) -> Start:

@@ -82,7 +82,7 @@ def test_an_object_is_picked_up_and_put_elsewhere_through_the_page(tmp_path):
             assert redness(image, old) > 0.3
             assert redness(image, new) < 0.05
         page.click("put it on the ring")
-        page.wait_for_text("remembered after")
+        page.wait_for_text("state updated after")
         generated, true = settled(page)
         page.screenshot(tmp_path / "page.png")
         assert redness(true, old) < 0.05

@@ -1,9 +1,9 @@
 """Websocket client of a session server. Needs no jax.
 
-    with Client("ws://127.0.0.1:8000") as client:
-        session = client.create(seed=3)
-        reply = session.step(rows)  # {"frames": ..., "row": ..., "info": ...}
-        reply = session.step(rows, show=lambda frames: ...)  # groups of decoded frames
+with Client("ws://127.0.0.1:8000") as client:
+    session = client.create(seed=3)
+    reply = session.step(rows)  # {"frames": ..., "row": ..., "info": ...}
+    reply = session.step(rows, show=lambda frames: ...)  # groups of decoded frames
 """
 
 from __future__ import annotations

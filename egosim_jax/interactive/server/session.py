@@ -240,7 +240,7 @@ class Session:
                 409,
                 "step_used",
                 f"Step {step_id} was made with another action: a used step_id repeats its result "
-                f"only for the same action. Committed is step {self.committed}; send step "
+                f"only for the same action. The last committed step is {self.committed}; send step "
                 f"{self.committed + 1}.",
             )
         last = self._last

@@ -117,7 +117,7 @@ def test_a_start_without_places_of_hands_is_read(tmp_path):
     away.save(tmp_path / "start")
     past = tmp_path / "start" / "past"
     assert sorted(p.name for p in past.iterdir()) == ["1.npz", "2.npz", "2_hands.npz"]
-    (past / "2_hands.npz").unlink()  # as earlier versions wrote it
+    (past / "2_hands.npz").unlink()  # as for actions without hidden hands
     found = Start.load(tmp_path / "start").past
     assert not any(isinstance(action, PlacedAction) for action in found)
     assert np.isnan(found[1].joints_m).all()
@@ -146,5 +146,5 @@ def test_a_state_of_elsewhere_is_refused():
     env = WorldEnv(world, actions=JOINTS)
     start = world.start(3, JOINTS)
     env.reset(options={"start": replace(start, state=replace(start.state, provenance={}))})
-    with pytest.raises(InputError, match="true world has the scenes of its seeds"):
+    with pytest.raises(InputError, match="true world has only the scenes of its seeds"):
         env.chunk_step(JOINTS.rest[None])

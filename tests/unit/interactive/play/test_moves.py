@@ -12,7 +12,7 @@ from egosim_jax.interactive.play.moves import (
     drive,
     intent_of,
     perform,
-    reach,
+    pre_grasp_pose,
     scene_from_state,
 )
 from egosim_jax.types import VideoSpec
@@ -42,7 +42,7 @@ def test_a_grip_is_the_pose_that_it_was_made_of():
 
 
 def test_a_driven_hand_closes_when_it_is_there(scene):
-    before = reach(scene, "red box", "right")
+    before = pre_grasp_pose(scene, "red box", "right")
     target = Pose(
         point_m=before.point_m + [0.1, 0, 0.05],
         rotation=rotation_z(0.5) @ before.rotation,
