@@ -48,7 +48,7 @@ def make_clip(page, button):
     clicked, events = page.run("window.clicked"), page.run("window.events")
     times = {what: seconds - clicked for seconds, what in reversed(events)}
     shown = [s - clicked for s, what in events if what == "image"]
-    live = [seconds for seconds in shown if seconds <= times["Looking at"] + 0.05]
+    live = [seconds for seconds in shown if seconds <= times["Updating the state"] + 0.05]
     return live[0], live[-1], times["state updated after"]
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import view_of
-from egosim_jax.interactive.play.moves import Pose, scene_from_state, suggest_goal
+from egosim_jax.interactive.play.moves import Pose, ready_pose, scene_from_state, suggest_goal
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size

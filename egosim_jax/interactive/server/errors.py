@@ -32,7 +32,7 @@ def as_request_error(error: Exception) -> RequestError:
         return RequestError(
             500,
             "not_finite",
-            "The clip has NaN or infinity: the step is not committed. Change its action.",
+            "The clip is not finite (NaN): the step is not committed. Change its action.",
         )
     return RequestError(
         500, "internal", "The step failed inside the server, which logged the error. Try again."

@@ -177,7 +177,7 @@ def test_http_does_not_stream(server):
     status, body = http(port, f"/sessions/{session['session']}/step", fields)
     error = json.loads(body)
     assert (status, error["code"]) == (422, "invalid")
-    assert "Connect there, or leave stream out. (stream)" in error["message"]
+    assert "Connect there, or omit stream. (stream)" in error["message"]
     fields["stream"] = False
     assert http(port, f"/sessions/{session['session']}/step", fields)[0] == 200
 

@@ -280,7 +280,7 @@ def test_limits_are_kept(tmp_path):
     session = store.create({})
     with pytest.raises(RequestError, match="Close one"):
         store.create({})
-    with pytest.raises(RequestError, match="more than a session's 2"):
+    with pytest.raises(RequestError, match="more than a session's maximum of 2 steps"):
         step(store, session, 3)
     session.busy.acquire()
     with pytest.raises(RequestError, match="one at a time"):
