@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import GeneratedWorld
-from egosim_jax.interactive.env.chunks import view_of
+from egosim_jax.interactive.env.chunks import straight_path, view_of
 from egosim_jax.interactive.play.moves import Pose, ready_pose, scene_from_state, suggest_goal
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.episode import Episode
@@ -174,9 +174,7 @@ class PlayedEpisode:
     def _rows(
         self, poses: Sequence[Pose], camera: Float[np.ndarray, " 6"]
     ) -> Float[np.ndarray, "k d"]:
-        before = self.row[-6:]
-        shares = np.linspace(0, 1, len(poses) + 1)[1:, None]
-        cameras = before + shares * (camera - before)
+        cameras = straight_path(self.row[-6:], camera, len(poses) + 1)
         rows = [pose.row(self.side, own) for pose, own in zip(poses, cameras, strict=True)]
         return np.clip(rows, *self.session.actions.bounds)
 

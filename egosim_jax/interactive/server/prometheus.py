@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import traceback
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from egosim_jax.interactive.server.errors import RequestError, as_request_error
 
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128)
 """Upper bounds of the histogram buckets, in seconds."""
@@ -30,6 +34,14 @@ class Metrics:
             buckets=SECONDS,
             registry=registry,
         )
+
+    def refuse(self, error: Exception) -> RequestError:
+        """Count an error and convert it for the client; log an internal one."""
+        found = as_request_error(error)
+        if found is not error and found.code == "internal":
+            traceback.print_exception(error)
+        self.refused.labels(found.code).inc()
+        return found
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus's text format."""

@@ -25,7 +25,7 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import REQUESTS, is_streamed
 from egosim_jax.interactive.server.server import make_app
-from egosim_jax.interactive.server.service import open_service, refusal
+from egosim_jax.interactive.server.service import open_service
 from egosim_jax.interactive.server.store import Limits
 from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.io.run import write_json
@@ -143,7 +143,7 @@ class Part:
         try:
             return {"reply": await self._service.handle(message)}
         except Exception as error:
-            return {"error": self._service.refused(error).body()}
+            return {"error": self._service.metrics.refuse(error).body()}
 
     async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
         """Yield each `reply` to a streamed step, or the `error` for the client."""
@@ -152,7 +152,7 @@ class Part:
                 async for reply in replies:
                     yield {"reply": reply}
             except Exception as error:
-                yield {"error": self._service.refused(error).body()}
+                yield {"error": self._service.metrics.refuse(error).body()}
 
     def __del__(self) -> None:
         """Finish the running steps. Ray calls it before it stops a replica."""
@@ -179,10 +179,6 @@ class Entrance:
     def active(self) -> Iterator[None]:
         """Do nothing: Ray itself waits for running requests."""
         yield
-
-    def refused(self, error: Exception) -> RequestError:
-        """Count an error and convert it for the client."""
-        return refusal(error, self.metrics)
 
     async def handle(self, message: Any) -> dict[str, Any]:
         """Return the reply of the session's part."""

@@ -49,10 +49,8 @@ SessionId = Annotated[str, Path(description="Id returned by create.")]
 class Requests(Protocol):
     """Object that replies to clients: a `Service`, or an `Entrance` to several."""
 
-    @property
-    def metrics(self) -> Metrics:
-        """Metrics of the requests."""
-        ...
+    metrics: Metrics
+    """Metrics of the requests."""
 
     @property
     def draining(self) -> bool:
@@ -65,10 +63,6 @@ class Requests(Protocol):
 
     def active(self) -> AbstractContextManager[None]:
         """Return the context that holds back a shutdown until the reply is sent."""
-        ...
-
-    def refused(self, error: Exception) -> RequestError:
-        """Convert the error of a request for the client."""
         ...
 
     async def handle(self, message: Any) -> dict[str, Any]:
@@ -114,7 +108,7 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
 
     @app.exception_handler(InputError)
     async def unreadable(_: Any, error: InputError) -> JSONResponse:
-        return response(service.refused(error))
+        return response(service.metrics.refuse(error))
 
     @app.exception_handler(HTTPException)
     async def refused(_: Any, error: HTTPException) -> JSONResponse:
@@ -132,7 +126,7 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
             try:
                 reply = await service.handle({**_from_json(fields), "request": name})
             except Exception as error:
-                return response(service.refused(error))
+                return response(service.metrics.refuse(error))
             data = await asyncio.to_thread(wire.pack_json, reply)
             return Response(data, media_type="application/json")
 
@@ -232,7 +226,7 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
             raise InputError("The message is text: it must be binary, packed as MessagePack.")
         message = await asyncio.to_thread(wire.unpack, data, limit=wire.MAX_BYTES)
     except Exception as error:
-        await socket.send_text(json.dumps(service.refused(error).body()))
+        await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
         return
     async with aclosing(service.replies(message)) as replies:
         while True:
@@ -241,7 +235,7 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
             except StopAsyncIteration:
                 return
             except Exception as error:
-                await socket.send_text(json.dumps(service.refused(error).body()))
+                await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
                 return
             await socket.send_bytes(reply)
 

@@ -6,7 +6,6 @@ import asyncio
 import sys
 import threading
 import time
-import traceback
 from collections.abc import AsyncGenerator, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -22,8 +21,7 @@ from jaxtyping import UInt8
 from egosim_jax.interactive.env import World, load_backend
 from egosim_jax.interactive.env.action_spec import LAYOUTS
 from egosim_jax.interactive.env.chunks import OBSERVATIONS, STATE_FIELDS, view_of
-from egosim_jax.interactive.server.errors import RequestError, as_request_error
-from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.requests import (
     REQUESTS,
     is_streamed,
@@ -42,14 +40,9 @@ class Service:
     """Replies to the requests of clients, from the sessions of a store."""
 
     def __init__(self, store: Store, *, world: str):
-        self.store, self._world = store, world
+        self.store, self.metrics, self._world = store, store.metrics, world
         self._active = 0
         self._quiet = threading.Condition()
-
-    @property
-    def metrics(self) -> Metrics:
-        """Metrics of the store."""
-        return self.store.metrics
 
     @property
     def draining(self) -> bool:
@@ -87,10 +80,6 @@ class Service:
                 self._active -= 1
                 self._quiet.notify_all()
 
-    def refused(self, error: Exception) -> RequestError:
-        """Count an error and convert it for the client; log an internal one."""
-        return refusal(error, self.metrics)
-
     def drain(self, timeout_s: float) -> bool:
         """Refuse new requests; return True once no request is running, False after the timeout."""
         self.store.draining = True
@@ -98,7 +87,7 @@ class Service:
             return self._quiet.wait_for(lambda: not self._active, timeout_s)
 
     async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply to a request. `refused` converts any error for the client."""
+        """Return the reply to a request. `Metrics.refuse` converts any error."""
         name, request = parse_request(message)
         if is_streamed(message):
             raise InputError(
@@ -124,7 +113,7 @@ class Service:
         run = {"step": store.step, "reset": store.reset, "load": store.load}[name]
         result = await self._wait(run(request))
         if name == "step":
-            store.metrics.steps.inc()
+            self.metrics.steps.inc()
         return await self._reply(session, result, observe)
 
     async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
@@ -220,15 +209,6 @@ class Service:
             view = await self._wait(self.store.submit(render, bounded=False))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
-
-
-def refusal(error: Exception, metrics: Metrics) -> RequestError:
-    """Count an error and convert it for the client; log an internal one."""
-    found = as_request_error(error)
-    if found is not error and found.code == "internal":
-        traceback.print_exception(error)
-    metrics.refused.labels(found.code).inc()
-    return found
 
 
 def open_service(

@@ -1,4 +1,4 @@
-"""The script of docs/serving.md, in the true world at a small size."""
+"""Script of docs/serving.md, in the true world with small frames."""
 
 import re
 from pathlib import Path

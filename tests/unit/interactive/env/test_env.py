@@ -1,4 +1,4 @@
-"""Gymnasium environments of a painted world: no model, no compilation."""
+"""Gymnasium environments of a painted world: without a model."""
 
 from dataclasses import replace
 

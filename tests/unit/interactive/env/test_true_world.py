@@ -23,7 +23,7 @@ WIDE = replace(JOINTS, workspace_m=((-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)))
 
 
 def carry():
-    """Seed, script, rows and task of a scene in which a body is carried."""
+    """Seed, rows and task of a scene with a carry script."""
     for seed in range(20):
         script = next(make_scripts(seed, spec=VIDEO))
         if script.intent.verb == "carry":
@@ -68,7 +68,7 @@ def test_a_start_of_the_past_continues_to_the_same_state():
 
 
 def follow(start, *paths):
-    """The start after some chunks, and the last chunk; nothing is filmed."""
+    """Start after some chunks, and the last chunk, without rendering."""
     for rows in paths:
         chunk = make_chunk(WIDE, rows, start=start, frames=VIDEO.frames, hide=True)
         start = start.after(start.state, chunk.rows[-1], chunk.action)
@@ -76,7 +76,7 @@ def follow(start, *paths):
 
 
 def taken():
-    """A start, rows that take a body, and rows that carry it out of view."""
+    """Start, rows that grasp a body, rows that carry it out of view, and task."""
     seed, rows, task = carry()
     start = replace(TrueWorld(video=VIDEO).start(seed, WIDE), row=rows[0])
     behind = (rows[9].reshape(-1, 3) + [0, -0.9, 0.2]).ravel()

@@ -1,4 +1,4 @@
-"""An episode that a person plays: its clips, and the return to earlier moments."""
+"""Played episode: clips, and the return to earlier moments."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A server over its sockets, in this process."""
+"""Server in this process, reached over its sockets."""
 
 import json
 import threading

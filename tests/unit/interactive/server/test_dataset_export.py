@@ -33,7 +33,7 @@ np.savez(sys.argv[2], frames=frames.astype(np.uint8).transpose(0, 2, 3, 1),
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Sessions: one of two steps and, after a reset, one more, closed and kept; an empty one."""
+    """Two sessions: one closed and kept with two steps, a reset and one step; one empty."""
     folder = tmp_path_factory.mktemp("recorded") / "sessions"
     store = Store(folder, painted(), Limits())
     session = store.create({"seed": 3, "session": "one"})

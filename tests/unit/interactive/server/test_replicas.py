@@ -1,4 +1,4 @@
-"""Parts of the sessions behind one entrance, without Ray: handles call the parts here."""
+"""Parts behind one entrance, without Ray: its handles call the parts directly."""
 
 import asyncio
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The server over its sockets, in this process."""
+"""Server in this process, reached over its sockets."""
 
 import json
 import threading
@@ -54,7 +54,7 @@ def test_a_client_that_vanishes_loses_nothing(server):
 
 
 class Gated(Painter):
-    """Painter whose last frames wait until they are asked for."""
+    """Painter whose last frames wait for `opened`."""
 
     def __init__(self):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Sessions of a painted world: journaled, resumed, never disturbed by each other."""
+"""Sessions of a painted world: journal, resumption, limits, isolation."""
 
 import shutil
 from dataclasses import replace
