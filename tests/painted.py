@@ -75,13 +75,12 @@ def _start(seed, kind, sides):
 
 def painted(perception=None, pause=0.0, batch=None):
     """World of the painter, by default without perception, which takes longest."""
-    painter = Painter(pause) if batch is None else Batcher(BatchPainter(pause), most=batch)
+    painter = Painter(pause) if batch is None else Batcher(BatchPainter(pause), max_batch=batch)
     return PaintedWorld(generator=painter, video=VIDEO, perception=perception)
 
 
 def main():
     """Serve the painted world with perception."""
-    from egosim_jax.interactive.server.prometheus import Metrics
     from egosim_jax.interactive.server.server import bind, serve
     from egosim_jax.interactive.server.service import Service
     from egosim_jax.interactive.server.store import Limits, Store
@@ -92,7 +91,7 @@ def main():
     parser.add_argument("--batch", type=int)
     given = parser.parse_args()
     backend = painted("classical", given.pause, given.batch)
-    service = Service(Store(given.folder, backend, Limits(), Metrics()), world="painted")
+    service = Service(Store(given.folder, backend, Limits()), world="painted")
 
     def ready(port):
         print(f"http://127.0.0.1:{port}", flush=True)

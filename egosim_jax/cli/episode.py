@@ -193,7 +193,7 @@ class FromLeRobot:
     def run(self) -> int:
         """Read the dataset, make, check and write the episode."""
         from egosim_jax import configs
-        from egosim_jax.interactive.env.lerobot_episode import episode_from_lerobot
+        from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
         from egosim_jax.state.snapshot import load, read_ply
 
         check_counts({"--clips": self.clips})

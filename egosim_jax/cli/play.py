@@ -18,8 +18,8 @@ from egosim_jax.types import InputError, check_counts, check_seed
 if TYPE_CHECKING:
     from egosim_jax.interactive.env.action_spec import ActionSpec
     from egosim_jax.interactive.env.backends import GeneratedWorld
-    from egosim_jax.interactive.env.start import Start
     from egosim_jax.interactive.play.viewer import LocalServer
+    from egosim_jax.simulation.start import Start
 
 HOST = "127.0.0.1"
 """Address of the page: viser asks nobody for a password."""
@@ -67,7 +67,7 @@ class Play:
         from egosim_jax.generation.stream import Streamer
         from egosim_jax.interactive.env.action_spec import ActionSpec
         from egosim_jax.interactive.env.backends import GeneratedWorld
-        from egosim_jax.interactive.play.played import Played
+        from egosim_jax.interactive.play.played_episode import PlayedEpisode
         from egosim_jax.interactive.play.viewer import Page
         from egosim_jax.io.atomic import lock_folder
         from egosim_jax.io.executables import share_with_jax
@@ -84,13 +84,13 @@ class Play:
         start = self._start(world, spec)
         streamer.compile()
 
-        def begin(seed: int) -> Played:
+        def begin(seed: int) -> PlayedEpisode:
             check_seed(seed, name="table")
-            return Played(world, self.out, world.start(seed, spec), self.hand)
+            return PlayedEpisode(world, self.out, world.start(seed, spec), self.hand)
 
         with lock_folder(self.out):
             server = self._serve()
-            Page(server, begin, Played(world, self.out, start, self.hand))
+            Page(server, begin, PlayedEpisode(world, self.out, start, self.hand))
             print(f"http://127.0.0.1:{server.get_port()}", flush=True)
             _wait()
             server.stop()
@@ -111,8 +111,8 @@ class Play:
                 ) from error
 
     def _start(self, world: GeneratedWorld, spec: ActionSpec) -> Start:
-        from egosim_jax.interactive.env.start import Start
         from egosim_jax.simulation.episode import Episode
+        from egosim_jax.simulation.start import Start
 
         if self.episode is None:
             return world.start(self.seed, spec)

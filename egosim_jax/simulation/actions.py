@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,8 @@ MAX_SPEED_M_S = 20.0
 """Fastest camera that is accepted, in meters per second."""
 ARRAYS = ("world_from_camera", "intrinsics_px", "joints_m")
 """Arrays of a file of an action."""
+PLACES = "_hands.npz"
+"""Suffix of the file with the joints of all hands, next to the action's file."""
 MAX_JSON_BYTES = 256 << 20
 """Largest .json file of an action in bytes."""
 _FINGERS = np.arange(1, 21).reshape(5, 4)
@@ -158,6 +161,59 @@ def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -
         kind=kind,
         prompt=prompt,
     )
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class PlacedAction(Action):
+    """Action whose hidden hands are missing from `joints_m`, with the joints of all hands.
+
+    A model does not get a hand that is out of view. The true world still moves it.
+    """
+
+    placed_m: Float[np.ndarray, "f n j 3"]
+    """Joints of all hands in the world, visible or hidden, in meters."""
+
+    def __post_init__(self) -> None:
+        """Check as `Action` does; `placed_m` must be finite and agree with `joints_m`."""
+        super().__post_init__()
+        placed, joints = np.asarray(self.placed_m), np.asarray(self.joints_m)
+        agree = placed.shape == joints.shape and np.isfinite(placed).all()
+        if not agree or not (np.isnan(joints) | (joints == placed)).all():
+            raise InputError(
+                f"placed_m is {placed.dtype} {placed.shape}: it must have the finite joints of all "
+                f"hands {joints.shape}, equal to joints_m where joints_m is finite."
+            )
+
+
+def places_of(action: Action) -> Float[np.ndarray, "f n j 3"]:
+    """Return the joints of all hands, including hidden ones if the action knows them."""
+    return action.placed_m if isinstance(action, PlacedAction) else action.joints_m
+
+
+def with_places(action: Action, placed_m: Float[np.ndarray, "f n j 3"]) -> PlacedAction:
+    """Return the action with the joints of all hands."""
+    own = {field.name: getattr(action, field.name) for field in fields(Action)}
+    return PlacedAction(**own, placed_m=placed_m)
+
+
+def save_placed(folder: Path, name: str, action: Action) -> None:
+    """Write an action to NAME.npz, and the joints of a `PlacedAction` to NAME_hands.npz."""
+    save_action(folder / f"{name}.npz", action)
+    if isinstance(action, PlacedAction):
+        with atomic_write(folder / f"{name}{PLACES}") as temporary:
+            np.savez(temporary, placed_m=np.ascontiguousarray(action.placed_m, float))
+
+
+def load_placed(
+    folder: Path, name: str, *, kind: Kind, size: tuple[int, int], prompt: str
+) -> Action:
+    """Read the files of `save_placed`; `size` is the height and width of the cameras."""
+    action = load_action(folder / f"{name}.npz", kind=kind, size=size, prompt=prompt)
+    path = folder / f"{name}{PLACES}"
+    if not path.exists():
+        return action
+    return with_places(action, read_arrays(path, {"placed_m": "float64"})["placed_m"])
 
 
 def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> Action:

@@ -26,7 +26,7 @@ WATCH = """(() => {
     for (const change of changes)
       if (change.type == 'attributes' && change.target.tagName == 'IMG') note('image');
     const text = document.body.innerText;
-    for (const part of ['Generating', 'Looking at', 'remembered after'])
+    for (const part of ['Generating', 'Updating the state', 'state updated after'])
       if (text.includes(part) && window.last != part) { window.last = part; note(part); }
   }).observe(document.body, {subtree: true, childList: true, characterData: true,
                              attributes: true, attributeFilter: ['src']});
@@ -44,12 +44,12 @@ def make_clip(page, button):
     """Make a clip; return the seconds to its first frames, last frames and update."""
     page.run("window.events = []; window.last = ''; window.clicked = performance.now() / 1000")
     page.click(button)
-    page.wait_for("window.events.some(e => e[1] == 'remembered after')")
+    page.wait_for("window.events.some(e => e[1] == 'state updated after')")
     clicked, events = page.run("window.clicked"), page.run("window.events")
     times = {what: seconds - clicked for seconds, what in reversed(events)}
     shown = [s - clicked for s, what in events if what == "image"]
-    live = [seconds for seconds in shown if seconds <= times["Looking at"] + 0.05]
-    return live[0], live[-1], times["remembered after"]
+    live = [seconds for seconds in shown if seconds <= times["Updating the state"] + 0.05]
+    return live[0], live[-1], times["state updated after"]
 
 
 def record(page, runs, path):
@@ -58,7 +58,7 @@ def record(page, runs, path):
     time.sleep(1)
     before = page.screenshot()
     page.click("put it on the ring")
-    page.wait_for_text("remembered after")
+    page.wait_for_text("state updated after")
     time.sleep(1)
     after = page.screenshot()
     page.click("save")

@@ -22,13 +22,12 @@ SESSION, WATCH = "fuzzed", "watched"
 @functools.cache
 def _service() -> Any:
     """Service of a painted world with a session that no message names."""
-    from egosim_jax.interactive.server.prometheus import Metrics
     from egosim_jax.interactive.server.service import Service
     from egosim_jax.interactive.server.store import Limits, Store
     from tests.painted import painted
 
     folder = Path(tempfile.mkdtemp())
-    service = Service(Store(folder, painted(), Limits(), Metrics()), world="painted")
+    service = Service(Store(folder, painted(), Limits()), world="painted")
     watched = service.store.create({"session": WATCH, "seed": 3})
     rows = watched.actions.rest[None]
     service.store.step({"session": WATCH, "step_id": 1, "actions": rows}).result()

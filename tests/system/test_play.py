@@ -9,7 +9,7 @@ import pytest
 from egosim_jax import configs
 from egosim_jax.cli.play import Play
 from egosim_jax.geometry import invert, project, transform
-from egosim_jax.interactive.play.moves import first_goal
+from egosim_jax.interactive.play.moves import suggest_goal
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import start_of_sequence
@@ -42,7 +42,7 @@ def test_the_denoising_steps_are_those_that_are_given(monkeypatch):
 def pixels_of_places():
     """Columns and rows, in the clip, of the suggested object and of the place that it is for."""
     scene, camera, *_ = start_of_sequence(SEED, spec=VIDEO)
-    name, goal = first_goal(scene, "right")
+    name, goal = suggest_goal(scene, "right")
     body = scene.body(name)
     assert name.startswith("red")
     here = body.world_from_body[:3, 3] + [0, 0, body.size_m[2] / 2]
@@ -82,7 +82,7 @@ def test_an_object_is_picked_up_and_put_elsewhere_through_the_page(tmp_path):
             assert redness(image, old) > 0.3
             assert redness(image, new) < 0.05
         page.click("put it on the ring")
-        page.wait_for_text("remembered after")
+        page.wait_for_text("state updated after")
         generated, true = settled(page)
         page.screenshot(tmp_path / "page.png")
         assert redness(true, old) < 0.05

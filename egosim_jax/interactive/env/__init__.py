@@ -1,10 +1,16 @@
-"""Worlds as Gymnasium environments: step a policy in a generated world or in the true one.
+"""Gymnasium environments: step a policy in a generated world or in the true tabletop world.
 
     env = gymnasium.make("egosim_jax/Tabletop-v0")
     envs = gymnasium.make_vec("egosim_jax/Tabletop-v0", num_envs=8)
 
-An action is a row of numbers (`actions.py`); `env.unwrapped.chunk_step` takes as many rows as a
-clip has frames. Needs the extra `env`.
+An action is a row of numbers (`action_spec.py`). `env.unwrapped.chunk_step` takes one row for each
+new frame of a clip. Sessions of remote clients are in `server`. Needs the extra `env`.
+
+- `make`, `make_vec`: one environment, or several as a batch.
+- `load_backend`: the world behind an environment.
+- `ActionSpec`: layout and bounds of action rows.
+- `Start`: scene, camera and hands from which an episode continues.
+- `rewards`: `Reward`, `MoveObject`, `GoalImage`.
 """
 
 from __future__ import annotations
@@ -14,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.start import Start
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -22,13 +28,13 @@ if TYPE_CHECKING:
     from egosim_jax.interactive.env.single import WorldEnv
     from egosim_jax.interactive.env.vector import WorldVectorEnv
 
-__all__ = ["ActionSpec", "Start", "backend_of", "make", "make_vec", "register"]
+__all__ = ["ActionSpec", "Start", "load_backend", "make", "make_vec", "register"]
 
 ID = "egosim_jax/Tabletop-v0"
 World = Literal["generated", "true"]
 
 
-def backend_of(
+def load_backend(
     world: World = "generated",
     *,
     config: str = "tabletop",
@@ -38,10 +44,10 @@ def backend_of(
     batch: int = 1,
     compile: bool = True,
 ) -> Backend:
-    """Return a world: a model's, of which `batch` clips are generated together, or the true one.
+    """Return the true tabletop world, or a model's world that batches up to `batch` clips.
 
-    The model is compiled for its batch sizes now, over all devices, or with `compile` unset at the
-    first step.
+    The model is compiled for all batch sizes now, over all devices. Without `compile` it is
+    compiled at the first step.
     """
     from dataclasses import replace
 
@@ -64,17 +70,17 @@ def backend_of(
     folder = configs.weights_of(config, None if weights is None else Path(weights))
     generator = Streamer(Generator.load(model, folder, mesh=mesh), mesh)
     unit = parts("batch", mesh)
-    batcher = Batcher(generator, most=max(batch, unit), unit=unit)
+    batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
     for size in batcher.sizes if compile else ():
         generator.compile(size)
     return GeneratedWorld(generator=batcher, video=model.video, perception=perception)
 
 
 def make(*, backend: Backend | None = None, world: World = "generated", **options: Any) -> WorldEnv:
-    """Return an environment of a backend, or of a world by name (`WorldEnv`)."""
+    """Return a `WorldEnv` of a backend, or of a world by name."""
     from egosim_jax.interactive.env.single import WorldEnv
 
-    return WorldEnv(backend or backend_of(world), **options)
+    return WorldEnv(backend or load_backend(world), **options)
 
 
 def make_vec(
@@ -84,14 +90,14 @@ def make_vec(
     world: World = "generated",
     **options: Any,
 ) -> WorldVectorEnv:
-    """Return a vector environment of a backend, or of a world by name (`WorldVectorEnv`)."""
+    """Return a `WorldVectorEnv` of a backend, or of a world by name."""
     from egosim_jax.interactive.env.vector import WorldVectorEnv
 
-    return WorldVectorEnv(backend or backend_of(world, batch=num_envs), num_envs, **options)
+    return WorldVectorEnv(backend or load_backend(world, batch=num_envs), num_envs, **options)
 
 
 def register() -> None:
-    """Register the environment with Gymnasium; importing this package does."""
+    """Register the environment with Gymnasium. Importing this package calls it."""
     import gymnasium
 
     if ID not in gymnasium.registry:

@@ -1,28 +1,30 @@
-"""Actions as rows of numbers: the coordinates in which a policy moves hands and camera.
+"""Actions as rows of numbers, the coordinates in which a policy moves hands and camera.
 
-One row per frame. It has the numbers of each hand, then, with `camera`, six of the camera:
+There is one row per frame. It has the numbers of each hand, then six for the camera if the
+`ActionSpec` includes it:
 
-    keypoints  63 a hand: 21 joints in the world, in meters, in the order of `episode.py`
-    wrist       7 a hand: position of the wrist in meters, rotation vector, closure from 0 to 1
-    gripper     7 a hand: the same of a gripper, whose fingers close
-    camera      6: translation in meters and rotation vector, from the first camera, in its axes
+    keypoints  63 per hand: 21 joints in the world, in meters, in the order of `episode.py`
+    wrist       7 per hand: wrist position in meters, rotation vector, closure from 0 to 1
+    gripper     7 per hand: the same numbers for a gripper, whose fingers close
+    camera      6: translation in meters and rotation vector, in the axes of the first camera
 
-All is in the world's frame. Without rotation the fingers point along y and the back of the hand
-along z (`worlds/tabletop/hands.py`).
+Hands are in the world frame. Without rotation the fingers point along y, and the back of the hand
+faces z (`worlds/tabletop/hands.py`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, no_type_check
+from typing import Any, Literal, no_type_check
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from egosim_jax.interactive.env.placed import with_places
 from egosim_jax.io.bounded import quote
+from egosim_jax.simulation.actions import with_places
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import Side, joints_of
 
@@ -31,13 +33,13 @@ LAYOUTS: tuple[Layout, ...] = ("keypoints", "wrist", "gripper")
 HAND_NAMES = ("x", "y", "z", "rx", "ry", "rz", "closure")
 CAMERA_NAMES = ("camera x", "camera y", "camera z", "camera rx", "camera ry", "camera rz")
 REST = (0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25)
-"""Row of a right hand at rest: position in meters, rotation vector in radians, closure."""
+"""Resting right hand: position in meters, rotation vector in radians, closure."""
 
 
-def numbers(rows: object) -> Float[np.ndarray, ...]:
-    """Return rows as an array. Raises `InputError` for text and other values that are no numbers.
+def to_numbers(rows: object) -> Float[np.ndarray, ...]:
+    """Return rows as an array.
 
-    Rows of unequal lengths are none either, and whole numbers beyond 64 bits.
+    Raises `InputError` for text, rows of unequal length, and integers beyond 64 bits.
     """
     try:
         found = np.asarray(rows)
@@ -51,25 +53,25 @@ def numbers(rows: object) -> Float[np.ndarray, ...]:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class ActionSpec:
-    """Meaning and bounds of the rows of an action."""
+    """Layout and bounds of action rows."""
 
     layout: Layout = "wrist"
-    """Numbers of each hand."""
+    """Representation of a hand."""
     sides: tuple[Side, ...] = ("right",)
-    """Hands in their order in a row."""
+    """Hands, in the order of a row."""
     camera: bool = False
-    """Append the pose of the camera, which otherwise rests."""
+    """Append the camera pose to each row; without it the camera does not move."""
     workspace_m: tuple[tuple[float, float, float], tuple[float, float, float]] = (
         (-0.35, 0.0, 0.0),
         (0.35, 0.55, 0.40),
     )
-    """Lowest and highest position of a wrist or joint in the world, in meters."""
+    """Minimum and maximum position of a wrist or joint in the world, in meters."""
     camera_reach: tuple[float, float] = (0.15, 0.35)
-    """Largest translation of the camera in meters and rotation in radians, along each axis."""
+    """Maximum translation (meters) and rotation (radians) of the camera, per axis."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` for an unknown layout, no hands, or an empty workspace or reach."""
-        if self.layout not in LAYOUTS:  # which a client may have chosen
+        if self.layout not in LAYOUTS:  # a client can send any string
             raise InputError(
                 f"There is no action layout {str(self.layout)[:40]!r}: it must be one of "
                 f"{', '.join(LAYOUTS)}."
@@ -93,7 +95,7 @@ class ActionSpec:
 
     @property
     def kind(self) -> Kind:
-        """Kind of hands that the rows move."""
+        """Kind of the hands."""
         return "robot" if self.layout == "gripper" else "human"
 
     @cached_property
@@ -121,31 +123,28 @@ class ActionSpec:
 
     @cached_property
     def rest(self) -> Float[np.ndarray, " d"]:
-        """Row of hands at rest in front of the wearer, within the workspace."""
+        """Row of resting hands in front of the wearer, within the workspace."""
         row: list[float] = []
         low, high = np.array(self.workspace_m)
         for side in self.sides:
             mirror = np.array([-1, 1, 1, 1, -1, -1, 1]) if side == "left" else 1
             hand = np.array(REST) * mirror
             hand[:3] = np.clip(hand[:3], low, high)
-            row += self._placed(hand, side).ravel().tolist() if self._joints else hand.tolist()
+            keypoints = self.layout == "keypoints"
+            row += self._placed(hand, side).ravel().tolist() if keypoints else hand.tolist()
         return np.clip([*row, *([0.0] * 6 if self.camera else [])], *self.bounds)
 
-    @property
-    def _joints(self) -> bool:
-        return self.layout == "keypoints"
+    def check(self, rows: object, *, max_rows: int) -> Float[np.ndarray, "k d"]:
+        """Return 1 to `max_rows` rows as an array.
 
-    def check(self, rows: object, *, most: int) -> Float[np.ndarray, "k d"]:
-        """Return rows as an array. Raises `InputError` for a wrong shape, NaN or a value outside.
-
-        `most` is the largest number of rows of a chunk.
+        Raises `InputError` for a wrong shape, a value that is not finite or one out of bounds.
         """
-        found = numbers(rows)
-        if found.ndim != 2 or not 1 <= len(found) <= most or found.shape[1] != len(self.names):
+        found = to_numbers(rows)
+        if found.ndim != 2 or not 1 <= len(found) <= max_rows or found.shape[1] != len(self.names):
             raise InputError(
                 f"The actions have shape {found.shape}: {self.layout} of {len(self.sides)} hands "
-                f"{'and the camera' if self.camera else 'without a camera'} must be (1 to {most}, "
-                f"{len(self.names)})."
+                f"{'and the camera' if self.camera else 'without a camera'} must be (1 to "
+                f"{max_rows}, {len(self.names)})."
             )
         finite = np.isfinite(found)
         if not finite.all():
@@ -155,6 +154,7 @@ class ActionSpec:
                 "must be finite."
             )
         low, high = self.bounds
+        # float32 rounds some bounds outward
         outside = (found < low - 1e-6) | (found > high + 1e-6)
         if outside.any():
             row, column = np.argwhere(outside)[0].tolist()
@@ -173,10 +173,10 @@ class ActionSpec:
         prompt: str,
         hide: bool = False,
     ) -> tuple[Action, Bool[np.ndarray, " n"]]:
-        """Return the action of a row per frame, and which hands are hidden.
+        """Return the action of one row per frame, and a mask of the hidden hands.
 
-        `camera` is the first camera of the episode. A hand that never comes near the view is an
-        `InputError`, or with `hide` is given as missing, in an action that knows its place.
+        `camera` is the first camera of the episode. A hand that never comes near the view raises
+        `InputError`. With `hide` it becomes missing in a `PlacedAction` instead.
         """
         cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
         joints = self.joints(rows)
@@ -189,9 +189,10 @@ class ActionSpec:
 
     def joints(self, rows: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n j 3"]:
         """Return the joints of each row's hands in the world, in meters."""
-        count = 63 if self._joints else len(HAND_NAMES)
+        keypoints = self.layout == "keypoints"
+        count = 3 * JOINTS["human"] if keypoints else len(HAND_NAMES)
         hands = rows[:, : count * len(self.sides)].reshape(len(rows), len(self.sides), count)
-        if self._joints:
+        if keypoints:
             return hands.reshape(len(rows), len(self.sides), JOINTS["human"], 3)
         return np.stack(
             [
@@ -212,3 +213,50 @@ class ActionSpec:
         for move, row in zip(moves, rows[:, -6:], strict=True):
             move[:3, :3], move[:3, 3] = cv2.Rodrigues(row[3:])[0], row[:3]
         return poses @ moves
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON."""
+        return {
+            "layout": self.layout,
+            "sides": list(self.sides),
+            "camera": self.camera,
+            "workspace_m": [list(corner) for corner in self.workspace_m],
+            "camera_reach": list(self.camera_reach),
+        }
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> ActionSpec:
+        """Read the spec of a client or file; missing fields have their defaults.
+
+        Raises `InputError` for an unknown field or a wrong type.
+        """
+        known = cls().to_json()
+        if unknown := sorted(fields.keys() - known.keys()):
+            raise InputError(
+                f"The actions have no setting {quote(unknown[0])}: choose from {', '.join(known)}."
+            )
+        given = {**known, **fields}
+        corners, reach, sides = given["workspace_m"], given["camera_reach"], given["sides"]
+        shapes = _shape(corners) == (2, 3) and _shape(reach) == (2,)
+        texts = isinstance(sides, list) and all(isinstance(side, str) for side in sides)
+        if not (shapes and texts and isinstance(given["camera"], bool)):
+            raise InputError(
+                "The actions need sides, a list of 'left' and 'right', camera, true or false, "
+                "workspace_m, two corners of three numbers in meters, and camera_reach, two "
+                "numbers."
+            )
+        values: Any = {
+            "layout": given["layout"],
+            "sides": tuple(sides),
+            "camera": given["camera"],
+            "workspace_m": tuple(tuple(map(float, corner)) for corner in corners),
+            "camera_reach": tuple(map(float, reach)),
+        }
+        return cls(**values)
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    try:
+        return to_numbers(value).shape
+    except InputError:
+        return None

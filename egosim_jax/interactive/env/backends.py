@@ -1,4 +1,4 @@
-"""Worlds behind the same interface: a model's, and others such as the true tabletop world."""
+"""Backends of environments and sessions: a model's world, or another one with its interface."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from functools import cached_property
 from typing import ClassVar, Protocol, runtime_checkable
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.start import Start
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.perception import registry
 from egosim_jax.simulation.simulator import Simulator, VideoGenerator
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import VideoSpec, check_seed
 from egosim_jax.worlds.tabletop import start_of_sequence
 
 
 @runtime_checkable
 class Backend(Protocol):
-    """World of which episodes are simulated."""
+    """Environment backend: a world in which episodes are simulated."""
 
     @property
     def video(self) -> VideoSpec:
-        """Length, size and rate of its clips."""
+        """Length, size and rate of the clips."""
         ...
 
     needs_past: ClassVar[bool]
-    """Simulators depend on the actions since the seed."""
+    """True if a simulator depends on all actions since the seed."""
 
     def identity(self) -> dict[str, str]:
-        """Return what the clips depend on, by name; equal worlds continue each other's sessions."""
+        """Return the settings that determine the clips; equal ones can resume a session."""
         ...
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
@@ -42,19 +42,19 @@ class Backend(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratedWorld:
-    """World whose clips a generator makes; its scenes are those of the tabletop world."""
+    """World of a video generator, with the scenes of the tabletop world."""
 
     generator: VideoGenerator
-    """Generator of the clips, shared by all episodes: a `Batcher` generates them together."""
+    """Generator of the clips, shared by all episodes; a `Batcher` generates them together."""
     video: VideoSpec
     """Length, size and rate of the generator's clips."""
     perception: str | None = "classical"
-    """Perception that updates the state, by name with its options; None keeps the first state."""
+    """Perception that updates the state: name and options, or None to keep the first state."""
 
     needs_past: ClassVar[bool] = False
 
     def identity(self) -> dict[str, str]:
-        """Return the size of the clips, perception, and content hash of the generator."""
+        """Return the size of the clips, the perception, and the generator's content hash."""
         return {
             "world": "generated",
             "video": str(self.video),
@@ -63,11 +63,11 @@ class GeneratedWorld:
         }
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
-        """Return a scene of the tabletop world with its first camera."""
+        """Return the seed's tabletop scene with its first camera."""
         return tabletop_start(seed, spec, self.video)
 
     def simulator(self, start: Start) -> Simulator:
-        """Return the simulator, which is the same for all clips."""
+        """Return the simulator, the same one for all clips."""
         return self._simulator
 
     @cached_property
@@ -81,7 +81,7 @@ class GeneratedWorld:
 
 
 def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
-    """Return the start of a seed's scene in the tabletop world."""
+    """Return the start of a seed's tabletop scene."""
     check_seed(seed, name="seed")
     _, camera, first, state = start_of_sequence(seed, spec=video, kind=spec.kind)
     name = next(iter(state.names.values()))

@@ -1,9 +1,9 @@
-"""Clips of many callers, generated together by one program.
+"""Batching of clips that many threads request.
 
-Each caller runs in its thread and calls the batcher like the generator. A thread of the batcher
-takes what waits and runs the program of the largest batch size that it fills, so that nothing is
-padded but to the devices of a mesh. It waits for callers that have announced themselves, for a
-moment at most: while one batch runs, the next one gathers.
+Each caller calls the batcher like a generator, in its own thread. The batcher's thread drains the
+queue into the largest compiled batch size it can fill. It pads only to the number of devices.
+Before a batch it waits up to `wait_s` for callers that have announced a clip. The next batch
+gathers while one runs.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from egosim_jax.types import Action, InputError, Triplet, View, check_counts, ch
 
 @runtime_checkable
 class BatchGenerator(VideoGenerator, Protocol):
-    """Generator of several clips in one program (`streaming.Streamer`)."""
+    """Generator of several clips in one program (`generation.stream.Streamer`)."""
 
     renderer: Renderer
 
     def condition(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
     ) -> Triplet:
-        """Return the conditions of a clip."""
+        """Return the conditioning inputs of a clip."""
         ...
 
     def groups(
         self, triplets: Sequence[Triplet], seeds: Sequence[int]
     ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
-        """Yield the frames of a clip of each triplet in groups, as they are decoded."""
+        """Yield the frames of one clip per triplet in groups, as they are decoded."""
         ...
 
     def fingerprint(self) -> str:
-        """Return the content hash of config and weights."""
+        """Return the content hash of the config and weights."""
         ...
 
 
 @no_type_check
 @dataclass(eq=False, kw_only=True)
 class _Request:
-    """Clip that a caller waits for, and its frames as they come."""
+    """Clip that a caller waits for, with a queue of its decoded frames."""
 
     triplet: Triplet
     seed: int
@@ -60,13 +60,13 @@ class _Request:
     _sent: int = 0
 
     def send(self, number: int, frames: UInt8[np.ndarray, "g h w 3"]) -> None:
-        """Pass a group on, unless the caller has it from an earlier run of its clip."""
+        """Queue a group of frames, unless an earlier run of the clip already sent it."""
         if number == self._sent:
             self._groups.put(frames)
             self._sent += 1
 
     def end(self, error: Exception | None = None) -> None:
-        """Let the caller continue after the last group, or raise an error there."""
+        """End the groups; the caller then continues, or raises the error."""
         self._groups.put(error)
 
     def receive(self) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
@@ -78,33 +78,34 @@ class _Request:
 
 
 class Batcher:
-    """Generator that gathers the clips of several threads (`simulator.StreamedGenerator`)."""
+    """Generator that batches the clips of several threads (`simulator.StreamedGenerator`)."""
 
     def __init__(
-        self, generator: BatchGenerator, *, most: int = 8, unit: int = 1, wait_s: float = 0.05
+        self, generator: BatchGenerator, *, max_batch: int = 8, unit: int = 1, wait_s: float = 0.05
     ):
-        """`unit` is the number of parts of a mesh that divides batches; `most` a multiple of it."""
-        check_counts({"batch size": most, "parts of the mesh": unit})
-        if most % unit:
+        """Start the thread; `unit` is the number of mesh parts that share a batch."""
+        check_counts({"batch size": max_batch, "parts of the mesh": unit})
+        if max_batch % unit:
             raise InputError(
-                f"Batches of {most} clips cannot be divided over {unit} parts of the devices: give "
-                f"a multiple of {unit}. (--batch)"
+                f"Batches of {max_batch} clips cannot be divided over {unit} parts of the devices: "
+                f"give a multiple of {unit}. (--batch)"
             )
         self.renderer = generator.renderer
         self._generator = generator
         self.sizes = [unit]
-        while 2 * self.sizes[-1] <= most:
+        # powers of two keep the number of programs to compile small
+        while 2 * self.sizes[-1] <= max_batch:
             self.sizes.append(2 * self.sizes[-1])
-        if self.sizes[-1] < most:
-            self.sizes.append(most)
+        if self.sizes[-1] < max_batch:
+            self.sizes.append(max_batch)
         self._wait_s = wait_s
         self._waiting: list[_Request] = []
-        self._coming = 0
+        self._announced = 0
         self._changed = threading.Condition()
         self._caller = threading.local()
         self._closed = False
         self.runs: dict[int, int] = dict.fromkeys(self.sizes, 0)
-        """Number of runs of the program of each batch size."""
+        """Number of runs by batch size."""
         self._thread = threading.Thread(target=self._work, name="batcher", daemon=True)
         self._thread.start()
 
@@ -113,14 +114,14 @@ class Batcher:
         return self._generator.fingerprint()
 
     def fingerprint(self) -> str:
-        """Return the generator's content hash: batching is no property of a clip."""
+        """Return the generator's content hash; batching does not change a clip."""
         return self._fingerprint
 
     @contextmanager
     def announced(self) -> Iterator[None]:
-        """Announce a clip that this thread will ask for, unless it fails before."""
+        """Announce a clip that this thread requests inside the context, unless it fails first."""
         with self._changed:
-            self._coming += 1
+            self._announced += 1
         self._caller.announced = True
         try:
             yield
@@ -131,19 +132,19 @@ class Batcher:
         if getattr(self._caller, "announced", False):
             self._caller.announced = False
             with self._changed:
-                self._coming -= 1
+                self._announced -= 1
                 self._changed.notify_all()
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Generate one clip together with those of other threads."""
+        """Generate one clip, batched with the clips of other threads."""
         return np.concatenate(list(self.stream(view, action, first_frame, seed)))
 
     def stream(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
-        """Yield the frames of one clip in groups, as the program of its batch decodes them."""
+        """Yield the frames of one clip in groups, as its batch is decoded."""
         check_seed(seed, name="seed")
         request = _Request(triplet=self._generator.condition(view, action, first_frame), seed=seed)
         with self._changed:
@@ -155,7 +156,7 @@ class Batcher:
         yield from request.receive()
 
     def close(self) -> None:
-        """Generate what waits, then end."""
+        """Generate the waiting clips, then end the thread."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -166,14 +167,15 @@ class Batcher:
             self._run(batch)
 
     def _next(self) -> list[_Request]:
-        """Wait for requests; return those of the next run, none when closed."""
+        """Wait for requests; return the next batch, empty when closed."""
         with self._changed:
             while not self._waiting:
                 if self._closed:
                     return []
                 self._changed.wait()
+            # the oldest request sets the deadline: later ones must not delay it further
             until = self._waiting[0].since + self._wait_s
-            while len(self._waiting) < self.sizes[-1] and self._coming:
+            while len(self._waiting) < self.sizes[-1] and self._announced:
                 left = until - time.monotonic()
                 if left <= 0:
                     break
@@ -196,7 +198,7 @@ class Batcher:
             if len(batch) == 1:
                 batch[0].end(error)
                 return
-            for request in batch:  # so that one clip's failure is not the others'
+            for request in batch:  # one bad clip must not fail the others
                 self._run([request])
             return
         self.runs[size] += 1
@@ -205,5 +207,5 @@ class Batcher:
 
 
 def announced(generator: VideoGenerator) -> AbstractContextManager[None]:
-    """Return the context in which a thread will ask a generator for a clip."""
+    """Return the context in which a thread requests a clip; only a `Batcher` counts it."""
     return generator.announced() if isinstance(generator, Batcher) else nullcontext()

@@ -1,7 +1,7 @@
-"""Chunks: the actions of one clip, and what is said about its result.
+"""Chunks: the action rows of one clip, and the metadata of its result.
 
-A chunk has a row for each frame but the first, which repeats the last row of the chunk before. The
-frames of a model are a fixed number, so a shorter chunk is padded by holding its last row.
+A chunk has a row for each frame but the first, which repeats the last row of the previous chunk. A
+model generates a fixed number of frames, so a shorter chunk is padded with its last row.
 """
 
 from __future__ import annotations
@@ -16,45 +16,48 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.batching import announced
-from egosim_jax.interactive.env.start import Start
 from egosim_jax.rendering import Renderer
 from egosim_jax.simulation.simulator import Simulator, Step
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import Action, Cameras, SceneState, View
 
+OBSERVATIONS = ("frames", "depth", "keypoints", "state")
+STATE_FIELDS = ("points_m", "colors", "object_ids")
+"""Arrays of the observation `state`."""
 STEADY_LEVELS = 25
-"""Largest difference of a color, in gray levels of 255, of a pixel that agrees with the state."""
+"""Maximum color difference (0 to 255) of a pixel that agrees with the state."""
 HAND_MARGIN = 0.08
-"""Width, in widths of the picture, around a hand's skeleton in which pixels may change."""
+"""Margin around a hand's skeleton in which pixels may change, as a fraction of the image width."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """Rows of a clip as an action."""
+    """Action of one clip, with its rows."""
 
     action: Action
     """Cameras, joints and prompt."""
     rows: Float[np.ndarray, "f d"]
-    """Row of each frame, of which the first is that of the chunk before."""
+    """Row of each frame; the first is the last row of the previous chunk."""
     padded: int
-    """Frames at the end that hold the last row."""
+    """Number of frames at the end that hold the last row."""
     hidden: Bool[np.ndarray, " n"]
-    """Hands that never come near the view and are given as missing."""
+    """Mask of the hands that never come near the view and are missing from the action."""
 
     def info(self, spec: ActionSpec) -> dict[str, Any]:
-        """Return what a caller needs to know of its action."""
+        """Return the number of padded frames and the hidden hands."""
         hidden = [side for side, lost in zip(spec.sides, self.hidden, strict=True) if lost]
         return {"padded_frames": self.padded, "hidden_hands": hidden}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Seconds of the phases of a step; two equal steps are equal however long they took."""
+    """Seconds of each phase of a step; all timings compare equal, so equal steps stay equal."""
 
     render_s: float = field(compare=False)
     """Rendering of the state along the camera path."""
     generate_s: float = field(compare=False)
-    """Generation of the clip, with the wait for its batch."""
+    """Generation of the clip, including the wait for its batch."""
     update_s: float = field(compare=False)
     """Perception of the clip and its fusion into the state."""
 
@@ -68,11 +71,11 @@ def make_chunk(
     prompt: str | None = None,
     hide: bool = False,
 ) -> Chunk:
-    """Return the chunk of 1 to `frames` - 1 rows that follow a start.
+    """Return the chunk of 1 to `frames` - 1 rows after a start.
 
-    Raises `InputError` for invalid rows; with `hide` a hand out of view is no error.
+    Raises `InputError` for invalid rows, and without `hide` for a hand out of view.
     """
-    given = spec.check(rows, most=frames - 1)
+    given = spec.check(rows, max_rows=frames - 1)
     padded = frames - 1 - len(given)
     before = spec.rest if start.row is None else start.row
     path = np.concatenate([before[None], given, np.repeat(given[-1:], padded, axis=0)])
@@ -87,10 +90,10 @@ def last_camera(action: Action) -> Cameras:
     return replace(action.cameras, world_from_camera=action.cameras.world_from_camera[-1:])
 
 
-def straight(
+def straight_path(
     before: Float[np.ndarray, " d"], target: Float[np.ndarray, " d"], frames: int
 ) -> Float[np.ndarray, "k d"]:
-    """Return the rows of a straight path to a target in a whole chunk."""
+    """Return the rows of a straight path to a target over a full chunk."""
     shares = np.linspace(0, 1, frames)[1:, None]
     return before + shares * (target - before)
 
@@ -103,12 +106,9 @@ def timed_step(
     seed: int,
     first_frame: np.ndarray | None,
 ) -> tuple[Step, Timing]:
-    """Run one step of a simulator; return it with the seconds of its phases.
-
-    The caller is announced to a generator that gathers batches.
-    """
+    """Run one step of a simulator, and time its phases."""
     then = time.monotonic()
-    with announced(simulator.generator):
+    with announced(simulator.generator):  # before rendering, so that a batch waits for this clip
         view = simulator.render(state, action)
         rendered = time.monotonic()
         clip = simulator.generate(view, action, seed=seed, first_frame=first_frame)
@@ -128,10 +128,9 @@ def view_of(simulator: Simulator, state: SceneState, cameras: Cameras) -> View:
 
 
 def validity(step: Step, action: Action, renderer: Renderer) -> float:
-    """Return the share of pixels that agree with the state where nothing should move, from 0 to 1.
+    """Return the fraction of steady pixels whose color agrees with the state, from 0 to 1.
 
-    These are pixels of the background that the state has observed, away from hands and objects; nan
-    if there are none.
+    Steady pixels show observed background, away from hands and objects. NaN without any.
     """
     hands = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
     steady = steady_pixels(step.view, np.isfinite(hands))
@@ -142,7 +141,7 @@ def validity(step: Step, action: Action, renderer: Renderer) -> float:
 
 
 def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Return the pixels of a view in which nothing should move."""
+    """Return the mask of pixels of a view in which nothing should move."""
     reach = 2 * round(HAND_MARGIN * view.mask.shape[2]) + 1
     near = np.ones((reach, reach), np.uint8)
     moving = [

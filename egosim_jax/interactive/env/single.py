@@ -15,32 +15,34 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import (
+    OBSERVATIONS,
+    STATE_FIELDS,
     Chunk,
     last_camera,
     make_chunk,
-    straight,
+    straight_path,
     timed_step,
     validity,
     view_of,
 )
 from egosim_jax.interactive.env.rewards import Outcome, RewardFn, no_reward
-from egosim_jax.interactive.env.start import Start, check_size
 from egosim_jax.simulation.actions import check_action
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.simulator import Step
+from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError, SceneState, VideoSpec, View, check_seed
 
-OBSERVATIONS = ("frames", "depth", "keypoints", "state")
 STATE_POINTS = 2048
-"""Points of a state's observation."""
+"""Number of points in the observation `state`."""
 FAR_M = 100.0
-"""Depth where nothing is seen, and bound of positions in observations, in meters."""
+"""Depth of empty pixels and bound of observed positions, in meters."""
 OPTIONS = ("start", "episode", "state", "prompt")
+"""Options of `reset`."""
 
 
 def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
-    """Return the space of the observations: the row, and what is asked for."""
+    """Return the space of the row and the requested observations."""
     if unknown := [name for name in observe if name not in OBSERVATIONS]:
         raise InputError(
             f"There is no observation {unknown[0]!r:.40}: choose from {', '.join(OBSERVATIONS)}."
@@ -64,13 +66,13 @@ def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ..
     return spaces.Dict({"row": row, **{name: known[name] for name in observe}})
 
 
-def start_of(
+def start_from_options(
     backend: Backend, spec: ActionSpec, *, seed: int, options: Mapping[str, Any] | None
 ) -> Start:
-    """Return the start that a reset asks for: a seed's scene, or that of an option.
+    """Return the start of a reset: the seed's scene, unless an option replaces it.
 
-    `start` is a `Start`, `episode` an `Episode` or its path, `state` a `SceneState` or its folder,
-    seen by the camera of the seed. `prompt` replaces the prompt.
+    `start` is a `Start`, `episode` an `Episode` or its path. `state` is a `SceneState` or its
+    folder, seen by the seed's camera. `prompt` replaces the prompt.
     """
     given = dict(options or {})
     if unknown := sorted(given.keys() - set(OPTIONS)):
@@ -79,7 +81,9 @@ def start_of(
         )
     prompt = given.pop("prompt", None)
     if len(given) > 1:
-        raise InputError(f"The options {', '.join(sorted(given))} exclude each other: give one.")
+        raise InputError(
+            f"The options {', '.join(sorted(given))} are mutually exclusive: give one."
+        )
     if (start := given.get("start")) is None:
         if (episode := given.get("episode")) is not None:
             episode = episode if isinstance(episode, Episode) else Episode.load(Path(episode))
@@ -97,16 +101,16 @@ def start_of(
 
 def _check_row(row: np.ndarray, spec: ActionSpec) -> None:
     try:
-        spec.check(np.asarray(row)[None], most=1)
+        spec.check(np.asarray(row)[None], max_rows=1)
     except InputError as error:
         raise InputError(
-            f"The row of the start is none of this environment: {error} Make the start with the "
-            "same ActionSpec, or without a row. (start)"
+            f"The row of the start does not match this environment's ActionSpec: {error} Make the "
+            "start with the same ActionSpec, or without a row. (start)"
         ) from error
 
 
-class Running:
-    """Episode in progress: where it is, and its last step."""
+class RunningEpisode:
+    """Episode in progress, with its position and last step."""
 
     def __init__(self, backend: Backend, actions: ActionSpec, start: Start):
         self.backend, self.actions, self.start, self.now = backend, actions, start, start
@@ -124,9 +128,9 @@ class Running:
         return self.now.steps - self.start.steps
 
     def chunk(self, rows: object, *, prompt: str | None = None) -> Chunk:
-        """Return the next chunk; a hand out of view is given as missing.
+        """Return the next chunk; a hand out of view becomes missing.
 
-        Raises `InputError` for rows that the state does not allow.
+        Raises `InputError` for invalid rows and for cameras that the state does not allow.
         """
         video = self.backend.video
         chunk = make_chunk(
@@ -136,7 +140,7 @@ class Running:
         return chunk
 
     def simulate(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
-        """Return the step of a chunk and what is known of it; the episode is not changed."""
+        """Return the step of a chunk and its metadata, without changing the episode."""
         now, action = self.now, chunk.action
         simulator = self.backend.simulator(now)
         step, timing = timed_step(
@@ -153,14 +157,14 @@ class Running:
         }
 
     def advance(self, chunk: Chunk, step: Step) -> dict[str, Any]:
-        """Continue the episode after the step of a chunk; return where it is."""
+        """Move the episode past the step of a chunk; return `info`."""
         kept = chunk.action if self.backend.needs_past else None
         self.last, self.now = step, self.now.after(step.state, chunk.rows[-1], kept)
         self.camera = last_camera(chunk.action)
         return self.info()
 
     def info(self) -> dict[str, Any]:
-        """Return number of the chunk that took effect last, hash of the state, and names."""
+        """Return the number of the last chunk, the hash of the state, and the object names."""
         state = self.now.state
         return {
             "chunk": self.chunks,
@@ -169,7 +173,7 @@ class Running:
         }
 
     def frames(self) -> UInt8[np.ndarray, "f h w 3"]:
-        """Return the frames of the last chunk; before the first, its first frame repeated."""
+        """Return the frames of the last chunk; before the first chunk, the first frame repeated."""
         if self.last is not None:
             return self.last.clip.frames
         first = self.start.first_frame
@@ -181,7 +185,7 @@ class Running:
         return view_of(self.backend.simulator(self.now), self.now.state, self.camera)
 
     def observation(self, observe: tuple[str, ...]) -> dict[str, Any]:
-        """Return the observation of what is asked for."""
+        """Return the row and the requested observations."""
         found: dict[str, Any] = {"row": self.row.copy()}
         if "frames" in observe:
             found["frames"] = self.frames().copy()
@@ -190,14 +194,15 @@ class Running:
         if "keypoints" in observe:
             found["keypoints"] = self.actions.joints(self.row[None])[0].copy()
         if "state" in observe:
-            state, names = self.now.state, ("points_m", "colors", "object_ids")
+            state = self.now.state
+            # a space has a fixed shape: sample evenly, with repeats in a small state
             chosen = np.linspace(0, len(state.points_m) - 1, STATE_POINTS).astype(int)
-            found["state"] = {name: getattr(state, name)[chosen] for name in names}
+            found["state"] = {name: getattr(state, name)[chosen] for name in STATE_FIELDS}
         return found
 
 
 class WorldEnv(gymnasium.Env):
-    """World of one episode, stepped by chunks of actions."""
+    """Environment of one episode, stepped by chunks of action rows."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012
 
@@ -218,15 +223,15 @@ class WorldEnv(gymnasium.Env):
         low, high = self.actions.bounds
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
-        self._running: Running | None = None
+        self._running: RunningEpisode | None = None
 
     @property
     def chunk(self) -> int:
-        """Most rows of a chunk."""
+        """Maximum number of rows of a chunk."""
         return self.backend.video.frames - 1
 
     @property
-    def running(self) -> Running:
+    def running(self) -> RunningEpisode:
         """Episode in progress. Raises `InputError` before the first reset."""
         if self._running is None:
             raise InputError("The environment has no episode: call reset first.")
@@ -235,28 +240,28 @@ class WorldEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode of a seed, or of the options `start`, `episode`, `state`, `prompt`."""
+        """Begin an episode from a seed, or from the options of `start_from_options`."""
         super().reset(seed=seed)
         chosen = int(self.np_random.integers(2**31)) if seed is None else seed
         check_seed(chosen, name="seed")
-        start = start_of(self.backend, self.actions, seed=chosen, options=options)
-        self._running = Running(self.backend, self.actions, start)
+        start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
+        self._running = RunningEpisode(self.backend, self.actions, start)
         return self.running.observation(self._observe), self.running.info()
 
     def step(
         self, action: Float[np.ndarray, " d"]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Move to a row in a straight line, over a whole chunk."""
-        (target,) = self.actions.check(np.asarray(action)[None], most=1)
-        return self.chunk_step(straight(self.running.row, target, self.chunk + 1))
+        """Move to a row in a straight line, over a full chunk."""
+        (target,) = self.actions.check(np.asarray(action)[None], max_rows=1)
+        return self.chunk_step(straight_path(self.running.row, target, self.chunk + 1))
 
     def chunk_step(
         self, actions: Float[np.ndarray, "k d"], *, prompt: str | None = None
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Simulate 1 to `chunk` rows, one per frame; the last one is held until the chunk ends.
+        """Simulate 1 to `chunk` rows, one per frame, and hold the last row until the chunk ends.
 
-        `info` has the number of the chunk in which the action took effect, padded frames, hidden
-        hands, hash of the state, seconds of each phase, `validity` and `success`.
+        `info` has the chunk number, padded frames, hidden hands, hash of the state, seconds of each
+        phase, `validity` and `success`.
         """
         running = self.running
         chunk = running.chunk(actions, prompt=prompt)

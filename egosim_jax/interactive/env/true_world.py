@@ -1,4 +1,4 @@
-"""The true tabletop world behind the interface of a generated one: every clip is exact."""
+"""True tabletop world as a backend: clips and states are ground truth."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from jaxtyping import UInt8
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import tabletop_start
-from egosim_jax.interactive.env.placed import places_of
-from egosim_jax.interactive.env.start import Start
 from egosim_jax.io.fingerprint import fingerprint
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering import jitted
+from egosim_jax.simulation.actions import places_of
 from egosim_jax.simulation.simulator import Simulator
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import (
     Action,
     Clip,
@@ -33,13 +33,13 @@ from egosim_jax.types import (
 )
 from egosim_jax.worlds.tabletop import TabletopClip, World, start_of_sequence, to_ground_truth
 
-REMEMBERED = 256
-"""Last used worlds that are kept, so that an episode is not executed from its start each time."""
+MAX_CACHED_WORLDS = 256
+"""Maximum number of cached worlds; without a cache each step repeats its episode from the start."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrueWorld:
-    """Tabletop world that executes actions and reads its state from the ground truth."""
+    """Backend that executes actions in the tabletop world and returns its ground truth."""
 
     needs_past: ClassVar[bool] = True
     video: VideoSpec
@@ -52,35 +52,38 @@ class TrueWorld:
     )
 
     def identity(self) -> dict[str, str]:
-        """Return the size of the clips: all else is fixed."""
+        """Return the size of the clips; nothing else varies."""
         return {"world": "true", "video": str(self.video)}
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
-        """Return the scene of a seed with its first camera."""
+        """Return the seed's scene with its first camera."""
         return tabletop_start(seed, spec, self.video)
 
     def simulator(self, start: Start) -> Simulator:
-        """Return the simulator of the clip that follows a start.
+        """Return the simulator of the clip after a start.
 
-        Raises `InputError` unless the start is of a seed's scene and the actions since then.
+        Raises `InputError` unless the start has a seed's scene and all actions since the seed.
         """
         origin = start.state.provenance
         own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
         if not own or start.state.step != len(start.past):
             raise InputError(
-                "The true world has the scenes of its seeds and what actions made of them: it "
+                "The true world has only the scenes of its seeds, changed by known actions: it "
                 f"cannot begin from a state of {dict(origin)} at step {start.state.step} with "
-                f"{len(start.past)} known actions. Reset it by a seed."
+                f"{len(start.past)} known actions. Reset it with a seed."
             )
-        truth = _Execution(world=self, start=start)
-        return Simulator(generator=_Film(truth=truth), perception=_Look(truth=truth),
-                         fps=self.video.fps)  # fmt: skip
+        execution = _Execution(world=self, start=start)
+        return Simulator(
+            generator=_TrueGenerator(execution=execution),
+            perception=_TruePerception(execution=execution),
+            fps=self.video.fps,
+        )
 
     def after(self, start: Start, kind: Kind) -> World:
-        """Return the world after the actions that led to a start."""
+        """Return the world after all past actions of a start."""
         key = f"{start.seed} {kind}"
         keys = [key]
-        for action in start.past:
+        for action in start.past:  # a chained hash names each prefix of the episode
             key = hashlib.sha256(f"{key} {fingerprint(action)}".encode()).hexdigest()
             keys.append(key)
         known, world = self._last_known(keys)
@@ -92,12 +95,12 @@ class TrueWorld:
         with self._changing:
             self._worlds[keys[-1]] = world
             self._worlds.move_to_end(keys[-1])
-            while len(self._worlds) > REMEMBERED:
+            while len(self._worlds) > MAX_CACHED_WORLDS:
                 self._worlds.popitem(last=False)
         return world
 
     def _last_known(self, keys: Sequence[str]) -> tuple[int, World | None]:
-        """Return how many actions led to the last world that is kept, and that world."""
+        """Return the longest cached prefix: its number of actions, and its world."""
         with self._changing:
             for known in reversed(range(len(keys))):
                 if (world := self._worlds.get(keys[known])) is not None:
@@ -107,7 +110,7 @@ class TrueWorld:
 
 @dataclass(kw_only=True)
 class _Execution:
-    """Execution of one action, which film and look share."""
+    """Execution of one action, shared by the generator and the perception."""
 
     world: TrueWorld
     start: Start
@@ -122,29 +125,29 @@ class _Execution:
         return self._made[1]
 
     def fingerprint(self) -> str:
-        """Return the content hash of the scene and the actions before."""
+        """Return the content hash of the scene and the past actions."""
         return fingerprint(("tabletop", self.start.seed, self.start.past))
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Film:
+class _TrueGenerator:
     """Generator that returns the true frames (`simulator.VideoGenerator`)."""
 
-    truth: _Execution
+    execution: _Execution
     renderer: ModuleType = jitted
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        return self.truth.clip(action).frames
+        return self.execution.clip(action).frames
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Look:
+class _TruePerception:
     """Perception that returns the ground truth (`perception.Perception`)."""
 
-    truth: _Execution
+    execution: _Execution
 
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        observation = to_ground_truth(self.truth.clip(action))
+        observation = to_ground_truth(self.execution.clip(action))
         return OracleConfig().build({state.step: observation})(clip, action, state)

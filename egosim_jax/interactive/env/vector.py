@@ -1,4 +1,4 @@
-"""Gymnasium vector environment: several episodes whose clips one program generates."""
+"""Gymnasium vector environment: several episodes whose clips are generated as one batch."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.env.chunks import straight
+from egosim_jax.interactive.env.chunks import straight_path
 from egosim_jax.interactive.env.rewards import Outcome, RewardFn, no_reward
-from egosim_jax.interactive.env.single import Running, observation_space, start_of
+from egosim_jax.interactive.env.single import RunningEpisode, observation_space, start_from_options
 from egosim_jax.types import InputError, check_counts, check_seed
 
-Result = tuple[
+StepReturn = tuple[
     dict[str, Any],
     Float[np.ndarray, " n"],
     Bool[np.ndarray, " n"],
@@ -30,14 +30,14 @@ Result = tuple[
 
 
 class WorldVectorEnv(VectorEnv):
-    """Episodes of a world that are stepped together; an ended one waits until it is reset.
+    """Episodes of a world, stepped together; finished episodes stay idle until reset.
 
-    Each step runs in its own thread, so that perception overlaps, and a backend with a
-    `Batcher` generates all clips in one program. Episodes are reset with the option `reset_mask`
+    Each episode steps in its own thread: perception overlaps, and a backend with a `Batcher`
+    generates all clips in one program. The option `reset_mask` selects the episodes to reset
     (`AutoresetMode.DISABLED`).
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium declares it so
         "render_modes": [],
         "autoreset_mode": AutoresetMode.DISABLED,
     }
@@ -66,17 +66,17 @@ class WorldVectorEnv(VectorEnv):
         space = observation_space(backend.video, self.actions, self._observe)
         self.single_observation_space = space
         self.observation_space = batch_space(space, num_envs)
-        self._running: list[Running | None] = [None] * num_envs
+        self._running: list[RunningEpisode | None] = [None] * num_envs
         self._ended = np.zeros(num_envs, bool)
         self._threads = ThreadPoolExecutor(num_envs, thread_name_prefix="episode")
 
     @property
     def chunk(self) -> int:
-        """Most rows of a chunk."""
+        """Maximum number of rows of a chunk."""
         return self.backend.video.frames - 1
 
     @property
-    def running(self) -> list[Running]:
+    def running(self) -> list[RunningEpisode]:
         """Episodes in progress. Raises `InputError` before the first reset."""
         found = [running for running in self._running if running is not None]
         if len(found) < self.num_envs:
@@ -89,10 +89,10 @@ class WorldVectorEnv(VectorEnv):
         seed: SupportsIndex | Sequence[SupportsIndex | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episodes: those of `reset_mask`, or all; none if one of them cannot begin.
+        """Begin the episodes of `reset_mask`, or all; if one cannot begin, none does.
 
-        A single seed is that of the first episode, of which the others have the following ones.
-        Other options are those of `WorldEnv.reset`; `starts` has them for each episode.
+        A single seed seeds episode 0; episode i uses seed + i. The other options are the options of
+        `WorldEnv.reset`, for all episodes. `starts` gives one set of options per episode.
         """
         given = dict(options or {})
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
@@ -100,21 +100,24 @@ class WorldVectorEnv(VectorEnv):
         seeds = self._seeds(seed)
         if mask.shape != (self.num_envs,) or {len(starts), len(seeds)} != {self.num_envs}:
             raise InputError(
-                f"reset_mask has shape {mask.shape}, starts {len(starts)} and seed {len(seeds)} "
-                f"entries: all must have one for each of {self.num_envs} episodes."
+                f"reset_mask has shape {mask.shape}, starts has {len(starts)} entries and seed "
+                f"{len(seeds)}: each must have one entry for each of {self.num_envs} episodes."
             )
         chosen = np.flatnonzero(mask).tolist()
+        # all starts are made before any episode changes: one bad option begins none
         begun = [
-            start_of(self.backend, self.actions, seed=seeds[number], options=starts[number])
+            start_from_options(
+                self.backend, self.actions, seed=seeds[number], options=starts[number]
+            )
             for number in chosen
         ]
         for number, start in zip(chosen, begun, strict=True):
-            self._running[number] = Running(self.backend, self.actions, start)
+            self._running[number] = RunningEpisode(self.backend, self.actions, start)
         self._ended[mask] = False
         return self._observations(), self._infos([running.info() for running in self.running])
 
     def _seeds(self, seed: SupportsIndex | Sequence[SupportsIndex | None] | None) -> list[int]:
-        """Return the seed of each episode; those that are not given follow from the last given."""
+        """Return the seed of each episode; missing seeds are drawn from `np_random`."""
         several = isinstance(seed, Sequence)
         given = [None if n is None else operator.index(n) for n in (seed if several else [seed])]
         known = [number for number in given if number is not None]
@@ -124,22 +127,22 @@ class WorldVectorEnv(VectorEnv):
         seeds = [int(self.np_random.integers(2**31)) if n is None else n for n in given]
         return seeds if several else [seeds[0] + number for number in range(self.num_envs)]
 
-    def step(self, actions: Float[np.ndarray, "n d"]) -> Result:
-        """Move each episode to a row in a straight line, over a whole chunk."""
+    def step(self, actions: Float[np.ndarray, "n d"]) -> StepReturn:
+        """Move each episode to a row in a straight line, over a full chunk."""
         frames = self.chunk + 1
-        targets = [self.actions.check(np.asarray(row)[None], most=1)[0] for row in actions]
+        targets = [self.actions.check(np.asarray(row)[None], max_rows=1)[0] for row in actions]
         rows = [
-            straight(r.row, target, frames) for r, target in zip(self.running, targets, strict=True)
+            straight_path(r.row, target, frames)
+            for r, target in zip(self.running, targets, strict=True)
         ]
         return self.chunk_step(np.stack(rows))
 
     def chunk_step(
         self, actions: Float[np.ndarray, "n k d"], *, prompts: Sequence[str] | None = None
-    ) -> Result:
+    ) -> StepReturn:
         """Simulate k rows in each episode as one batch (`WorldEnv.chunk_step`).
 
-        If an action is refused or a step fails, no episode is changed. An ended episode must be
-        reset first.
+        If an action is invalid or a step fails, no episode changes. Reset a finished episode first.
         """
         if len(actions) != self.num_envs:
             raise InputError(
@@ -159,7 +162,7 @@ class WorldVectorEnv(VectorEnv):
             self._threads.submit(running.simulate, chunk)
             for running, chunk in zip(self.running, chunks, strict=True)
         ]
-        wait(made)
+        wait(made)  # all: a step that still runs must not outlive an error of another
         steps, known = zip(*(future.result() for future in made), strict=True)
         results = [
             reward(Outcome(first=running.start.state, step=step))

@@ -1,7 +1,7 @@
-"""Moves of one clip: the hand drives straight to a pose, or acts on a body as in a script.
+"""Hand moves of one clip: straight to a pose, or a scripted interaction with an object.
 
-The pose of a hand is that of the point between its grasping fingertips, which one aims with, and
-its closure. A row of the session (`interactive/env/action_spec.py`) has the wrist's instead.
+A hand's pose refers to the point between its grasping fingertips, because a person aims with it.
+The rows of a session (`interactive/env/action_spec.py`) refer to the wrist.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from egosim_jax.worlds.tabletop.hand_motion import Grip, Hand, Intent
 from egosim_jax.worlds.tabletop.hands import Side, joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import DRAWER_M, Scene, moving_part
 
-Deed = Literal["carry", "lift", "open or close"]
+Interaction = Literal["carry", "lift", "open or close"]
 TRAVEL = 0.75
-"""Share of a clip in which a driven hand moves; afterwards it opens or closes."""
+"""Fraction of a clip in which a driven hand moves; then it opens or closes."""
 MIDDLE_M = (0.0, 0.25)
-"""Middle of the objects' places on the table, in meters."""
-FIRST_M = (0.10, 0.16)
-"""Shortest and longest way that is suggested to carry an object, in meters."""
+"""Center of the objects' area on the table, in meters."""
+CARRY_M = (0.10, 0.16)
+"""Minimum and maximum suggested distance to carry an object, in meters."""
 OPENINGS = np.linspace(0, 1, 41)
-"""Openings of furniture that are compared."""
+"""Candidate openings of drawers and lids, from closed (0) to open (1)."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Pose:
-    """Pose of a hand: where its fingertips meet, its axes, how far it is closed."""
+    """Pose of a hand: point between the fingertips, rotation, closure."""
 
     point_m: Float[np.ndarray, " 3"]
     """Point between the grasping fingertips in the world, in meters."""
@@ -44,7 +44,7 @@ class Pose:
 
     @classmethod
     def of_row(cls, row: Float[np.ndarray, " d"], side: Side) -> Pose:
-        """Return the pose of a row, of which the first seven numbers are the hand's."""
+        """Return the pose of a row, whose first seven numbers describe the hand."""
         rotation, closure = cv2.Rodrigues(row[3:6])[0], float(row[6])
         return cls(
             point_m=row[:3] + rotation @ pinch(joints_of("human", closure, side))[0],
@@ -58,13 +58,13 @@ class Pose:
         return cls(point_m=grip.point_m, rotation=grip.rotation, closure=grip.closure)
 
     def row(self, side: Side, camera: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " d"]:
-        """Return the row of the hand, with the numbers of the camera."""
+        """Return the row of the hand, followed by the camera's numbers."""
         tip = self.rotation @ pinch(joints_of("human", self.closure, side))[0]
         vector = cv2.Rodrigues(self.rotation)[0][:, 0]
         return np.concatenate([self.point_m - tip, vector, [self.closure], camera])
 
     def grip(self) -> Grip:
-        """Return the nearest configuration of a scripted hand, which does not roll."""
+        """Return the nearest pose of a scripted hand, which cannot roll."""
         along = self.rotation[:, 1]
         return Grip(
             point_m=self.point_m,
@@ -75,9 +75,9 @@ class Pose:
 
 
 def drive(before: Pose, target: Pose, frames: int) -> list[Pose]:
-    """Return the pose of a hand in each frame of a clip but the first.
+    """Return the hand's pose in each frame of a clip but the first.
 
-    It moves in a straight line, and opens or closes when it is there.
+    The hand moves in a straight line, then opens or closes at the target.
     """
     turn = cv2.Rodrigues(before.rotation.T @ target.rotation)[0]
     poses = []
@@ -95,34 +95,34 @@ def drive(before: Pose, target: Pose, frames: int) -> list[Pose]:
 
 
 def perform(scene: Scene, intent: Intent, before: Pose, side: Side, frames: int) -> list[Pose]:
-    """Return the pose of a hand in each frame but the first while it acts on a body."""
+    """Return the hand's pose in each frame but the first of a scripted interaction."""
     hand = Hand(side=side, grip=before.grip())
     moments = hand_motion.act(scene, (hand,), intent, "human", frames=frames)
     return [Pose.of_grip(moment.hands[0].grip) for moment in moments[1:]]
 
 
-def reach(scene: Scene, name: str, side: Side) -> Pose:
-    """Return the open hand at the place where it would grasp a body."""
+def pre_grasp_pose(scene: Scene, name: str, side: Side) -> Pose:
+    """Return the pose of an open hand that is about to grasp a body."""
     grip = hand_motion.grip_on(scene, Intent(verb="lift", name=name), "human", side)
     return Pose.of_grip(replace(grip, closure=hand_motion.opened("human")))
 
 
-def ready(scene: Scene, name: str, side: Side) -> Pose:
-    """Return the hand in the air in front of a body, where hands begin in the training clips."""
+def ready_pose(scene: Scene, name: str, side: Side) -> Pose:
+    """Return the pose in the air in front of a body from which training clips start."""
     grip = hand_motion.grip_on(scene, Intent(verb="lift", name=name), "human", side)
     return Pose.of_grip(hand_motion.relaxed(grip.point_m + hand_motion.BEFORE_M, side, "human"))
 
 
-def first_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] | None:
-    """Return a body near the middle, and a free place across the hand, which hides it nowhere.
+def suggest_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] | None:
+    """Return a movable body near the center, and a free place on the side away from the hand.
 
-    None if there is no loose body with such a place.
+    The hand does not hide the body there. None if no movable body has a free place.
     """
     across, rng = -1.0 if side == "right" else 1.0, np.random.default_rng(0)
     loose = [b for b in scene.bodies if b.shape != "ring" and not (b.static or b.articulated)]
     gaps = {b.name: np.linalg.norm(b.world_from_body[:2, 3] - MIDDLE_M) for b in loose}
     for name in sorted(gaps, key=lambda name: gaps[name]):
-        drawn = [scene.free_place(scene.body(name), rng, away_m=FIRST_M) for _ in range(8)]
+        drawn = [scene.free_place(scene.body(name), rng, away_m=CARRY_M) for _ in range(8)]
         places = [place for place in drawn if place is not None]
         if places:
             return name, max(places, key=lambda place: across * place[0])
@@ -130,19 +130,22 @@ def first_goal(scene: Scene, side: Side) -> tuple[str, Float[np.ndarray, " 2"]] 
 
 
 def intent_of(
-    deed: Deed, scene: Scene, name: str, place_m: Float[np.ndarray, " 2"] | None = None
+    interaction: Interaction,
+    scene: Scene,
+    name: str,
+    place_m: Float[np.ndarray, " 2"] | None = None,
 ) -> Intent:
-    """Return a deed as the intent of a script, with its caption; `place_m` is where to carry to."""
+    """Return an interaction as a script's intent with its caption; `carry` ends at `place_m`."""
     body = scene.body(name)
-    if deed == "open or close":
+    if interaction == "open or close":
         return hand_motion.open_or_close(scene, body)
-    if deed == "lift" or place_m is None:
+    if interaction == "lift" or place_m is None:
         return hand_motion.lift(body)
     return hand_motion.carry(body, place_m)
 
 
-def remembered(scene: Scene, state: SceneState) -> Scene:
-    """Return a first scene with its bodies where a state remembers them."""
+def scene_from_state(scene: Scene, state: SceneState) -> Scene:
+    """Return a first scene with its bodies moved to their poses in a state."""
     for body in scene.bodies:
         motion = state.world_from_object.get(scene.instance_id(body.name))
         if motion is None:
@@ -151,6 +154,7 @@ def remembered(scene: Scene, state: SceneState) -> Scene:
         if not body.articulated:
             scene = scene.with_pose(body.name, part)
             continue
+        # estimated motion is noisy: take the nearest pose that the joint allows
         inside = np.linalg.inv(body.world_from_body) @ part
         gaps = [_gap(moving_part(body, opening), inside) for opening in OPENINGS]
         scene = scene.with_opening(body.name, float(OPENINGS[int(np.argmin(gaps))]))
@@ -158,6 +162,6 @@ def remembered(scene: Scene, state: SceneState) -> Scene:
 
 
 def _gap(pose: np.ndarray, other: np.ndarray) -> float:
-    """Return the distance of two poses in meters, a radian counting as a drawer's travel."""
+    """Return the distance between two poses in meters; a radian counts as a drawer's travel."""
     translation = np.linalg.norm(pose[:3, 3] - other[:3, 3])
     return float(translation + DRAWER_M * np.linalg.norm(pose[:3, :3] - other[:3, :3]))

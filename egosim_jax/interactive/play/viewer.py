@@ -1,7 +1,7 @@
 """Page of `egosim play`: a state to orbit, a hand to drag, clips next to their ground truth.
 
-Made with viser, which keeps the page of every browser equal. Everything that changes the episode
-runs under one lock; the page can be used again as soon as a clip is shown, while it is perceived.
+viser shows the same page in every browser. One lock guards all changes of the episode. The page
+accepts one more request while perception runs.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,50 +17,60 @@ import viser
 import viser.transforms as tf
 from jaxtyping import Float, UInt8
 
-from egosim_jax.interactive.play.moves import Deed, Pose, drive, intent_of, perform, reach
-from egosim_jax.interactive.play.played import Frames, Moment, Played
+from egosim_jax.interactive.play.moves import (
+    Interaction,
+    Pose,
+    drive,
+    intent_of,
+    perform,
+    pre_grasp_pose,
+)
+from egosim_jax.interactive.play.played_episode import Frames, Moment, PlayedEpisode
 from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import REACH_M
 from egosim_jax.worlds.tabletop.hands import SKIN, hand_meshes, joints_of, pinch
+from egosim_jax.worlds.tabletop.scene import Scene
 
 SCALE = 3
-"""Size of a picture on the page, in pixels per pixel of the clip."""
+"""Upscaling of clip frames on the page."""
 CAMERA = (("turn", 4, 20.0), ("tilt", 3, 15.0), ("lean", 0, 12.0), ("forward", 2, 12.0))
-"""Sliders of the camera: name, number of the row, largest value in degrees or centimeters."""
+"""Camera sliders: name, index in the camera row, maximum in degrees or centimeters."""
 HELP = (
     "Drag the **hand** or the **ring**, choose an object, press a button. Orbit with the mouse; "
-    "the picture in the frustum is what the wearer would see."
+    "the image in the frustum is the wearer's view."
 )
-DEEDS: tuple[tuple[str, Deed], ...] = (
+INTERACTIONS: tuple[tuple[str, Interaction], ...] = (
     ("put it on the ring", "carry"),
     ("lift it", "lift"),
     ("open or close it", "open or close"),
 )
-"""Labels of what a hand does with an object."""
+"""Button labels of the interactions."""
 NOTHING: tuple[str, ...] = ("-",)
-"""Choice where there is none."""
+"""Placeholder of an empty list."""
 PREVIEW_S = 0.1
-"""Shortest time between two previews, in seconds."""
+"""Minimum time between two previews, in seconds."""
 
 
 class LocalServer(viser.ViserServer):
-    """Server of a page on this machine alone: it opens no tunnel, whatever a browser asks."""
+    """Page server that never opens a public tunnel, even if a browser requests one."""
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Refuse to publish the page."""
 
 
 class Page:
-    """Page of an episode that is played."""
+    """Page of a played episode."""
 
-    def __init__(self, server: viser.ViserServer, new: Callable[[int], Played], played: Played):
-        """`new` begins an episode of a seed."""
+    def __init__(
+        self, server: viser.ViserServer, new: Callable[[int], PlayedEpisode], played: PlayedEpisode
+    ):
+        """Show an episode; `new` begins another one from a seed."""
         self._server, self._new, self.played = server, new, played
         self._changing, self._waiting = threading.Lock(), threading.Lock()
         self._stale, self._shown = threading.Event(), 0
-        self._filling = False
+        self._filling = False  # viser also calls back for values that the page itself sets
         self._make_scene()
         self._make_controls()
         self._open()
@@ -100,14 +109,15 @@ class Page:
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.set_panel_label("egosim play")
         blank = np.zeros((self.played.world.video.height, self.played.world.video.width, 3))
-        self._pictures = [
+        self._images = [
             gui.add_image(_large(blank.astype(np.uint8)), label=label, jpeg_quality=90)
             for label in ("Generated", "Ground truth")
         ]
         self._status = gui.add_markdown(HELP)
         with gui.add_folder("Act"):
             self._object: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", NOTHING)
-            self._choose("Let the hand", {label: partial(self._do, d) for label, d in DEEDS})
+            acts = {label: partial(self._interact, act) for label, act in INTERACTIONS}
+            self._choose("Let the hand", acts)
         with gui.add_folder("Hand"):
             self._closure = gui.add_slider("Grasp", 0.0, 1.0, 0.01, 0.25)
             self._closure.on_update(lambda _: self._draw_hand())
@@ -115,8 +125,8 @@ class Page:
             self._choose("Let the hand", moves)
         with gui.add_folder("Camera", expand_by_default=False):
             self._moved = [
-                gui.add_slider(name, -most, most, 0.5, 0.0, hint="degrees" if n > 2 else "cm")
-                for name, n, most in CAMERA
+                gui.add_slider(name, -limit, limit, 0.5, 0.0, hint="degrees" if n > 2 else "cm")
+                for name, n, limit in CAMERA
             ]
             for slider in self._moved:
                 slider.on_update(lambda _: self._stale.set())
@@ -129,18 +139,18 @@ class Page:
             self._choose("That table", {"begin there": self._begin})
 
     def _choose(self, label: str, runs: dict[str, Callable[[], None]]) -> None:
-        """Add a row of buttons, each of which changes the episode."""
+        """Add a row of buttons; each one changes the episode."""
         group = self._server.gui.add_button_group(label, tuple(runs))
         group.on_click(lambda event: self._change(runs[event.target.value]))
 
     def _change(self, run: Callable[[], None]) -> None:
-        """Run what changes the episode, unless something else already waits to."""
-        if not self._waiting.acquire(blocking=False):
+        """Run a change of the episode, unless another change already waits."""
+        if not self._waiting.acquire(blocking=False):  # at most one waits: clicks do not pile up
             return
         try:
             with self._changing:
                 self._waiting.release()
-                self._shown += 1  # ends what is being replayed
+                self._shown += 1  # ends a running replay
                 run()
         except (InputError, FloatingPointError) as error:
             self._status.content = quote_text(str(error))
@@ -165,32 +175,32 @@ class Page:
             closure=float(self._closure.value),
         )
 
-    def _do(self, deed: Deed) -> None:
-        """Act on the chosen object, where the state remembers it."""
+    def _interact(self, interaction: Interaction) -> None:
+        """Act on the chosen object, at its place in the state."""
         played = self.played
-        scene, name = self._believed(), self._object.value
-        if scene.body(name).articulated != (deed == "open or close"):
+        scene, name = self._scene(), self._object.value
+        if scene.body(name).articulated != (interaction == "open or close"):
             raise InputError(
                 f"The {name} cannot be used so: drawers and lids open and close, all other objects "
                 "are lifted and carried. Choose another object or button."
             )
         place = np.array(self._ring.position[:2], float)
-        intent = intent_of(deed, scene, name, place)
+        intent = intent_of(interaction, scene, name, place)
         poses = perform(scene, intent, played.hand, played.side, played.world.video.frames)
         self._step(poses, f"The {played.side} hand {intent.caption}")
 
-    def _believed(self) -> Any:
-        scene = self.played.believed()
+    def _scene(self) -> Scene:
+        scene = self.played.current_scene()
         if scene is None:
             raise InputError(
-                "The scene is none of the tabletop world's, so nothing is known of its bodies: "
-                "drag the hand instead."
+                "The scene is not from the tabletop world, so its objects are unknown: drag the "
+                "hand instead."
             )
         return scene
 
     def _aim(self) -> None:
-        """Move the gizmo to where the hand would grasp the object."""
-        self._place(reach(self._believed(), self._object.value, self.played.side))
+        """Move the gizmo to the pose before a grasp of the object."""
+        self._place(pre_grasp_pose(self._scene(), self._object.value, self.played.side))
 
     def _drive(self) -> None:
         played = self.played
@@ -202,14 +212,14 @@ class Page:
 
         def show(frames: Frames, last: bool) -> None:
             for frame in frames:
-                self._pictures[0].image = _large(frame)
+                self._images[0].image = _large(frame)
             if last:
-                self._status.content = "Looking at what happened…"
+                self._status.content = "Updating the state…"
 
         timing = self.played.step(poses, self._camera, caption, show)
         self._status.content = (
             f"{quote_text(caption)}  \nFirst frame after {timing.first_s:.1f} s, last after "
-            f"{timing.last_s:.1f} s; remembered after {timing.total_s:.1f} s."
+            f"{timing.last_s:.1f} s; state updated after {timing.total_s:.1f} s."
         )
         self._refresh()
         self._replay_later([self.played.now])
@@ -226,7 +236,7 @@ class Page:
         self._refresh()
 
     def _refresh(self) -> None:
-        """Show the present moment."""
+        """Show the current moment."""
         played, now = self.played, self.played.now
         state = played.state
         with self._server.atomic():
@@ -241,10 +251,10 @@ class Page:
             slider.value = round(float(np.degrees(value) if number > 2 else 100 * value), 1)
         self._place(played.hand)
         self._filling = False
-        self._pictures[0].image = _large(now.frames[-1])
-        self._pictures[1].visible = now.truth is not None
+        self._images[0].image = _large(now.frames[-1])
+        self._images[1].visible = now.truth is not None
         if now.truth is not None and now.truth.done():
-            self._pictures[1].image = _large(now.truth.result()[1][-1])
+            self._images[1].image = _large(now.truth.result()[1][-1])
 
     def _place(self, hand: Pose) -> None:
         """Show the hand in a pose."""
@@ -264,7 +274,7 @@ class Page:
         self._stale.set()
 
     def _keep_preview(self) -> None:
-        """Draw the wearer's view again whenever hand, camera or state changed."""
+        """Redraw the wearer's view whenever hand, camera or state has changed."""
         while True:
             self._stale.wait()
             self._stale.clear()
@@ -302,7 +312,7 @@ class Page:
         threading.Thread(target=self._show, args=(list(moments), self._shown), daemon=True).start()
 
     def _show(self, moments: Sequence[Moment], number: int) -> None:
-        """Show clips at their rate, generated and true ones side by side, until others are."""
+        """Play clips at their frame rate next to their ground truth, until `_shown` changes."""
         pause = 1 / self.played.world.video.fps
         for moment in moments:
             truth = None if moment.truth is None else moment.truth.result()[1]
@@ -310,16 +320,16 @@ class Page:
                 if self._shown != number:
                     return
                 then = time.monotonic()
-                self._pictures[0].image = _large(frame)
+                self._images[0].image = _large(frame)
                 if truth is not None:
-                    self._pictures[1].image = _large(truth[index])
+                    self._images[1].image = _large(truth[index])
                 time.sleep(max(0.0, pause - (time.monotonic() - then)))
 
     def _save(self) -> None:
         """Write the episode and its video to the session's folder."""
         played = self.played
         if not played.at:
-            raise InputError("Nothing has happened yet: make a clip first.")
+            raise InputError("The episode has no clips yet: make one first.")
         folder = played.session.folder
         played.episode().save(folder / "episode.zip")
         write_video(folder / "episode.mp4", _video(played), played.world.video.fps)
@@ -331,8 +341,8 @@ class Page:
         self._open()
 
 
-def _video(played: Played) -> UInt8[np.ndarray, "f h w 3"]:
-    """Return the clips up to the present moment, with the true ones to their right."""
+def _video(played: PlayedEpisode) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return the clips up to the current moment, with their ground truth on the right."""
     clips = []
     for moment in played.moments[1 : played.at + 1]:
         pair = [moment.frames]

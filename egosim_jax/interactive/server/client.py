@@ -1,9 +1,9 @@
-"""Client of a server of sessions, over its websocket. Needs no jax.
+"""Websocket client of a session server. Needs no jax.
 
 with Client("ws://127.0.0.1:8000") as client:
     session = client.create(seed=3)
-    reply = session.step(rows)          # {"frames": ..., "row": ..., "info": ...}
-    reply = session.step(rows, show=lambda frames: ...)     # in groups, as they are decoded
+    reply = session.step(rows)  # {"frames": ..., "row": ..., "info": ...}
+    reply = session.step(rows, show=lambda frames: ...)  # groups of decoded frames
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.types import InputError
 
 Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
-"""Function that gets the frames of a step in groups, as they are decoded."""
+"""Callback for each decoded group of frames."""
 REPEATABLE = ("step", "reset", "save", "load", "status")
-"""Requests that have the same effect when they are sent again after a timeout."""
+"""Idempotent requests, which may be sent again after a timeout."""
 
 
 class Client:
-    """Connection to a server, for one thread."""
+    """Connection to a server; use one per thread."""
 
     def __init__(
         self,
@@ -39,8 +39,8 @@ class Client:
     ):
         """Connect to an address such as ws://127.0.0.1:8000.
 
-        A request waits `timeout_s` for its reply, and is sent again for `patience_s` while the
-        server is full or the session busy.
+        A request waits `timeout_s` for its reply. While the server is full or the session busy, it
+        is sent again for up to `patience_s`.
         """
         import websockets.sync.client
 
@@ -55,7 +55,7 @@ class Client:
         )
         self._socket = self._connection.__enter__()
         self.server: dict[str, Any] = wire.unpack(self._received())
-        """Description of the server: world, size and rate of clips, limits."""
+        """Description of the server: world, size and rate of its clips, limits."""
 
     def __enter__(self) -> Client:
         return self
@@ -64,7 +64,7 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Disconnect; the sessions stay."""
+        """Disconnect; the sessions stay open."""
         self._connection.__exit__(None, None, None)
 
     def _received(self) -> bytes:
@@ -82,8 +82,8 @@ class Client:
     def request(self, kind: str, /, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
         """Return the reply to a request. Raises `RequestError` with the server's message.
 
-        `show` gets the frames of a step that is streamed, before its reply.
-        If it is interrupted, or waits too long, the connection is closed: connect and attach again.
+        `show` gets the frames of a streamed step before its reply. An interrupt or timeout closes
+        the connection: connect and attach again.
         """
         message = wire.pack({"request": kind, **fields})
         until = time.monotonic() + self._patience_s
@@ -107,17 +107,17 @@ class Client:
                 reply = wire.unpack(self._received())
         except RequestError:
             raise
-        except BaseException:  # a late reply would be taken for that to the next request
+        except BaseException:  # otherwise a late reply would be read as the next request's
             self.close()
             raise
         return reply
 
     def create(self, **fields: Any) -> RemoteSession:
-        """Create a session of a `seed` or `episode`."""
+        """Create a session from a `seed` or an `episode`."""
         return RemoteSession(self, self.request("create", **fields))
 
     def attach(self, session: str) -> RemoteSession:
-        """Continue a session by its id, from any client."""
+        """Continue a session of any client, by its id."""
         status = self.request("status", session=session)
         return RemoteSession(self, {**status, "step_id": status["committed_step_id"]})
 
@@ -128,15 +128,15 @@ class RemoteSession:
     def __init__(self, client: Client, reply: dict[str, Any]):
         self._client, self.id = client, reply["session"]
         self.reply = reply
-        """Reply to the request that created or attached it."""
+        """Reply to the request that created or attached the session."""
         self.step_id: int = reply["step_id"]
-        """Last committed step."""
+        """Number of the last committed step."""
 
     def step(self, rows: np.ndarray, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
-        """Make the next step.
+        """Make the next step, and return its reply.
 
-        `show` gets its frames in groups as they are decoded, before the step is perceived and
-        committed; a step that the server has made already, or makes already, is not shown.
+        `show` gets the frames in groups as they are decoded, before the step is perceived and
+        committed. A step that is already committed or under way is not shown.
         """
         fields = {"actions": np.asarray(rows, float), **fields}
         if show is not None:
@@ -147,26 +147,26 @@ class RemoteSession:
         if (reply["session"], reply["step_id"]) != (self.id, self.step_id + 1):
             raise InputError(
                 f"The reply is step {reply['step_id']} of session {reply['session']}, not step "
-                f"{self.step_id + 1} of {self.id}: a client is for one thread. Give each "
-                "thread its own."
+                f"{self.step_id + 1} of {self.id}: a client is for one thread. Use a client "
+                "per thread."
             )
         self.step_id = reply["step_id"]
         return reply
 
     def reset(self, **fields: Any) -> dict[str, Any]:
-        """Continue from a `seed` or `episode`; without one from the first start."""
+        """Continue from a `seed` or an `episode`, by default from the first start."""
         return self._client.request("reset", session=self.id, **fields)
 
     def save(self, name: str) -> None:
-        """Save where the session is under a name."""
+        """Save the current position of the session under a name."""
         self._client.request("save", session=self.id, name=name)
 
     def load(self, name: str) -> dict[str, Any]:
-        """Continue from what was saved under a name."""
+        """Continue from a saved position."""
         return self._client.request("load", session=self.id, name=name)
 
     def status(self) -> dict[str, Any]:
-        """Return committed step, hash of the state and saved names."""
+        """Return the committed step, the hash of the state and the saved names."""
         return self._client.request("status", session=self.id)
 
     def close(self, *, keep: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Recorded sessions as data: LeRobot datasets, training shards, and recordings for Rerun."""
+"""Export of recorded sessions: LeRobot datasets, training shards, and Rerun recordings."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid,
 
 @dataclass(frozen=True, kw_only=True)
 class _Unavailable:
-    """Generator of a world that is only read."""
+    """Generator of a recorded world, which can only be rendered."""
 
     renderer: Any
     """Renderer of the views."""
 
     def __call__(self, view: View, action: Action, first_frame: Any, seed: int) -> Any:
-        raise InputError("A recorded session cannot be continued here: use egosim serve.")
+        raise InputError("A recorded session cannot continue here: use egosim serve.")
 
 
 def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session], dict[str, str]]:
-    """Return the sessions of a server's folder with at least one step, and what is damaged.
+    """Return the sessions of a server's folder, and the error of each damaged one.
 
-    These are the open ones and those that were closed and kept. A damaged one does not keep the
-    others from being read. Raises `InputError` if no session is left, for an id of `names` that is
-    not there, and if a session that is named is damaged.
+    Sessions that were closed and kept are included; sessions without a step are not. Raises
+    `InputError` if no session is readable, and if a session of `names` is missing or damaged.
     """
     paths = sorted({p.parent for name in (SETTINGS, CLOSED) for p in folder.glob(f"[!.]*/{name}")})
     known = {path.name: path for path in paths}
@@ -53,7 +52,7 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
         except DAMAGE as error:
             if names:
                 raise InputError(
-                    f"Session {path.name} cannot be exported: {error} Export others. (--session)"
+                    f"Session {path.name} cannot be exported: {error} Omit it. (--session)"
                 ) from error
             damaged[path.name] = str(error)
         else:
@@ -61,14 +60,14 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
     if not found:
         raise InputError(
             f"{quote_path(folder)} has no readable session with a committed step"
-            f"{f', and {len(damaged)} damaged ones' if damaged else ''}: name the folder of egosim "
+            f"{f', and {len(damaged)} damaged ones' if damaged else ''}: give the folder of egosim "
             "serve. (SESSIONS)"
         )
     return found, damaged
 
 
 def _recorded(path: Path) -> GeneratedWorld:
-    """Return the world of a recorded session, which renders and does not generate."""
+    """Return a world that renders a recorded session, and does not generate."""
     fields = settings_of(path).get("video")
     names = ("frames", "height", "width", "fps")
     if not isinstance(fields, dict) or not all(type(fields.get(n)) is int for n in names):
@@ -78,7 +77,7 @@ def _recorded(path: Path) -> GeneratedWorld:
 
 
 def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
-    """Write a LeRobot dataset with an episode for each stretch between resets."""
+    """Write a LeRobot dataset with one episode per run of steps between resets."""
     names = {(session.actions.kind, session.actions.names) for session in sessions}
     videos = {session.backend.video for session in sessions}
     if len(names) > 1 or len(videos) > 1:
@@ -100,25 +99,25 @@ def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
 def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
     for number in steps:
         yield ClipRecord(
-            frames=session.repeat(number).frames,
+            frames=session.load_result(number).frames,
             rows=session.rows(number),
             action=session.action(number),
         )
 
 
 def _steps(session: Session) -> Iterator[tuple[int, SceneState, View, Any]]:
-    """Yield number, state before, its view and first frame of each committed step."""
+    """Yield the number, prior state, view and first frame of each committed step."""
     for start, steps in session.runs():
         state, image = start.state, start.first_frame
         simulator = session.backend.simulator(start)
         for number in steps:
             view = view_of(simulator, state, session.action(number).cameras)
             yield number, state, view, view.frames[0] if image is None else image
-            state, image = session.repeat(number).state, None
+            state, image = session.load_result(number).state, None
 
 
 def to_shards(sessions: Sequence[Session], folder: Path, *, grid: VideoGrid) -> None:
-    """Write the steps as clips for training: prior, mask, hands, and the clip as the target."""
+    """Write the steps as training clips: prior, mask, hands, and the clip as the target."""
     specs = {session.backend.video for session in sessions}
     if len(specs) > 1:
         raise InputError(
@@ -141,7 +140,7 @@ def to_shards(sessions: Sequence[Session], folder: Path, *, grid: VideoGrid) -> 
                     mask=view.mask,
                     hands=hands,
                     first_frame=image,
-                    target=session.repeat(number).frames,
+                    target=session.load_result(number).frames,
                     extra={"kind": action.kind, "session": session.id},
                 )
                 record = triplet_record(triplet)
@@ -153,7 +152,7 @@ def to_rerun(session: Session, path: Path) -> None:
     first = next(session.runs())[0].state
     recording, state = Recording(path, session.id, up=up_of(first)), first
     for number, before, view, _ in _steps(session):
-        result = session.repeat(number)
+        result = session.load_result(number)
         recording.add(
             before,
             session.action(number),

@@ -1,4 +1,4 @@
-"""Checks before a request is read: token, origin and host, size and time of its body."""
+"""Checks before a request is read: token, origin, host, and size and time of the body."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.io.bounded import quote
 
 OPEN_PATHS = ("/healthz", "/readyz")
-"""Paths that need no token."""
-BODY_S = 60.0
-"""Longest time in which the body of a request must arrive."""
+"""Paths without a token."""
+BODY_TIMEOUT_S = 60.0
+"""Maximum time in which the body of a request must arrive."""
 
 
 class Guard:
-    """ASGI middleware that checks token, origin and size before a request is read."""
+    """ASGI middleware that checks token, origin, host and size before a request is read."""
 
     def __init__(self, app: ASGIApp, *, token: str | None, limit: int = wire.MAX_BYTES):
         self._app, self._token, self._limit = app, token, limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or refuse it."""
+        """Forward the request, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             return await self._app(scope, receive, send)
         try:
@@ -42,21 +42,23 @@ class Guard:
         await self._app(scope, self._bounded(receive), send)
 
     def _check(self, connection: HTTPConnection) -> None:
-        headers, path = connection.headers, connection.scope["path"]  # url contains the Host header
+        # not connection.url: it starts with the Host header, which the client chooses
+        headers, path = connection.headers, connection.scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")
         if origin is not None and _address(origin).netloc != host:
             raise RequestError(
                 403,
                 "wrong_origin",
                 "The request comes from a page of another origin, which may not use this server. "
-                "Use a client of your own.",
+                "Use a client outside the browser.",
             )
+        # without a token, DNS rebinding would let a web page reach the loopback by its own name
         if self._token is None and not is_loopback(_address(f"//{host}").hostname or ""):
             raise RequestError(
                 403,
                 "wrong_host",
-                "The host of the request is not this machine: without a token, the server is used "
-                "as localhost or 127.0.0.1 only.",
+                "The host of the request is not this machine: without a token, the server must be "
+                "addressed as localhost or 127.0.0.1. Use one of them, or set a token.",
             )
         if self._token is not None and path not in OPEN_PATHS:
             scheme, _, given = headers.get("authorization", "").partition(" ")
@@ -74,7 +76,7 @@ class Guard:
 
     def _bounded(self, receive: Receive) -> Receive:
         total, complete = 0, False
-        until = time.monotonic() + BODY_S
+        until = time.monotonic() + BODY_TIMEOUT_S
 
         async def bounded() -> Message:
             nonlocal total, complete
@@ -102,21 +104,21 @@ def _address(url: str) -> SplitResult:
 
 
 def too_large(limit: int) -> RequestError:
-    """Return the error of a message of too many bytes."""
+    """Return the error for a message above the limit."""
     return RequestError(
         413,
         "too_large",
-        f"The message is larger than {limit:,} bytes, the most that is read. Send fewer rows or a "
-        "smaller episode.",
+        f"The message is larger than the maximum of {limit:,} bytes. Send fewer rows or a smaller "
+        "episode.",
     )
 
 
 def too_slow() -> RequestError:
-    """Return the error of a body that comes too slowly."""
+    """Return the error for a body that did not arrive in time."""
     return RequestError(
         408,
         "too_slow",
-        f"The body has not arrived within {BODY_S:g} s, the longest that is waited. Send it again.",
+        f"The body did not arrive within the maximum of {BODY_TIMEOUT_S:g} s. Send it again.",
     )
 
 
@@ -131,7 +133,7 @@ async def _refuse(error: RequestError, scope: Scope, receive: Receive, send: Sen
 
 
 def response(error: RequestError) -> JSONResponse:
-    """Return the response of a request that is refused."""
+    """Return the response to a refused request."""
     headers = {}
     if error.retry_after_s is not None:
         headers["Retry-After"] = str(max(1, round(error.retry_after_s)))

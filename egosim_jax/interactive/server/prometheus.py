@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import traceback
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
+from egosim_jax.interactive.server.errors import RequestError, as_request_error
+
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128)
-"""Upper bounds of the histogram of seconds."""
+"""Upper bounds of the histogram buckets, in seconds."""
 
 
 class Metrics:
-    """Metrics in their own registry, so that one process may hold several servers."""
+    """Metrics of one server, in a separate registry: a process may hold several servers."""
 
     def __init__(self) -> None:
         self.registry = registry = CollectorRegistry()
         self.sessions = Gauge("egosim_sessions", "Open sessions.", registry=registry)
-        self.queued = Gauge("egosim_queue", "Requests that wait or run.", registry=registry)
+        self.queued = Gauge("egosim_queue", "Waiting or running requests.", registry=registry)
         self.connections = Gauge("egosim_connections", "Open websockets.", registry=registry)
-        self.steps = Counter("egosim_steps", "Steps whose results were sent.", registry=registry)
-        self.refused = Counter(
-            "egosim_refused", "Requests that were refused.", ["code"], registry=registry
-        )
+        self.steps = Counter("egosim_steps", "Steps with a sent result.", registry=registry)
+        self.refused = Counter("egosim_refused", "Refused requests.", ["code"], registry=registry)
         self.first_frames = Histogram(
             "egosim_first_frames_seconds",
-            "Seconds from a streamed step's request until its first frames are sent.",
+            "Seconds from the request of a streamed step until its first frames are sent.",
             buckets=SECONDS,
             registry=registry,
         )
@@ -32,6 +34,14 @@ class Metrics:
             buckets=SECONDS,
             registry=registry,
         )
+
+    def refuse(self, error: Exception) -> RequestError:
+        """Count an error and convert it for the client; log an internal one."""
+        found = as_request_error(error)
+        if found is not error and found.code == "internal":
+            traceback.print_exception(error)
+        self.refused.labels(found.code).inc()
+        return found
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus's text format."""

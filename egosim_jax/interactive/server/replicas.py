@@ -1,10 +1,10 @@
-"""Sessions on several machines: replicas of Ray Serve, each of which has a part of the sessions.
+"""Sessions on several machines, sharded over replicas of Ray Serve.
 
     serve run egosim_jax.interactive.server.replicas:app out=/shared/serve parts=4 gpus=1
 
-The hash of a session's id chooses its part, whose one replica holds the folder OUT/part-N. If a
-replica or its machine fails, Ray starts it again, and it resumes its sessions as `egosim serve`
-does. Clients connect to Ray's proxy of any machine as to one server. Needs the extra `replicas`.
+A hash of the session id selects its part. One replica serves each part, from the folder OUT/part-N.
+If a replica or its machine fails, Ray restarts it, and it resumes its sessions like `egosim serve`.
+Clients connect to Ray's proxy on any machine, as to one server. Needs the extra `replicas`.
 """
 
 from __future__ import annotations
@@ -23,47 +23,48 @@ from typing import Any
 from egosim_jax.interactive.env import World
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.server.requests import REQUESTS, is_streamed
 from egosim_jax.interactive.server.server import make_app
-from egosim_jax.interactive.server.service import FIELDS, is_streamed, open_service, refusal
+from egosim_jax.interactive.server.service import open_service
 from egosim_jax.interactive.server.store import Limits
 from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
 from egosim_jax.io.run import write_json
 from egosim_jax.types import InputError, check_counts
 
 PARTS = "parts.json"
-"""File of the number of parts, which cannot change while there are sessions."""
-ONGOING = 1000
-"""Most requests that Ray sends to a replica at a time, above the limits of its store."""
-DRAIN_S = 300.0
-"""Longest time that a replica that is stopped has for the requests under way."""
+"""File with the number of parts, which is fixed once there are sessions."""
+MAX_ONGOING = 1000
+"""Maximum concurrent requests that Ray sends to a replica; its store has lower limits."""
+DRAIN_TIMEOUT_S = 300.0
+"""Maximum time that a stopped replica has to finish its running requests."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replicas:
-    """Settings of a deployment, which `serve run` takes as NAME=VALUE."""
+    """Settings of a deployment, given to `serve run` as NAME=VALUE."""
 
     out: Path
-    """Folder that all machines see; each part of the sessions has a folder in it."""
+    """Folder that all machines share; each part has a subfolder."""
     parts: int = 2
     """Number of parts, each with one replica."""
     gpus: float = 0.0
-    """GPUs of a replica."""
+    """GPUs per replica."""
     cpus: float = 1.0
-    """CPU cores that Ray reserves for a replica."""
+    """CPU cores that Ray reserves per replica."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
-    """Folder of weights, if not those that come with the package."""
+    """Folder of weights; by default the packaged ones."""
     world: World = "generated"
-    """World of the sessions: the model's, or the tabletop world itself."""
+    """World of the sessions: the model's, or the true tabletop world."""
     perception: str = "classical"
-    """Perception pipeline by name, with its options."""
+    """Perception pipeline: name and options."""
     steps: int | None = None
-    """Denoising steps, instead of the model's."""
+    """Number of denoising steps; by default the model's."""
     batch: int = 4
-    """Most clips that a replica generates together."""
+    """Maximum batch size of a replica, in clips."""
     sessions: int = 64
-    """Most open sessions of a replica."""
+    """Maximum number of open sessions per replica."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` unless counts are positive and the folder is absolute."""
@@ -71,8 +72,8 @@ class Replicas:
         check_counts({"steps": self.steps})
         if not self.out.is_absolute():
             raise InputError(
-                f"out is {quote_path(self.out)}: it must be absolute, as replicas run in folders "
-                "of Ray. Give the whole path. (out)"
+                f"out is {quote_path(self.out)}: it must be absolute, because replicas run in "
+                "Ray's folders. Give the full path. (out)"
             )
 
 
@@ -97,13 +98,13 @@ def read_settings(given: Mapping[str, Any]) -> Replicas:
 
 
 def part_of(session: str, parts: int) -> int:
-    """Return the part that has a session."""
-    name = session.encode("utf-8", "surrogatepass")  # of JSON, which may have half a pair
+    """Return the part of a session."""
+    name = session.encode("utf-8", "surrogatepass")  # JSON may contain a lone surrogate
     return int.from_bytes(hashlib.sha256(name).digest()[:8]) % parts
 
 
 def keep_parts(settings: Replicas) -> None:
-    """Record the number of parts. Raises `InputError` if the folder has another one."""
+    """Record the number of parts. Raises `InputError` if the folder has another number."""
     path = settings.out / PARTS
     if not path.exists():
         settings.out.mkdir(parents=True, exist_ok=True)
@@ -113,13 +114,13 @@ def keep_parts(settings: Replicas) -> None:
     if count != settings.parts:
         raise InputError(
             f"{quote_path(settings.out)} has sessions in {quote(count)} parts, not "
-            f"{settings.parts}: the number cannot change, as it chooses the part of a session. "
-            "Start it with that number, or choose another folder. (parts)"
+            f"{settings.parts}: the number cannot change, because it selects the part of a "
+            "session. Use that number, or choose another folder. (parts)"
         )
 
 
 class Part:
-    """Replica that has one part of the sessions."""
+    """Replica that serves one part of the sessions."""
 
     def __init__(self, settings: Replicas, number: int):
         self._service = open_service(
@@ -134,7 +135,7 @@ class Part:
         )
 
     async def describe(self) -> dict[str, Any]:
-        """Return the description of the world and the limits of this part."""
+        """Return the description of this part."""
         return await self._service.describe()
 
     async def handle(self, message: Any) -> dict[str, Any]:
@@ -142,7 +143,7 @@ class Part:
         try:
             return {"reply": await self._service.handle(message)}
         except Exception as error:
-            return {"error": self._service.refused(error).body()}
+            return {"error": self._service.metrics.refuse(error).body()}
 
     async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
         """Yield each `reply` to a streamed step, or the `error` for the client."""
@@ -151,16 +152,16 @@ class Part:
                 async for reply in replies:
                     yield {"reply": reply}
             except Exception as error:
-                yield {"error": self._service.refused(error).body()}
+                yield {"error": self._service.metrics.refuse(error).body()}
 
     def __del__(self) -> None:
-        """Finish the steps under way; Ray calls it before it stops a replica."""
+        """Finish the running steps. Ray calls it before it stops a replica."""
         if hasattr(self, "_service"):
             self._service.store.close()
 
 
 class Entrance:
-    """Requests of clients, each passed to the part of its session (`server.Requests`)."""
+    """Router of requests to the part of their session (`server.Requests`)."""
 
     def __init__(self, parts: Sequence[Any]):
         self._parts = parts
@@ -171,23 +172,19 @@ class Entrance:
         return make_app(self, token=os.environ.get("EGOSIM_TOKEN", "").strip() or None)
 
     async def describe(self) -> dict[str, Any]:
-        """Return the description of the first part, which is that of all, and their number."""
+        """Return the description of a part (identical on all) and the number of parts."""
         return {**await self._parts[0].describe.remote(), "parts": len(self._parts)}
 
     @contextmanager
     def active(self) -> Iterator[None]:
-        """Count nothing: Ray waits for the requests under way."""
+        """Do nothing: Ray itself waits for running requests."""
         yield
 
-    def refused(self, error: Exception) -> RequestError:
-        """Count the error of a request and return it for the client."""
-        return refusal(error, self.metrics)
-
     async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply of the part that has the session."""
+        """Return the reply of the session's part."""
         name = message.get("request") if isinstance(message, dict) else None
-        if not isinstance(name, str) or name not in FIELDS:
-            return await self._ask(0, message)  # which refuses it
+        if not isinstance(name, str) or name not in REQUESTS:
+            return await self._ask(0, message)  # any part refuses it
         session = message.get("session")
         if name == "status" and session is None:
             return await self._status(message)
@@ -197,7 +194,7 @@ class Entrance:
         return await self._ask(part_of(str(session), len(self._parts)), message)
 
     async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
-        """Yield the reply of the part that has the session, after frames that it streams."""
+        """Yield the reply of the session's part, after the frames of a streamed step."""
         if not is_streamed(message):
             yield await self.handle(message)
             return
@@ -205,11 +202,11 @@ class Entrance:
         with _restarts(number):
             streamed = self._parts[number].replies.options(stream=True).remote(message)
             async for found in streamed:
-                yield _opened(found)
+                yield _unwrap(found)
 
     async def _ask(self, number: int, message: Any) -> dict[str, Any]:
         with _restarts(number):
-            return _opened(await self._parts[number].handle.remote(message))
+            return _unwrap(await self._parts[number].handle.remote(message))
 
     async def _status(self, message: Mapping[str, Any]) -> dict[str, Any]:
         """Return the sessions of all parts."""
@@ -224,7 +221,7 @@ class Entrance:
 
 @contextmanager
 def _restarts(number: int) -> Iterator[None]:
-    """Turn the error of Ray for a part that has stopped into that for the client."""
+    """Convert Ray's error for a stopped replica."""
     from ray.exceptions import RayError
 
     try:
@@ -233,14 +230,14 @@ def _restarts(number: int) -> Iterator[None]:
         raise RequestError(
             503,
             "part_restarts",
-            f"The replica of part {number} has stopped; Ray starts it again and it resumes its "
+            f"The replica of part {number} has stopped; Ray restarts it, and it resumes its "
             "sessions. Send the same request again.",
             retry_after_s=5.0,
         ) from error
 
 
-def _opened(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the reply that a part has sent. Raises its error."""
+def _unwrap(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the reply of a part, or raise its error."""
     if "error" in found:
         body = dict(found["error"])
         raise RequestError(body.pop("status"), body.pop("code"), body.pop("message"), **body)
@@ -250,7 +247,7 @@ def _opened(found: Mapping[str, Any]) -> dict[str, Any]:
 def app(args: dict[str, str]) -> Any:
     """Return the application for `serve run` and `serve build`.
 
-    Raises `InputError` for settings that are not valid, or without Ray Serve.
+    Raises `InputError` for invalid settings, and without Ray Serve.
     """
     settings = read_settings(args)
     if find_spec("ray") is None or find_spec("grpc") is None:
@@ -263,8 +260,8 @@ def app(args: dict[str, str]) -> Any:
     keep_parts(settings)
     common: Any = {
         "num_replicas": 1,
-        "max_ongoing_requests": ONGOING,
-        "graceful_shutdown_timeout_s": DRAIN_S,
+        "max_ongoing_requests": MAX_ONGOING,
+        "graceful_shutdown_timeout_s": DRAIN_TIMEOUT_S,
     }
     resources = {"num_gpus": settings.gpus, "num_cpus": settings.cpus}
     part = serve.deployment(Part).options(ray_actor_options=resources, **common)

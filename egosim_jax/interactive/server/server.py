@@ -1,9 +1,9 @@
-"""HTTP and websocket server of sessions: FastAPI on uvicorn.
+"""HTTP and websocket server of sessions, with FastAPI on uvicorn.
 
-The websocket at / speaks OpenPI's protocol: the server sends a map that describes it, then each
-binary message is a request and gets one reply, a map as a binary message or an error as text; only
-a step that asks for it gets its frames first. HTTP has the same requests as JSON. All that is
-refused has a status, a code and a message.
+The websocket at / follows OpenPI's protocol. The server first sends a map that describes it. Then
+each binary message is a request with one reply: a map as a binary message, or an error as text. A
+streamed step gets its frames before the reply. HTTP has the same requests as JSON. Each error has a
+status, a code and a message.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from egosim_jax.interactive.server.service import Service
 from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
-DRAIN_S = 300.0
-"""Longest time that a shutdown waits for the requests that are under way."""
+DRAIN_TIMEOUT_S = 300.0
+"""Maximum time that a shutdown waits for running requests."""
 BODY = {
     "requestBody": {
         "description": "Fields of the request; see docs/serving.md.",
@@ -41,34 +41,28 @@ BODY = {
         "required": True,
     }
 }
-"""Description of the body of a request, which is not read by FastAPI: its size is bounded first."""
-SessionId = Annotated[str, Path(description="Id that create has returned.")]
+"""OpenAPI description of a body; FastAPI does not parse it, because `Guard` bounds its size."""
+SessionId = Annotated[str, Path(description="Id returned by create.")]
 
 
 @runtime_checkable
 class Requests(Protocol):
-    """Object that replies to clients: a `Service`, or several behind one entrance."""
+    """Object that replies to clients: a `Service`, or an `Entrance` to several."""
 
-    @property
-    def metrics(self) -> Metrics:
-        """Metrics of the requests."""
-        ...
+    metrics: Metrics
+    """Metrics of the requests."""
 
     @property
     def draining(self) -> bool:
-        """True if nothing new is taken."""
+        """True if new requests are refused."""
         ...
 
     async def describe(self) -> dict[str, Any]:
-        """Return the description that a client gets when it connects."""
+        """Return the description that a client receives when it connects."""
         ...
 
     def active(self) -> AbstractContextManager[None]:
-        """Return the context in which a request is replied to."""
-        ...
-
-    def refused(self, error: Exception) -> RequestError:
-        """Return the error of a request for the client."""
+        """Return the context that holds back a shutdown until the reply is sent."""
         ...
 
     async def handle(self, message: Any) -> dict[str, Any]:
@@ -76,7 +70,7 @@ class Requests(Protocol):
         ...
 
     def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
-        """Yield the reply to a request, after the frames of a step that is streamed."""
+        """Yield the reply to a request, after the frames of a streamed step."""
         ...
 
 
@@ -96,11 +90,11 @@ Fields = Annotated[dict[str, Any], Depends(_fields)]
 
 
 def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
-    """Return the application of a service; without a token it is used from this machine only."""
+    """Return the application of a service; without a token, only this machine can use it."""
     app = FastAPI(
         title="egosim_jax",
         version=metadata.version("egosim-jax"),
-        docs_url=None,  # its pages run scripts of another server
+        docs_url=None,  # the default pages load scripts from a CDN
         redoc_url=None,
     )
     app.add_middleware(Guard, token=token)
@@ -114,7 +108,7 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
 
     @app.exception_handler(InputError)
     async def unreadable(_: Any, error: InputError) -> JSONResponse:
-        return response(service.refused(error))
+        return response(service.metrics.refuse(error))
 
     @app.exception_handler(HTTPException)
     async def refused(_: Any, error: HTTPException) -> JSONResponse:
@@ -127,12 +121,12 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
         return response(RequestError(error.status_code, code, message))
 
     async def call(name: str, fields: dict[str, Any]) -> Response:
-        """Reply to a request of HTTP."""
+        """Return the response to an HTTP request."""
         with service.active():
             try:
                 reply = await service.handle({**_from_json(fields), "request": name})
             except Exception as error:
-                return response(service.refused(error))
+                return response(service.metrics.refuse(error))
             data = await asyncio.to_thread(wire.pack_json, reply)
             return Response(data, media_type="application/json")
 
@@ -140,13 +134,13 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
     async def healthz() -> PlainTextResponse:
         return PlainTextResponse("OK\n")
 
-    @app.get("/readyz", summary="The server takes requests")
+    @app.get("/readyz", summary="The server accepts requests")
     async def readyz() -> PlainTextResponse:
         if service.draining:
             return PlainTextResponse("draining\n", status_code=503)
         return PlainTextResponse("OK\n")
 
-    @app.get("/metrics", summary="Metrics in Prometheus's format")
+    @app.get("/metrics", summary="Metrics in the Prometheus format")
     async def metrics() -> PlainTextResponse:
         return PlainTextResponse(service.metrics.text().decode())
 
@@ -166,15 +160,15 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
     async def status(session: SessionId) -> Response:
         return await call("status", {"session": session})
 
-    @app.delete("/sessions/{session}", summary="Close a session and remove its files")
+    @app.delete("/sessions/{session}", summary="Close a session and delete its files")
     async def close(session: SessionId, keep: bool = False) -> Response:
         return await call("close", {"session": session, "keep": keep})
 
     for name, summary in {
-        "step": "Make a step; a repeated step_id returns the result of the first time",
+        "step": "Make a step; a repeated step_id returns the first result",
         "reset": "Continue from a seed or episode",
-        "save": "Save where the session is under a name",
-        "load": "Continue from what was saved",
+        "save": "Save the current position under a name",
+        "load": "Continue from a saved position",
     }.items():
         _add(app, name, summary, call)
 
@@ -194,7 +188,7 @@ def _add(app: FastAPI, name: str, summary: str, call: Any) -> None:
 
 
 def _from_json(fields: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a JSON request, in which an episode is Base64."""
+    """Return the fields of a JSON request, with a Base64 episode decoded."""
     import base64
     import binascii
 
@@ -208,7 +202,7 @@ def _from_json(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 async def _converse(socket: WebSocket, service: Requests) -> None:
-    """Describe the server to a client, then reply to its messages one after the other."""
+    """Describe the server to a client, then reply to its messages in order."""
     await socket.accept()
     connections = service.metrics.connections
     connections.inc()
@@ -220,7 +214,7 @@ async def _converse(socket: WebSocket, service: Requests) -> None:
                 return
             with service.active():
                 await _reply(socket, service, message.get("bytes"))
-    except (WebSocketDisconnect, RuntimeError):  # it vanished while a reply was on its way
+    except (WebSocketDisconnect, RuntimeError):  # the client disconnected during a reply
         return
     finally:
         connections.dec()
@@ -232,7 +226,7 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
             raise InputError("The message is text: it must be binary, packed as MessagePack.")
         message = await asyncio.to_thread(wire.unpack, data, limit=wire.MAX_BYTES)
     except Exception as error:
-        await socket.send_text(json.dumps(service.refused(error).body()))
+        await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
         return
     async with aclosing(service.replies(message)) as replies:
         while True:
@@ -241,13 +235,13 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
             except StopAsyncIteration:
                 return
             except Exception as error:
-                await socket.send_text(json.dumps(service.refused(error).body()))
+                await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
                 return
             await socket.send_bytes(reply)
 
 
 class _Server(uvicorn.Server):
-    """Server that finishes the requests under way when it is asked to end."""
+    """Server that finishes running requests before it shuts down."""
 
     def __init__(self, config: uvicorn.Config, service: Service):
         super().__init__(config)
@@ -262,19 +256,18 @@ class _Server(uvicorn.Server):
         threading.Thread(target=self._drain, daemon=True).start()
 
     def _drain(self) -> None:
-        self._service.drain(DRAIN_S)
+        self._service.drain(DRAIN_TIMEOUT_S)
         self.should_exit = True
 
 
 def bind(host: str, port: int, *, token: str | None) -> socket.socket:
-    """Return a socket that is bound to an address and listens once it is served; 0 is a free port.
+    """Bind a socket to an address; port 0 chooses a free one. `serve` then listens on it.
 
-    Raises `InputError` if the port is in use, or for another address than the loopback's without a
-    token.
+    Raises `InputError` if the port is in use, and for a public address without a token.
     """
     if not is_loopback(host) and not token:
         raise InputError(
-            f"{host} can be reached from other machines: the server needs a token to listen on it. "
+            f"{host} is reachable from other machines: the server needs a token to listen on it. "
             "Set EGOSIM_TOKEN, or listen on 127.0.0.1. (--host)"
         )
     bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
@@ -284,16 +277,16 @@ def bind(host: str, port: int, *, token: str | None) -> socket.socket:
     except OSError as error:
         bound.close()
         raise InputError(
-            f"{host}:{port} cannot be listened on ({error.strerror}): address and port must be "
-            "of this machine and free. Choose another port, 0 for any free one. (--port)"
+            f"Cannot listen on {host}:{port} ({error.strerror}): the address must belong to this "
+            "machine, and the port must be free. Choose another port, 0 for any free one. (--port)"
         ) from error
     return bound
 
 
 def serve(service: Service, bound: socket.socket, *, token: str | None, ready: Any = None) -> bool:
-    """Serve until SIGTERM or Ctrl-C; `ready` is called with the port that is listened on.
+    """Serve until SIGTERM or Ctrl-C; call `ready` with the port once it listens.
 
-    Returns False if a second signal has ended it before the requests under way were done.
+    Returns False if a second signal ended it before the running requests finished.
     """
     config = uvicorn.Config(
         make_app(service, token=token),

@@ -1,4 +1,4 @@
-"""Requests of clients by websocket or HTTP: a map in, a map out; before it maps of frames."""
+"""Service of a store: a request map in, a reply map out, preceded by streamed frames."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import sys
 import threading
 import time
-import traceback
 from collections.abc import AsyncGenerator, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -19,52 +18,39 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.interactive.env import World, backend_of
+from egosim_jax.interactive.env import World, load_backend
 from egosim_jax.interactive.env.action_spec import LAYOUTS
-from egosim_jax.interactive.env.chunks import view_of
-from egosim_jax.interactive.env.specs import vars_of
-from egosim_jax.interactive.server.errors import RequestError, as_request_error
-from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.env.chunks import OBSERVATIONS, STATE_FIELDS, view_of
+from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.requests import (
+    REQUESTS,
+    is_streamed,
+    observations_of,
+    parse_request,
+)
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.interactive.server.store import Limits, Store
-from egosim_jax.io.bounded import quote
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
-OBSERVATIONS = ("frames", "depth", "keypoints", "state")
-FIELDS = {
-    "create": ("session", "seed", "prompt", "episode", "actions", "observe"),
-    "step": ("session", "step_id", "actions", "prompt", "observe", "stream"),
-    "reset": ("session", "seed", "prompt", "episode", "observe"),
-    "save": ("session", "name"),
-    "load": ("session", "name", "observe"),
-    "close": ("session", "keep"),
-    "status": ("session",),
-}
-"""Fields of each request."""
 
 
 class Service:
-    """Requests of clients to the sessions of a store."""
+    """Replies to the requests of clients, from the sessions of a store."""
 
     def __init__(self, store: Store, *, world: str):
-        self.store, self._world = store, world
+        self.store, self.metrics, self._world = store, store.metrics, world
         self._active = 0
         self._quiet = threading.Condition()
 
     @property
-    def metrics(self) -> Metrics:
-        """Metrics of the store."""
-        return self.store.metrics
-
-    @property
     def draining(self) -> bool:
-        """True if the server is ending and takes nothing new."""
+        """True if the server is shutting down and accepts no new requests."""
         return self.store.draining
 
     async def describe(self) -> dict[str, Any]:
-        """Return the description that a client gets when it connects."""
+        """Return the description that a client receives when it connects."""
         video, limits = self.store.backend.video, self.store.limits
         return {
             "server": "egosim_jax",
@@ -78,13 +64,13 @@ class Service:
             "rows": video.frames - 1,
             "layouts": list(LAYOUTS),
             "observations": list(OBSERVATIONS),
-            "requests": {name: list(fields) for name, fields in FIELDS.items()},
+            "requests": {name: list(fields) for name, fields in REQUESTS.items()},
             "limits": asdict(limits),
         }
 
     @contextmanager
     def active(self) -> Iterator[None]:
-        """Keep a shutdown waiting, until a reply is sent."""
+        """Hold back a shutdown until the reply is sent."""
         with self._quiet:
             self._active += 1
         try:
@@ -94,32 +80,28 @@ class Service:
                 self._active -= 1
                 self._quiet.notify_all()
 
-    def refused(self, error: Exception) -> RequestError:
-        """Count the error of a request and return it for the client; log a defect of the server."""
-        return refusal(error, self.metrics)
-
     def drain(self, timeout_s: float) -> bool:
-        """Refuse new work; return True when no request is under way any more."""
+        """Refuse new requests; return True once no request is running, False after the timeout."""
         self.store.draining = True
         with self._quiet:
             return self._quiet.wait_for(lambda: not self._active, timeout_s)
 
     async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply to a request. Raises what `refused` returns for the client."""
-        name, request = _parsed(message)
+        """Return the reply to a request. `Metrics.refuse` converts any error."""
+        name, request = parse_request(message)
         if is_streamed(message):
             raise InputError(
-                "stream is true, and this request has one reply: frames are streamed over the "
-                "websocket only. Connect there, or leave stream out. (stream)"
+                "stream is true, but this request has one reply: frames are streamed over the "
+                "websocket only. Connect there, or omit stream. (stream)"
             )
-        observe = _observe(request.get("observe", ["frames"]))
+        observe = observations_of(request)
         store = self.store
         if name == "status":
             return self.status(request)
         if name == "create":
             session = await self._wait(store.submit(lambda: store.create(request)))
             low, high = session.actions.bounds
-            spec = {**vars_of(session.actions), "names": list(session.actions.names)}
+            spec = {**session.actions.to_json(), "names": list(session.actions.names)}
             reply = await self._reply(session, session.result, observe)
             return {**reply, "actions": {**spec, "low": low, "high": high}}
         session = store.get(request.get("session"))
@@ -131,25 +113,25 @@ class Service:
         run = {"step": store.step, "reset": store.reset, "load": store.load}[name]
         result = await self._wait(run(request))
         if name == "step":
-            store.metrics.steps.inc()
+            self.metrics.steps.inc()
         return await self._reply(session, result, observe)
 
     async def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
-        """Yield the reply to a request, after the frames of a step that is streamed.
+        """Yield the reply to a request, after the frames of a streamed step.
 
-        A step that was made before, or is under way already, has the reply alone.
+        A step that is already committed or running yields only the reply.
         """
         if not is_streamed(message):
             yield await self.handle(message)
             return
         then, times = time.monotonic(), []
-        request = _parsed(message)[1]
-        observe = _observe(request.get("observe", ["frames"]))
+        request = parse_request(message)[1]
+        observe = observations_of(request)
         groups: asyncio.Queue[UInt8[np.ndarray, "g h w 3"] | None] = asyncio.Queue()
         loop = asyncio.get_running_loop()
 
         def show(frames: UInt8[np.ndarray, "g h w 3"]) -> None:
-            with suppress(RuntimeError):  # the loop has ended: the step is finished without it
+            with suppress(RuntimeError):  # the loop has ended, and the step finishes without it
                 loop.call_soon_threadsafe(groups.put_nowait, frames)
 
         session, future = self.store.get(request.get("session")), self.store.step(request, show)
@@ -164,7 +146,7 @@ class Service:
                 first += len(frames)
             result = await made
         finally:
-            made.cancel()  # of a client that has vanished; the step continues
+            made.cancel()  # the client disconnected; this ends the wait, not the step
         self.metrics.steps.inc()
         reply = await self._reply(session, result, observe)
         if times:
@@ -173,7 +155,7 @@ class Service:
         yield reply
 
     def status(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return where a session is, or without one the sessions of the server."""
+        """Return the status of a session, or of the server if none is named."""
         if request.get("session") is None:
             steps = {name: s.committed for name, s in sorted(self.store.sessions.items())}
             return {
@@ -187,12 +169,12 @@ class Service:
             "committed_step_id": session.committed,
             "busy": session.busy.locked(),
             "saved": session.saved,
-            "actions": vars_of(session.actions),
+            "actions": session.actions.to_json(),
             **session.result.info,
         }
 
     async def _wait(self, future: Future[T]) -> T:
-        """Return a result that may take a while; the request continues if the client vanishes."""
+        """Wait for a result; the work continues if the client disconnects or the wait times out."""
         timeout = self.store.limits.step_timeout_s
         waiting = asyncio.shield(asyncio.wrap_future(future))
         try:
@@ -201,8 +183,8 @@ class Service:
             raise RequestError(
                 504,
                 "timeout",
-                f"The request has taken more than {timeout:g} s, the longest that a client waits: "
-                "it continues. Ask for the status, or send the same step_id again.",
+                f"The request has taken more than {timeout:g} s, the maximum wait: it continues. "
+                "Request the status, or send the same step_id again.",
                 retry_after_s=1.0,
             ) from None
 
@@ -220,35 +202,13 @@ class Service:
         if "keypoints" in observe:
             found["keypoints"] = session.actions.joints(result.row[None])[0]
         if "state" in observe:
-            names = ("points_m", "colors", "object_ids")
-            found["state"] = {name: getattr(result.state, name) for name in names}
+            found["state"] = {name: getattr(result.state, name) for name in STATE_FIELDS}
         if "depth" in observe:
             simulator = session.backend.simulator(session.now)
             render = partial(view_of, simulator, result.state, result.camera)
             view = await self._wait(self.store.submit(render, bounded=False))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
-
-
-def is_streamed(message: Any) -> bool:
-    """Return True if a request is a step whose frames are asked for as they are decoded.
-
-    Raises `InputError` if it does not say so by true or false.
-    """
-    if not isinstance(message, dict) or message.get("request") != "step":
-        return False
-    if not isinstance(stream := message.get("stream", False), bool):
-        raise InputError(f"stream is {quote(stream)}: it must be true or false. (stream)")
-    return stream
-
-
-def refusal(error: Exception, metrics: Metrics) -> RequestError:
-    """Count an error and return it for the client; log a defect of the server."""
-    found = as_request_error(error)
-    if found is not error and found.code == "internal":
-        traceback.print_exception(error)
-    metrics.refused.labels(found.code).inc()
-    return found
 
 
 def open_service(
@@ -262,40 +222,11 @@ def open_service(
     steps: int | None,
     batch: int,
 ) -> Service:
-    """Load and compile a world, resume the sessions of a folder, and return their service."""
+    """Load and compile a world, resume the sessions of a folder, and return the service."""
     share_with_jax()
-    backend = backend_of(
+    backend = load_backend(
         world, config=config, weights=weights, perception=perception, steps=steps, batch=batch
     )
-    store = Store(folder, backend, limits, Metrics())
-    print(f"{len(store.sessions)} sessions are resumed", file=sys.stderr)
+    store = Store(folder, backend, limits)
+    print(f"resumed {len(store.sessions)} sessions", file=sys.stderr)
     return Service(store, world=world)
-
-
-def _parsed(message: Any) -> tuple[str, Mapping[str, Any]]:
-    """Return name and fields of a request. Raises `InputError` for an unknown one."""
-    if not isinstance(message, dict):
-        raise InputError(
-            f"The message is {quote(message)}: it must be a map with the field request."
-        )
-    name = message.get("request")
-    if not isinstance(name, str) or name not in FIELDS:
-        raise InputError(
-            f"The request is {quote(name)}: it must be one of {', '.join(FIELDS)}. (request)"
-        )
-    allowed = ("request", *FIELDS[name])
-    if unknown := [key for key in message if key not in allowed]:
-        raise InputError(
-            f"The request {name} has no field {quote(unknown[0])}: its fields are "
-            f"{', '.join(FIELDS[name])}."
-        )
-    return name, {key: value for key, value in message.items() if key != "request"}
-
-
-def _observe(names: Any) -> tuple[str, ...]:
-    given = names if isinstance(names, list | tuple) else [names]
-    if unknown := [n for n in given if not (isinstance(n, str) and n in OBSERVATIONS)]:
-        raise InputError(
-            f"observe has {quote(unknown[0])}: it must be a list of {', '.join(OBSERVATIONS)}."
-        )
-    return tuple(given)

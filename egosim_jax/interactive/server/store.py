@@ -1,4 +1,4 @@
-"""All sessions of a server: creation, a bounded queue of steps in threads, and resumption."""
+"""Store of all sessions of a server: creation, a bounded queue with worker threads, resumption."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from typing import Any, TypeVar
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.env.specs import spec_of
-from egosim_jax.interactive.env.start import Start, check_size
 from egosim_jax.interactive.server.errors import RequestError, as_request_error
-from egosim_jax.interactive.server.fields import check_name, mapping, prompt_of, whole
 from egosim_jax.interactive.server.prometheus import Metrics
+from egosim_jax.interactive.server.requests import (
+    check_integer,
+    check_mapping,
+    check_name,
+    prompt_of,
+)
 from egosim_jax.interactive.server.session import (
     CLOSED,
     DAMAGE,
@@ -36,15 +39,16 @@ from egosim_jax.interactive.server.session import (
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import InputError, check_counts
 
 T = TypeVar("T")
 UNFINISHED = re.compile(r"starts|\.session\..*")
-"""Names that a crash during the creation of a session leaves in its folder."""
+"""File names that a crash can leave while a session is created."""
 MAX_SEED = 2**63 - 1_000_000
-"""Largest seed of a session, so that those of its steps are valid, too."""
+"""Maximum seed of a session: the seed of a step is larger by up to the number of steps."""
 REMOVED = ".removed-{}"
-"""Name of the folder of a session while it is removed."""
+"""Name of a session's folder while it is deleted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,22 +56,22 @@ class Limits:
     """Limits of a server."""
 
     sessions: int = 64
-    """Most open sessions."""
+    """Maximum number of open sessions."""
     queue: int = 32
-    """Most steps that wait or run."""
+    """Maximum number of waiting and running requests."""
     threads: int = 8
-    """Most steps that run at the same time."""
+    """Maximum number of concurrent steps."""
     steps: int = 10_000
-    """Most steps of a session."""
+    """Maximum number of steps of a session."""
     saved: int = 100
-    """Most starts that a session saves."""
+    """Maximum number of saved starts of a session."""
     connections: int = 256
-    """Most connections of clients."""
+    """Maximum number of client connections."""
     step_timeout_s: float = 120.0
-    """Longest time that a request waits for its step, which continues without it."""
+    """Maximum time that a request waits for its step; the step then continues without it."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` unless all are positive."""
+        """Raise `InputError` unless all limits are positive."""
         check_counts({"queue": self.queue, "threads": self.threads, "sessions": self.sessions})
         check_counts({"steps of a session": self.steps, "saved starts": self.saved})
         check_counts({"connections": self.connections})
@@ -76,10 +80,11 @@ class Limits:
 
 
 class Store:
-    """Sessions in a folder, which is locked while the store is open."""
+    """Sessions in a folder; the folder is locked while the store is open."""
 
-    def __init__(self, folder: Path, backend: Backend, limits: Limits, metrics: Metrics):
-        self.folder, self.backend, self.limits, self.metrics = folder, backend, limits, metrics
+    def __init__(self, folder: Path, backend: Backend, limits: Limits):
+        self.folder, self.backend, self.limits = folder, backend, limits
+        self.metrics = Metrics()
         self.sessions: dict[str, Session] = {}
         self.damaged: dict[str, str] = {}
         self.draining = False
@@ -92,7 +97,7 @@ class Store:
         self._resume()
 
     def _resume(self) -> None:
-        """Open all sessions of the folder, and finish the steps that were under way."""
+        """Open all sessions of the folder, and finish interrupted steps."""
         for path in self.folder.glob(REMOVED.format("*")):
             shutil.rmtree(path, ignore_errors=True)
         for path in sorted(self.folder.glob(f"*/{SETTINGS}")):
@@ -100,27 +105,27 @@ class Store:
                 check_world(path.parent, self.backend)
                 session = Session(path.parent, self.backend)
                 number = session.committed + 1
-                key = (number, session.request(number)) if session.pending else None
+                key = (number, session.hash_of(number)) if session.pending else None
             except DAMAGE as error:
                 self.damaged[path.parent.name] = str(self._for_client(error))
-                print(f"session {path.parent.name} is not resumed: {error}", file=sys.stderr)
+                print(f"cannot resume session {path.parent.name}: {error}", file=sys.stderr)
                 continue
             self.sessions[session.id] = session
             if key is not None:
-                session.flight = key, self.submit(session.finish, changes=session, bounded=False)
+                session.in_flight = key, self.submit(session.finish, changes=session, bounded=False)
         self.metrics.sessions.set(len(self.sessions))
 
     def close(self, *, at_once: bool = False) -> None:
-        """Refuse new requests, wait for the steps that run or wait, then unlock the folder.
+        """Refuse new requests, finish waiting and running ones, then unlock the folder.
 
-        With `at_once` waiting ones are given up; those on disk are made when the store is opened.
+        With `at_once`, waiting requests are canceled. Accepted steps are made by the next store.
         """
         self.draining = True
         self._threads.shutdown(wait=True, cancel_futures=at_once)
         self._lock.__exit__(None, None, None)
 
     def get(self, session_id: object) -> Session:
-        """Return a session. Raises `RequestError` if there is none of that id."""
+        """Return a session. Raises `RequestError` for an unknown or damaged one."""
         session = self.sessions.get(session_id) if isinstance(session_id, str) else None
         if session is not None:
             return session
@@ -133,9 +138,9 @@ class Store:
         raise _unknown(session_id)
 
     def create(self, request: Mapping[str, Any]) -> Session:
-        """Create a session of a seed or episode, with the id that is asked for or a new one."""
+        """Create a session from a seed or episode, with the requested id or a new one."""
         self._check_open()
-        actions = spec_of(mapping(request.get("actions", {}), "actions"))
+        actions = ActionSpec.from_json(check_mapping(request.get("actions", {}), "actions"))
         name = check_name(request.get("session", secrets.token_hex(8)), "session")
         folder = self._reserve(name)
         try:
@@ -150,14 +155,14 @@ class Store:
         return session
 
     def _reserve(self, name: str) -> Path:
-        """Return the folder of a new session, which nobody else can create meanwhile."""
+        """Reserve the id of a new session, and return its folder."""
         with self._changing:
             count = len(self.sessions.keys() | self._reserved)
             if count >= self.limits.sessions:
                 raise RequestError(
                     429,
                     "too_many_sessions",
-                    f"{count} sessions are open, the most of this server is "
+                    f"{count} sessions are open, the maximum of this server is "
                     f"{self.limits.sessions}. Close one, or try again later.",
                     retry_after_s=5.0,
                 )
@@ -169,7 +174,7 @@ class Store:
                 raise RequestError(
                     409,
                     "session_exists",
-                    f"There is a session {quote(name)} already: choose another id, or none for a "
+                    f"There is already a session {quote(name)}: choose another id, or none for a "
                     "new one.",
                 )
             self._reserved.add(name)
@@ -181,12 +186,12 @@ class Store:
         actions: ActionSpec,
         default: Callable[[], Start] | None = None,
     ) -> Start:
-        """Return the start that a request chooses: `seed`, or the bytes of an `episode`.
+        """Return the start of a request's `seed` or `episode` bytes.
 
-        Without either it is the default, by default that of seed 0.
+        Without either, return the default, or the start of seed 0.
         """
         prompt = prompt_of(request)
-        seed = 0 if (chosen := request.get("seed")) is None else whole(chosen, "seed")
+        seed = 0 if (chosen := request.get("seed")) is None else check_integer(chosen, "seed")
         if not 0 <= seed <= MAX_SEED:
             raise InputError(f"seed is {quote(seed)}: it must be from 0 to {MAX_SEED}.")
         if (data := request.get("episode")) is not None:
@@ -201,9 +206,9 @@ class Store:
         return start if prompt is None else replace(start, prompt=prompt)
 
     def step(self, request: Mapping[str, Any], show: Show | None = None) -> Future[Result]:
-        """Queue a step of a session, whose frames are shown unless it is a repeated one."""
+        """Queue a step of a session; `show` gets the frames of a new step only."""
         session = self.get(request.get("session"))
-        step_id, prompt = whole(request.get("step_id"), "step_id"), prompt_of(request)
+        step_id, prompt = check_integer(request.get("step_id"), "step_id"), prompt_of(request)
         if step_id < 1:
             raise InputError(
                 f"step_id is {step_id}: it must be one more than the last committed step. Send "
@@ -213,33 +218,34 @@ class Store:
             raise RequestError(
                 429,
                 "too_many_steps",
-                f"Step {step_id} is more than a session's {self.limits.steps}: create a new one.",
+                f"Step {step_id} is more than a session's maximum of {self.limits.steps} steps: "
+                "create a new session.",
             )
         if "actions" not in request:
             raise InputError("The step has no actions: give rows of numbers.")
         rows = request["actions"]
-        flight = session.flight
+        flight = session.in_flight
         key = step_id, request_hash(rows, prompt)
         if flight is not None and flight[0] == key and not flight[1].done():
-            return flight[1]  # a client that vanished and came back waits for its step
+            return flight[1]  # a client that reconnected waits for its running step
         run = partial(session.step, step_id, rows, prompt, show)
-        if step_id <= session.committed:
+        if step_id <= session.committed:  # a repeated step only reads, so it may run concurrently
             return self.submit(run)
         future = self.submit(run, changes=session)
-        session.flight = key, future
+        session.in_flight = key, future
         return future
 
     def reset(self, request: Mapping[str, Any]) -> Future[Result]:
-        """Queue a reset of a session to a seed or episode, or to its own first start."""
+        """Queue a reset of a session to a seed or episode, by default to its first start."""
         session = self.get(request.get("session"))
 
         def run() -> Result:
-            return session.restart(self._start(request, session.actions, session.first))
+            return session.restart(self._start(request, session.actions, session.first_start))
 
         return self.submit(run, changes=session)
 
     def save(self, request: Mapping[str, Any]) -> Future[str]:
-        """Queue the saving of a session under a name."""
+        """Queue saving a session under a name."""
         session, name = self.get(request.get("session")), request.get("name")
         check_name(name, "name")
 
@@ -249,8 +255,8 @@ class Store:
                 raise RequestError(
                     429,
                     "too_many_saved",
-                    f"The session has saved {len(saved)} starts, the most is {self.limits.saved}. "
-                    "Save under one of their names.",
+                    f"The session has saved {len(saved)} starts, the maximum is "
+                    f"{self.limits.saved}. Save under one of their names.",
                 )
             session.save(str(name))
             return str(name)
@@ -258,23 +264,22 @@ class Store:
         return self.submit(run, changes=session)
 
     def load(self, request: Mapping[str, Any]) -> Future[Result]:
-        """Queue the return of a session to what it has saved."""
+        """Queue restoring a saved start."""
         session, name = self.get(request.get("session")), request.get("name")
         return self.submit(lambda: session.load(check_name(name, "name")), changes=session)
 
     def remove(self, request: Mapping[str, Any]) -> Future[str]:
-        """Queue the end of a session, and the removal of its folder unless `keep` is true."""
+        """Queue closing a session; its folder is deleted unless `keep` is true."""
         session, keep = self.get(request.get("session")), request.get("keep", False)
         if not isinstance(keep, bool):
             raise InputError(f"keep is {quote(keep)}: it must be true or false.")
-
         removed = self.folder / REMOVED.format(session.id)
 
         def run() -> str:
             with self._changing:
                 if keep:
                     (session.folder / SETTINGS).rename(session.folder / CLOSED)
-                else:
+                else:  # renamed first: a crash while files are deleted leaves no half session
                     shutil.rmtree(removed, ignore_errors=True)
                     session.folder.rename(removed)
                 self.sessions.pop(session.id, None)
@@ -291,10 +296,10 @@ class Store:
         changes: Session | None = None,
         bounded: bool = True,
     ) -> Future[T]:
-        """Run a request in a thread.
+        """Run a request in a worker thread.
 
-        A `bounded` one is refused if the queue is full or the server ends, one that `changes` a
-        session if another such one is under way.
+        A `bounded` request is refused if the queue is full or the server is shutting down. A
+        request that `changes` a session is refused while another one changes it.
         """
         if bounded:
             self._check_open()
@@ -303,7 +308,7 @@ class Store:
                 raise RequestError(
                     429,
                     "queue_full",
-                    f"{self._queued} requests wait or run, the most of this server is "
+                    f"{self._queued} requests wait or run, the maximum of this server is "
                     f"{self.limits.queue}. Send it again later.",
                     retry_after_s=1.0,
                 )
@@ -311,12 +316,12 @@ class Store:
                 raise RequestError(
                     409,
                     "session_busy",
-                    f"Session {changes.id} has a request under way: one at a time can change it. "
-                    "Wait for its reply, then send this one again.",
+                    f"Session {changes.id} has a running request: one at a time can change it. "
+                    "Wait for its reply, then send this request again.",
                     retry_after_s=0.5,
                 )
             if changes is not None and self.sessions.get(changes.id) is not changes:
-                changes.busy.release()  # it was closed after it was found
+                changes.busy.release()  # closed between lookup and lock
                 raise _unknown(changes.id)
             self._queued += 1
             self.metrics.queued.set(self._queued)
@@ -333,7 +338,7 @@ class Store:
             raise found from error
         finally:
             if changes is not None:
-                changes.flight = None
+                changes.in_flight = None
                 changes.busy.release()
             with self._changing:
                 self._queued -= 1
@@ -341,7 +346,7 @@ class Store:
             self.metrics.seconds.observe(time.monotonic() - then)
 
     def _for_client(self, error: Exception) -> Exception:
-        """Return an error that does not show a client where the server's files are."""
+        """Return the error without the path of the server's folder."""
         folder = f"{quote_path(self.folder)}/"
         if isinstance(error, InputError) and folder in str(error):
             return InputError(str(error).replace(folder, ""))
@@ -352,8 +357,8 @@ class Store:
             raise RequestError(
                 503,
                 "draining",
-                "The server is shutting down: it finishes what runs and takes nothing new. Connect "
-                "again when it is back; all sessions are kept.",
+                "The server is shutting down: it finishes running requests and accepts no new "
+                "ones. Connect again after its restart; all sessions are kept.",
                 retry_after_s=10.0,
             )
 
@@ -362,8 +367,8 @@ def _unknown(session_id: object) -> RequestError:
     return RequestError(
         404,
         "unknown_session",
-        f"There is no session {quote(session_id)}: session must be an id that create has returned "
-        "and that is not closed. Create one.",
+        f"There is no session {quote(session_id)}: session must be the id of an open session, as "
+        "returned by create. Create one.",
     )
 
 

@@ -1,8 +1,8 @@
-"""Messages in MessagePack with NumPy arrays, as OpenPI's clients and servers exchange them; JSON.
+"""Messages as MessagePack with NumPy arrays, compatible with OpenPI, and as JSON.
 
-An array is a map of `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one of
-`__npgeneric__`, `data` and `dtype`; their keys are bytes. Nothing is unpickled: dtypes are numbers
-only, and an array's size must be that of its data.
+An array is a map of `__ndarray__`, `data`, `dtype` and `shape`. A NumPy scalar is a map of
+`__npgeneric__`, `data` and `dtype`. Their keys are bytes. Nothing is unpickled: only numeric dtypes
+are read, and the shape must match the number of bytes.
 """
 
 from __future__ import annotations
@@ -18,60 +18,61 @@ from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
 MAX_BYTES = 16 << 20
-"""Largest message from a client in bytes."""
+"""Maximum size of a client's message in bytes."""
 DTYPES = re.compile(r"[<>=]?(?:i[1248]|u[1248]|f[248])|[|]?(?:b1|i1|u1)")
-"""Names of dtypes; NumPy would evaluate others, such as those with commas, as Python."""
-LISTED = 512
-"""Most numbers of an array that JSON has as a list."""
+"""Accepted dtypes. NumPy evaluates other names, such as lists with commas, as Python."""
+MAX_LISTED = 512
+"""Maximum number of values of an array that JSON stores as a list."""
 MAX_DEPTH = 16
-"""Deepest nesting of a message."""
+"""Maximum nesting depth of a message."""
 MAX_ITEMS = 200_000
-"""Most items of all lists and maps of a message from a client."""
+"""Maximum number of items in all lists and maps of a client's message."""
 
 
 def pack(value: Any) -> bytes:
-    """Return the bytes of a message."""
+    """Return a message as MessagePack."""
     import msgpack
 
     return bytes(msgpack.Packer(default=_packed).pack(value))
 
 
 def unpack(data: bytes, *, limit: int | None = None) -> Any:
-    """Return the message of some bytes. Raises `InputError` for what is not one.
+    """Return the message of MessagePack bytes. Raises `InputError` if they are invalid.
 
-    Messages from outside are given a `limit` in bytes.
+    For untrusted messages, `limit` is the maximum size in bytes; it also bounds items and depth.
     """
     import msgpack
 
     if limit is not None and len(data) > limit:
         raise InputError(f"The message has {len(data):,} bytes: it may have at most {limit:,}.")
-    items, longest = 0, -1 if limit is None else MAX_ITEMS
+    items, max_length = 0, -1 if limit is None else MAX_ITEMS
 
     def counted(value: Any) -> Any:
         nonlocal items
         items += 1 + len(value)
         if limit is not None and items > MAX_ITEMS:
             raise InputError(
-                f"The message has more than {MAX_ITEMS:,} items in its lists and maps, the most "
-                "that is read. Send NumPy arrays instead of lists."
+                f"The message has more than {MAX_ITEMS:,} items in its lists and maps, the "
+                "maximum. Send NumPy arrays instead of lists."
             )
         return value
 
+    # the hooks count while msgpack parses: a small message could otherwise fill the memory
     try:
         value = msgpack.unpackb(
             data,
             object_hook=lambda value: _unpacked(counted(value)),
             list_hook=counted,
             strict_map_key=True,
-            max_array_len=longest,
-            max_map_len=longest,
+            max_array_len=max_length,
+            max_map_len=max_length,
         )
     except InputError:
         raise
     except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError) as error:
         raise InputError(
-            "The message is not MessagePack with arrays of numbers, as openpi_client.msgpack_numpy "
-            f"packs it: {quote_text(str(error) or type(error).__name__)}."
+            "The message is not MessagePack with numeric arrays, in the format of "
+            f"openpi_client.msgpack_numpy: {quote_text(str(error) or type(error).__name__)}."
         ) from error
     if limit is not None:
         _check_depth(value)
@@ -118,12 +119,12 @@ def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
             f"An array has data {quote(data)} and shape {quote(shape)}: data must be bytes, the "
             "shape a list of at most 8 whole numbers."
         )
-    count = 1
+    count = 1  # a Python integer: np.prod would overflow
     for size in shape:
         count *= size
     if count * kind.itemsize != len(data):
         raise InputError(
-            f"An array of {kind} has {len(data):,} bytes, its shape asks for "
+            f"An array of {kind} has {len(data):,} bytes, its shape needs "
             f"{quote(count * kind.itemsize)}: they must agree."
         )
     return np.frombuffer(data, kind).reshape(shape)
@@ -150,8 +151,8 @@ def _check_depth(value: Any) -> None:
 
 
 def unpack_json(data: bytes) -> dict[str, Any]:
-    """Return the object of a JSON body, bounded as MessagePack is. Raises `InputError`."""
-    # each item follows a comma or opens a list or object: texts can only add to this bound
+    """Return the object of a JSON body, with the bounds of `unpack`. Raises `InputError`."""
+    # each item follows a comma or an opening bracket, so this bounds the items from above
     items = sum(data.count(mark) for mark in (b",", b"[", b"{"))
     if items > MAX_ITEMS:
         raise InputError(
@@ -171,16 +172,16 @@ def unpack_json(data: bytes) -> dict[str, Any]:
 
 
 def pack_json(value: Any) -> bytes:
-    """Return the bytes of a reply in JSON."""
+    """Return a reply as JSON bytes."""
     return json.dumps(to_json(value), allow_nan=False).encode()
 
 
 def to_json(value: Any) -> Any:
-    """Return a value for JSON: short arrays as lists, others as dtype, shape and Base64 data.
+    """Convert a value for JSON: short arrays to lists, long ones to dtype, shape and Base64.
 
-    NaN and infinity are null.
+    NaN and infinity become null.
     """
-    if isinstance(value, np.ndarray) and value.size <= LISTED:
+    if isinstance(value, np.ndarray) and value.size <= MAX_LISTED:
         return to_json(value.tolist())
     if isinstance(value, np.ndarray):
         data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")

@@ -147,7 +147,7 @@ class _Child:
             self._process, self._owner = None, os.getpid()
         if self._process is None or self._process.poll() is not None:
             self.stop()
-            package = str(CHILD.parents[2])
+            package = str(CHILD.parents[3])
             paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
             self._process = subprocess.Popen(  # noqa: S603
                 [sys.executable, "-P", str(CHILD)],

@@ -1,9 +1,10 @@
-"""Clips of several threads in one program."""
+"""Batches of clips that several threads request."""
 
 import functools
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from tests.painted import painted
 
 
 class Counting:
-    """Generator that notes its batches; a clip of seed 13 fails."""
+    """Generator that records its batches; a clip of seed 13 fails."""
 
     renderer = reference
 
@@ -62,7 +63,7 @@ def ask(batcher, seed):
 
 def run(batcher, seeds):
     with ThreadPoolExecutor(len(seeds)) as threads:
-        return [future for future in [threads.submit(ask, batcher, seed) for seed in seeds]]
+        return [threads.submit(ask, batcher, seed) for seed in seeds]
 
 
 @pytest.fixture
@@ -71,15 +72,20 @@ def generator():
     return Counting()
 
 
-def test_callers_that_announced_themselves_share_a_program(generator):
-    batcher = Batcher(generator, most=4, wait_s=5.0)
+@pytest.fixture
+def make_batcher(generator):
+    with ExitStack() as stack:
+        yield lambda **options: stack.enter_context(closing(Batcher(generator, **options)))
+
+
+def test_callers_that_announced_themselves_share_a_program(generator, make_batcher):
+    batcher = make_batcher(max_batch=4, wait_s=5.0)
     assert [f.result() for f in run(batcher, [1, 2, 3, 4])] == [1, 2, 3, 4]
     assert [sorted(batch) for batch in generator.batches] == [[1, 2, 3, 4]]
-    batcher.close()
 
 
-def test_the_largest_program_that_is_filled_runs(generator):
-    batcher = Batcher(generator, most=8, wait_s=0.0)
+def test_the_largest_program_that_is_filled_runs(generator, make_batcher):
+    batcher = make_batcher(max_batch=8, wait_s=0.0)
     generator.held.clear()
     first = threading.Thread(target=ask, args=(batcher, 0))
     first.start()
@@ -91,30 +97,27 @@ def test_the_largest_program_that_is_filled_runs(generator):
         generator.held.set()
     first.join()
     assert [len(batch) for batch in generator.batches] == [1, 4, 2, 1]
-    batcher.close()
 
 
-def test_a_batch_is_padded_to_the_devices_only(generator):
-    batcher = Batcher(generator, most=4, unit=2, wait_s=0.0)
+def test_a_batch_is_padded_to_the_devices_only(generator, make_batcher):
+    batcher = make_batcher(max_batch=4, unit=2, wait_s=0.0)
     assert batcher.sizes == [2, 4]
     assert ask(batcher, 5) == 5
     assert generator.batches == [[5, 5]]
     with pytest.raises(InputError, match="a multiple of 2"):
-        Batcher(generator, most=3, unit=2)
-    batcher.close()
+        make_batcher(max_batch=3, unit=2)
 
 
-def test_one_failing_clip_does_not_fail_the_others(generator):
-    batcher = Batcher(generator, most=2, wait_s=5.0)
+def test_one_failing_clip_does_not_fail_the_others(generator, make_batcher):
+    batcher = make_batcher(max_batch=2, wait_s=5.0)
     found = run(batcher, [1, 13])
     assert found[0].result() == 1
     with pytest.raises(FloatingPointError, match="clip 13"):
         found[1].result()
-    batcher.close()
 
 
-def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator):
-    batcher = Batcher(generator, most=2, wait_s=5.0)
+def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator, make_batcher):
+    batcher = make_batcher(max_batch=2, wait_s=5.0)
 
     def stream(seed):
         with batcher.announced():
@@ -127,11 +130,10 @@ def test_no_group_comes_twice_when_another_clip_of_the_batch_fails(generator):
         with pytest.raises(FloatingPointError, match="clip 14"):
             bad.result(timeout=10)
     assert [len(batch) for batch in generator.batches] == [2, 1, 1]
-    batcher.close()
 
 
-def test_a_caller_that_fails_before_is_not_waited_for(generator):
-    batcher = Batcher(generator, most=2, wait_s=60.0)
+def test_a_caller_that_fails_before_is_not_waited_for(generator, make_batcher):
+    batcher = make_batcher(max_batch=2, wait_s=60.0)
 
     def fail():
         with batcher.announced():
@@ -142,4 +144,3 @@ def test_a_caller_that_fails_before_is_not_waited_for(generator):
         assert good.result(timeout=10) == 1
         with pytest.raises(InputError):
             bad.result()
-    batcher.close()

@@ -1,4 +1,4 @@
-"""The script of docs/serving.md, in the true world at a small size."""
+"""Script of docs/serving.md, in the true world with small frames."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,7 @@ def test_the_documented_script_separates_good_policies_from_bad_ones(monkeypatch
     script = re.findall(r"```python\n(.*?)```", text, re.S)[0]
     assert len(script.splitlines()) == 25
     monkeypatch.setattr(
-        egosim_jax.interactive.env, "backend_of", lambda world, **options: TrueWorld(video=VIDEO)
+        egosim_jax.interactive.env, "load_backend", lambda world, **options: TrueWorld(video=VIDEO)
     )
     for shown, small in (
         ('("generated", "true")', '("true",)'),

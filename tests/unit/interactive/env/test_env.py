@@ -1,4 +1,4 @@
-"""Gymnasium environments of a painted world: no model, no compilation."""
+"""Gymnasium environments of a painted world: without a model."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from egosim_jax.interactive import env as egosim
 from egosim_jax.interactive.env import rewards
 from egosim_jax.interactive.env.action_spec import LAYOUTS, ActionSpec
 from egosim_jax.interactive.env.rewards import GoalImage, MoveObject
-from egosim_jax.interactive.env.start import Start
 from egosim_jax.interactive.env.vector import WorldVectorEnv
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, painted
 

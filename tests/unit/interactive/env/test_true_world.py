@@ -7,10 +7,10 @@ import pytest
 
 from egosim_jax.interactive.env import ActionSpec, Start, true_world
 from egosim_jax.interactive.env.chunks import make_chunk
-from egosim_jax.interactive.env.placed import PlacedAction, with_places
 from egosim_jax.interactive.env.rewards import MoveObject
 from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
+from egosim_jax.simulation.actions import PlacedAction, with_places
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_scripts
 from egosim_jax.worlds.tabletop.policies import POLICIES
@@ -23,7 +23,7 @@ WIDE = replace(JOINTS, workspace_m=((-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)))
 
 
 def carry():
-    """Seed, script, rows and task of a scene in which a body is carried."""
+    """Seed, rows and task of a scene with a carry script."""
     for seed in range(20):
         script = next(make_scripts(seed, spec=VIDEO))
         if script.intent.verb == "carry":
@@ -68,7 +68,7 @@ def test_a_start_of_the_past_continues_to_the_same_state():
 
 
 def follow(start, *paths):
-    """The start after some chunks, and the last chunk; nothing is filmed."""
+    """Start after some chunks, and the last chunk, without rendering."""
     for rows in paths:
         chunk = make_chunk(WIDE, rows, start=start, frames=VIDEO.frames, hide=True)
         start = start.after(start.state, chunk.rows[-1], chunk.action)
@@ -76,7 +76,7 @@ def follow(start, *paths):
 
 
 def taken():
-    """A start, rows that take a body, and rows that carry it out of view."""
+    """Start, rows that grasp a body, rows that carry it out of view, and task."""
     seed, rows, task = carry()
     start = replace(TrueWorld(video=VIDEO).start(seed, WIDE), row=rows[0])
     behind = (rows[9].reshape(-1, 3) + [0, -0.9, 0.2]).ravel()
@@ -117,7 +117,7 @@ def test_a_start_without_places_of_hands_is_read(tmp_path):
     away.save(tmp_path / "start")
     past = tmp_path / "start" / "past"
     assert sorted(p.name for p in past.iterdir()) == ["1.npz", "2.npz", "2_hands.npz"]
-    (past / "2_hands.npz").unlink()  # as earlier versions wrote it
+    (past / "2_hands.npz").unlink()  # as for actions without hidden hands
     found = Start.load(tmp_path / "start").past
     assert not any(isinstance(action, PlacedAction) for action in found)
     assert np.isnan(found[1].joints_m).all()
@@ -131,7 +131,7 @@ def test_places_that_do_not_agree_with_the_joints_are_refused():
 
 
 def test_the_worlds_that_were_used_last_are_kept(monkeypatch):
-    monkeypatch.setattr(true_world, "REMEMBERED", 2)
+    monkeypatch.setattr(true_world, "MAX_CACHED_WORLDS", 2)
     world = TrueWorld(video=VIDEO)
     starts = [world.start(seed, JOINTS) for seed in (1, 2, 3)]
     kept = world.after(starts[0], "human")
@@ -146,5 +146,5 @@ def test_a_state_of_elsewhere_is_refused():
     env = WorldEnv(world, actions=JOINTS)
     start = world.start(3, JOINTS)
     env.reset(options={"start": replace(start, state=replace(start.state, provenance={}))})
-    with pytest.raises(InputError, match="true world has the scenes of its seeds"):
+    with pytest.raises(InputError, match="true world has only the scenes of its seeds"):
         env.chunk_step(JOINTS.rest[None])

@@ -7,7 +7,14 @@ import pytest
 
 from egosim_jax.geometry import rotation_z
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.play.moves import Pose, drive, intent_of, perform, reach, remembered
+from egosim_jax.interactive.play.moves import (
+    Pose,
+    drive,
+    intent_of,
+    perform,
+    pre_grasp_pose,
+    scene_from_state,
+)
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import World, start_of_sequence
 from egosim_jax.worlds.tabletop.hand_motion import Grip
@@ -35,7 +42,7 @@ def test_a_grip_is_the_pose_that_it_was_made_of():
 
 
 def test_a_driven_hand_closes_when_it_is_there(scene):
-    before = reach(scene, "red box", "right")
+    before = pre_grasp_pose(scene, "red box", "right")
     target = Pose(
         point_m=before.point_m + [0.1, 0, 0.05],
         rotation=rotation_z(0.5) @ before.rotation,
@@ -68,7 +75,7 @@ def test_the_state_remembers_where_an_object_was_put(scene):
     motion = np.eye(4)
     motion[:2, 3] = 0.1, -0.05
     number = scene.instance_id("red box")
-    moved = remembered(scene, replace(state, world_from_object={number: motion}))
+    moved = scene_from_state(scene, replace(state, world_from_object={number: motion}))
     gap = moved.body("red box").world_from_body - scene.body("red box").world_from_body
     np.testing.assert_allclose(gap[:3, 3], [0.1, -0.05, 0])
 
@@ -79,6 +86,6 @@ def test_the_state_remembers_how_far_a_drawer_is_open():
     opened = scene.with_opening(name, 0.75)
     motion = opened.first_part_pose(name) @ np.linalg.inv(scene.first_part_pose(name))
     state = replace(state, world_from_object={scene.instance_id(name): motion})
-    assert remembered(scene, state).openings[name] == pytest.approx(0.75)
-    verb = intent_of("open or close", remembered(scene, state), name).verb
+    assert scene_from_state(scene, state).openings[name] == pytest.approx(0.75)
+    verb = intent_of("open or close", scene_from_state(scene, state), name).verb
     assert verb == "close"

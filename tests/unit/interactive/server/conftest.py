@@ -1,4 +1,4 @@
-"""A server of the tests of a module."""
+"""Server shared by the tests of a module."""
 
 import pytest
 

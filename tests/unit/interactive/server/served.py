@@ -1,11 +1,10 @@
-"""A server over its sockets, in this process."""
+"""Server in this process, reached over its sockets."""
 
 import json
 import threading
 import urllib.error
 import urllib.request
 
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.server import bind, serve
 from egosim_jax.interactive.server.service import Service
 from egosim_jax.interactive.server.store import Limits, Store
@@ -16,7 +15,7 @@ TOKEN = "secret"  # noqa: S105
 
 def run(folder, token=None, limits=None, world=None):
     """A service, its port, and the thread that serves it."""
-    store = Store(folder, world or painted(), limits or Limits(), Metrics())
+    store = Store(folder, world or painted(), limits or Limits())
     service = Service(store, world="painted")
     ports, ready = [], threading.Event()
 

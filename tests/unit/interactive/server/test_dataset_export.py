@@ -13,7 +13,6 @@ from PIL import Image
 from egosim_jax.cli.export import Export
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.interactive.server import dataset_export
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.io.untrusted.parquet import read_columns
 from egosim_jax.runtime.command import ExitCode
@@ -34,9 +33,9 @@ np.savez(sys.argv[2], frames=frames.astype(np.uint8).transpose(0, 2, 3, 1),
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Sessions: one of two steps and, after a reset, one more, closed and kept; an empty one."""
+    """Two sessions: one closed and kept with two steps, a reset and one step; one empty."""
     folder = tmp_path_factory.mktemp("recorded") / "sessions"
-    store = Store(folder, painted(), Limits(), Metrics())
+    store = Store(folder, painted(), Limits())
     session = store.create({"seed": 3, "session": "one"})
     store.create({"seed": 3, "session": "empty"})
     rows = session.actions.rest + 0.02 * np.eye(7)[1][None]
@@ -55,9 +54,9 @@ def expected(folder):
     frames, actions = [], []
     for _, steps in session.runs():
         for number in steps:
-            frames += list(session.repeat(number).frames[:-1])
+            frames += list(session.load_result(number).frames[:-1])
             actions += list(session.rows(number)[1:])
-        frames.append(session.repeat(steps[-1]).frames[-1])
+        frames.append(session.load_result(steps[-1]).frames[-1])
         actions.append(actions[-1])
     return np.stack(frames), np.stack(actions).astype(np.float32)
 
@@ -101,7 +100,7 @@ def test_shards_have_a_clip_for_each_step(folder, tmp_path):
     dataset_export.to_shards(sessions, tmp_path / "shards", grid=WAN_GRID)
     records = list(ShardReader(tmp_path / "shards"))
     assert [record.metadata["video_id"] for record in records] == ["one_1", "one_2", "one_3"]
-    np.testing.assert_array_equal(records[1].arrays["target"], sessions[0].repeat(2).frames)
+    np.testing.assert_array_equal(records[1].arrays["target"], sessions[0].load_result(2).frames)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Requests that are refused before they are read, and connections."""
+"""Requests refused before they are read, and bounds on connections."""
 
 import asyncio
 import http.client as http_client
@@ -55,20 +55,24 @@ def test_a_body_too_large_or_no_json_is_refused(server):
         assert json.loads(http(port, path, fields)[1])["code"] == code
 
 
-def test_a_body_that_grows_too_large_is_refused(server):
+def post(service, receive):
+    """Status and code of the reply to a request whose body `receive` returns."""
     sent = []
-
-    async def receive():
-        return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
 
     async def send(message):
         sent.append(message)
 
     headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
     scope = {"type": "http", "method": "POST", "path": "/sessions", "headers": headers}
-    asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
-    assert sent[0]["status"] == 413
-    assert json.loads(sent[1]["body"])["code"] == "too_large"
+    asyncio.run(make_app(service)({**scope, "query_string": b""}, receive, send))
+    return sent[0]["status"], json.loads(sent[1]["body"])["code"]
+
+
+def test_a_body_that_grows_too_large_is_refused(server):
+    async def receive():
+        return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
+
+    assert post(server[0], receive) == (413, "too_large")
 
 
 def test_a_body_of_too_many_items_or_of_another_kind_is_refused(server):
@@ -89,19 +93,12 @@ def test_a_body_of_too_many_items_or_of_another_kind_is_refused(server):
 
 
 def test_a_body_that_comes_too_slowly_is_refused(server, monkeypatch):
-    monkeypatch.setattr(guard, "BODY_S", 0.01)
-    sent = []
+    monkeypatch.setattr(guard, "BODY_TIMEOUT_S", 0.01)
 
     async def receive():
         await asyncio.sleep(60)
 
-    async def send(message):
-        sent.append(message)
-
-    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
-    scope = {"type": "http", "method": "POST", "path": "/sessions", "headers": headers}
-    asyncio.run(make_app(server[0])({**scope, "query_string": b""}, receive, send))
-    assert (sent[0]["status"], json.loads(sent[1]["body"])["code"]) == (408, "too_slow")
+    assert post(server[0], receive) == (408, "too_slow")
 
 
 def test_an_idle_connection_is_closed_and_one_above_the_limit_refused(tmp_path, monkeypatch):
@@ -132,7 +129,7 @@ def test_a_token_is_asked_for(tmp_path):
 
 
 class OldConnection(HTTPConnection):
-    """Connection whose URL begins with the Host header, as in older versions of Starlette."""
+    """Connection whose URL begins with the Host header, as in older Starlette versions."""
 
     url = URL("http://a/healthz?/sessions")
 

@@ -1,4 +1,4 @@
-"""Parts of the sessions behind one entrance, without Ray: handles call the parts here."""
+"""Parts behind one entrance, without Ray: its handles call the parts directly."""
 
 import asyncio
 from types import SimpleNamespace
@@ -8,7 +8,6 @@ import pytest
 
 from egosim_jax.interactive.server import replicas
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.service import Service
 from egosim_jax.interactive.server.store import Store
 from egosim_jax.types import InputError
@@ -48,7 +47,7 @@ class Handle:
 @pytest.fixture
 def entrance(tmp_path, monkeypatch):
     def open_painted(folder, limits, **_):
-        return Service(Store(folder, painted(), limits, Metrics()), world="painted")
+        return Service(Store(folder, painted(), limits), world="painted")
 
     monkeypatch.setattr(replicas, "open_service", open_painted)
     settings = replicas.Replicas(out=tmp_path, parts=PARTS)

@@ -1,4 +1,4 @@
-"""The server over its sockets, in this process."""
+"""Server in this process, reached over its sockets."""
 
 import json
 import threading
@@ -11,7 +11,6 @@ import websockets.sync.client
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.client import Client
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.server import _Server, bind
 from egosim_jax.interactive.server.service import Service
 from egosim_jax.interactive.server.store import Limits, Store
@@ -55,7 +54,7 @@ def test_a_client_that_vanishes_loses_nothing(server):
 
 
 class Gated(Painter):
-    """Painter whose last frames wait until they are asked for."""
+    """Painter whose last frames wait for `opened`."""
 
     def __init__(self):
         super().__init__()
@@ -178,7 +177,7 @@ def test_http_does_not_stream(server):
     status, body = http(port, f"/sessions/{session['session']}/step", fields)
     error = json.loads(body)
     assert (status, error["code"]) == (422, "invalid")
-    assert "Connect there, or leave stream out. (stream)" in error["message"]
+    assert "Connect there, or omit stream. (stream)" in error["message"]
     fields["stream"] = False
     assert http(port, f"/sessions/{session['session']}/step", fields)[0] == 200
 
@@ -287,7 +286,7 @@ def test_a_defect_is_logged_and_counted(server, monkeypatch, capsys):
 def test_sigterm_drains_then_ends(tmp_path):
     import uvicorn
 
-    service = Service(Store(tmp_path, painted(), Limits(), Metrics()), world="painted")
+    service = Service(Store(tmp_path, painted(), Limits()), world="painted")
     server = _Server(uvicorn.Config(lambda: None), service)
     server.handle_exit(15, None)
     for _ in range(100):

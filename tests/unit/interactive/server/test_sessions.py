@@ -1,4 +1,4 @@
-"""Sessions of a painted world: journaled, resumed, never disturbed by each other."""
+"""Sessions of a painted world: journal, resumption, limits, isolation."""
 
 import shutil
 from dataclasses import replace
@@ -10,7 +10,6 @@ from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.interactive.server import session as session_module
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.simulation.episode import Episode
@@ -20,7 +19,7 @@ from tests.painted import VIDEO, painted
 
 @pytest.fixture
 def store(tmp_path):
-    opened = Store(tmp_path / "sessions", painted(), Limits(), Metrics())
+    opened = Store(tmp_path / "sessions", painted(), Limits())
     yield opened
     opened.close()
 
@@ -109,7 +108,7 @@ def test_a_pending_step_without_its_request_is_not_resumed(store):
     last = made.folder / "steps" / "2"
     for name in ("info.json", "request.json"):
         (last / name).unlink()
-    again = Store(store.folder, painted(), Limits(), Metrics())
+    again = Store(store.folder, painted(), Limits())
     assert step(again, again.sessions["one"], 2, rows(made, 5)).step_id == 2
     again.close()
 
@@ -122,7 +121,7 @@ def test_a_damaged_request_does_not_keep_the_store_from_opening(store, text):
     last = store.folder / "bad" / "steps" / "1"
     (last / "info.json").unlink()
     (last / "request.json").write_text(text)
-    again = Store(store.folder, painted(), Limits(), Metrics())
+    again = Store(store.folder, painted(), Limits())
     assert (set(again.sessions), set(again.damaged)) == ({"good"}, {"bad"})
     again.close()
 
@@ -133,7 +132,7 @@ def test_more_pending_steps_than_the_queue_are_resumed(store):
         step(store, made, 1)
         (made.folder / "steps" / "1" / "info.json").unlink()
     store.close()
-    again = Store(store.folder, painted(), Limits(queue=1, threads=1), Metrics())
+    again = Store(store.folder, painted(), Limits(queue=1, threads=1))
     again.close()
     assert [session.committed for session in again.sessions.values()] == [1, 1, 1]
 
@@ -170,7 +169,7 @@ def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
     last = copy / "one" / "steps" / "3"
     (last / "info.json").unlink()
     shutil.rmtree(last / "rollout")
-    again = Store(copy, painted(), Limits(), Metrics())
+    again = Store(copy, painted(), Limits())
     found = again.sessions["one"]
     result = step(again, found, 3)
     assert hashes([result]) == hashes(wanted[2:])
@@ -202,7 +201,7 @@ def test_a_reset_returns_to_the_first_start_and_takes_a_prompt(store):
 def test_a_session_is_not_continued_in_another_world(store):
     step(store, store.create({"session": "one"}), 1)
     store.close()
-    again = Store(store.folder, painted("classical"), Limits(), Metrics())
+    again = Store(store.folder, painted("classical"), Limits())
     with pytest.raises(RequestError, match="perception of the session is 'None', of this server"):
         again.get("one")
     again.close()
@@ -277,11 +276,11 @@ def test_an_invalid_session_is_refused_and_not_made(store, request_, message):
 
 def test_limits_are_kept(tmp_path):
     limits = Limits(sessions=1, queue=1, steps=2)
-    store = Store(tmp_path, painted(), limits, Metrics())
+    store = Store(tmp_path, painted(), limits)
     session = store.create({})
     with pytest.raises(RequestError, match="Close one"):
         store.create({})
-    with pytest.raises(RequestError, match="more than a session's 2"):
+    with pytest.raises(RequestError, match="more than a session's maximum of 2 steps"):
         step(store, session, 3)
     session.busy.acquire()
     with pytest.raises(RequestError, match="one at a time"):
@@ -294,7 +293,7 @@ def test_limits_are_kept(tmp_path):
 
 
 def test_a_full_queue_and_a_busy_session_are_refused_and_nothing_is_lost(tmp_path):
-    store = Store(tmp_path, painted(pause=0.3), Limits(queue=2), Metrics())
+    store = Store(tmp_path, painted(pause=0.3), Limits(queue=2))
     one, two, three = (store.create({"session": name}) for name in ("one", "two", "three"))
     runs = [store.step({"session": s.id, "step_id": 1, "actions": rows(s)}) for s in (one, two)]
     for session, number, code in ((one, 2, "queue_full"), (three, 1, "queue_full")):
@@ -361,7 +360,7 @@ def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):
     store.close()
     (store.folder / "bad" / "starts" / "0" / "start.json").write_text("{")
     (store.folder / "bad" / "steps" / "1" / "info.json").unlink()
-    again = Store(store.folder, painted(), Limits(), Metrics())
+    again = Store(store.folder, painted(), Limits())
     assert set(again.sessions) == {"good"}
     with pytest.raises(
         RequestError, match=r"could not be resumed: bad/starts/0/start\.json"
@@ -382,7 +381,7 @@ def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store):
 
 
 def test_a_store_that_closes_at_once_gives_up_what_waits(tmp_path, monkeypatch):
-    store = Store(tmp_path, painted(pause=0.3), Limits(threads=1), Metrics())
+    store = Store(tmp_path, painted(pause=0.3), Limits(threads=1))
     one, two = (store.create({"session": name}) for name in ("one", "two"))
     runs = [store.step({"session": s.id, "step_id": 1, "actions": rows(s)}) for s in (one, two)]
     store.close(at_once=True)

@@ -1,7 +1,7 @@
-"""Episodes of LeRobot datasets, version 3.0, that have hands and cameras.
+"""Episodes from LeRobot v3.0 datasets with hands and cameras.
 
-Each frame's row has the vectors that `data/lerobot_writer.py` names: hand joints in the world,
-camera pose and intrinsics. Datasets with videos only are annotated first (docs/video.md).
+Each frame's row has the features that `data/lerobot_writer.py` names: hand joints in the world,
+camera pose and intrinsics. Annotate a dataset that has only videos first (docs/video.md).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from egosim_jax.annotate.to_episode import nearest_frames, resized_intrinsics
 from egosim_jax.data.lerobot_writer import HANDS, INTRINSICS, POSES, SCENE
 from egosim_jax.data.readers.lerobot import read_info, read_rows, read_tasks
 from egosim_jax.data.transforms import resize_image
-from egosim_jax.interactive.env.start import Start
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState, VideoSpec
 
 MAX_HANDS = 2
-"""Most hands of a dataset."""
+"""Maximum number of hands in a dataset."""
 
 
 def episode_from_lerobot(
@@ -36,10 +36,9 @@ def episode_from_lerobot(
 ) -> Episode:
     """Return an episode of a dataset, at the length, size and rate of a model's clips.
 
-    The first clip starts in the first frame, each other one in the last frame of the one before;
-    frames are the nearest in time. The scene is the `state`, or that which `egosim data export`
-    has written. Raises `InputError` for a dataset without hands, cameras or scene, and if the
-    episode is too short.
+    Each clip starts in the last frame of the clip before. Frames are the nearest in time. The
+    scene is `state`, by default the one that `egosim data export` wrote. Raises `InputError` for a
+    dataset without hands, cameras or scene, and for an episode that is too short.
     """
     info = read_info(root, ["v3.0"])
     if missing := [name for name in (HANDS, POSES, INTRINSICS) if name not in info["features"]]:
@@ -95,15 +94,15 @@ def _scene(folder: Path, state: SceneState | None) -> tuple[SceneState, np.ndarr
         return state, None
     if not folder.is_dir():
         raise InputError(
-            f"{quote_path(folder)} is not there: the dataset has no scene of this episode. Give a "
-            "folder of a state or a .ply of colored points. (--state)"
+            f"{quote_path(folder)} is missing: the dataset has no scene of this episode. Give the "
+            "folder of a state, or a .ply of colored points. (--state)"
         )
     start = Start.load(folder)
     return start.state, start.first_frame
 
 
 def _size(features: dict[str, Any], video: VideoSpec) -> tuple[int, int]:
-    """Return height and width of the dataset's pictures, to which its intrinsics belong."""
+    """Return the height and width of the dataset's images, which its intrinsics refer to."""
     shapes = [
         tuple(feature["shape"])
         for feature in features.values()
@@ -112,8 +111,8 @@ def _size(features: dict[str, Any], video: VideoSpec) -> tuple[int, int]:
     sizes = {shape[:2] if shape[-1] in (1, 3) else shape[-2:] for shape in shapes}
     if len(sizes) > 1:
         raise InputError(
-            f"The dataset has pictures of the sizes {sorted(sizes)}: {INTRINSICS} must belong to "
-            "one. Remove the other cameras."
+            f"The dataset has images of the sizes {sorted(sizes)}: {INTRINSICS} must belong to one "
+            "size. Remove the other cameras."
         )
     return next(iter(sizes), (video.height, video.width))
 
@@ -123,15 +122,15 @@ def _kind(joints: int) -> Kind:
 
 
 def _joints(rows: Sequence[Any]) -> Float[np.ndarray, "f n j 3"]:
-    """Return the joints of one or two hands, of the kind that the length of a row gives."""
+    """Return the joints of one or two hands; the row length determines their kind."""
     length = len(rows[0]) if isinstance(rows[0], list) else 0
     for count in JOINTS.values():
         hands = length // (3 * count)
         if length == 3 * count * hands and 1 <= hands <= MAX_HANDS:
             return _numbers(rows, (hands, count, 3), HANDS)
     raise InputError(
-        f"{HANDS} has {length} numbers: it must have 63 for each human hand, or 9 for each "
-        f"gripper, and at most {MAX_HANDS} of them."
+        f"{HANDS} has {length} numbers: it must have 63 per human hand or 9 per gripper, for at "
+        f"most {MAX_HANDS} of them."
     )
 
 

@@ -1,4 +1,4 @@
-"""An episode that a person plays: its clips, and the return to earlier moments."""
+"""Played episode: clips, and the return to earlier moments."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import tabletop_start
 from egosim_jax.interactive.play.moves import intent_of, perform
-from egosim_jax.interactive.play.played import Played
+from egosim_jax.interactive.play.played_episode import PlayedEpisode
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state import snapshot
@@ -31,13 +31,13 @@ class Showing(Painter):
 def played(tmp_path):
     world = PaintedWorld(generator=Showing(), video=VIDEO, perception=None)
     start = tabletop_start(0, ActionSpec(camera=True), VIDEO)
-    return Played(world, tmp_path, start, "right")
+    return PlayedEpisode(world, tmp_path, start, "right")
 
 
 def carry(played, show=lambda frames, last: None):
     """Carry the suggested object to the suggested place."""
     name, place = played.goal
-    scene = played.believed()
+    scene = played.current_scene()
     intent = intent_of("carry", scene, name, place)
     poses = perform(scene, intent, played.hand, "right", VIDEO.frames)
     return played.step(poses, STILL, f"The right hand {intent.caption}", show)

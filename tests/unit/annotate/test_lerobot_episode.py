@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
 from egosim_jax.data.lerobot_writer import HANDS, POSES
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.lerobot_episode import episode_from_lerobot
 from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.server import dataset_export
-from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
@@ -24,7 +23,7 @@ SIDES = ["left", "right"]
 def recorded(tmp_path_factory):
     """A dataset of a session with two hands and a camera that moves, and its two actions."""
     folder = tmp_path_factory.mktemp("dataset")
-    store = Store(folder / "sessions", painted(), Limits(), Metrics())
+    store = Store(folder / "sessions", painted(), Limits())
     session = store.create({"seed": 3, "actions": {"sides": SIDES, "camera": True}})
     for number, prompt in ((1, "Wave."), (2, "Clap.")):
         rows = session.actions.rest + 0.01 * np.arange(1, 5)[:, None] * number

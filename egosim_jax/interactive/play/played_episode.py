@@ -1,7 +1,7 @@
-"""Episode that a person plays: a session, the true world next to it, and all earlier moments.
+"""Played episode: a session, the true world next to it, and all earlier moments.
 
-The session (`interactive/server/session.py`) is the engine and the record: every clip is in its
-folder. The true world executes the same actions, if the scene is one of a seed.
+The session (`interactive/server/session.py`) generates and records every clip. If the scene comes
+from a seed, the true world executes the same actions.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from jaxtyping import Float, UInt8
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import GeneratedWorld
-from egosim_jax.interactive.env.chunks import view_of
-from egosim_jax.interactive.env.start import Start, check_size
-from egosim_jax.interactive.play.moves import Pose, first_goal, ready, remembered
+from egosim_jax.interactive.env.chunks import straight_path, view_of
+from egosim_jax.interactive.play.moves import Pose, ready_pose, scene_from_state, suggest_goal
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 from egosim_jax.worlds.tabletop import Scene, World, start_of_sequence
 from egosim_jax.worlds.tabletop.clips import render_scenes
@@ -39,49 +39,49 @@ Filmed = tuple[World, Frames]
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """State of an episode after one of its clips, to which one can return."""
+    """Point of an episode after one of its clips, from which play can continue."""
 
     start: Start
-    """Scene, camera and hand, from which the session continues."""
+    """Scene, camera and hand from which the session continues."""
     caption: str
-    """Event before it, in words."""
+    """Description of the last clip."""
     frames: Frames
-    """Generated clip that led here; the first moment has one frame."""
+    """Last generated clip; the first moment has one frame."""
     camera: Cameras
     """Camera of the last frame."""
     action: Action | None = None
-    """Action that led here; None at first."""
+    """Action of the last clip; None at the first moment."""
     truth: Future[Filmed] | None = None
-    """Ground truth of the clip, when it is filmed; None if the scene is of no seed."""
+    """Ground truth of the clip, once rendered; None if the scene does not come from a seed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Seconds from the request of a clip to three events."""
+    """Latencies of a clip, in seconds since its request."""
 
     first_s: float
-    """First frames shown."""
+    """Time until the first frames are shown."""
     last_s: float
-    """Last frames shown."""
+    """Time until the last frames are shown."""
     total_s: float
-    """Clip perceived, and state updated."""
+    """Time until the state is updated."""
 
 
-class Played:
+class PlayedEpisode:
     """Episode in progress; one thread at a time may change it."""
 
     def __init__(self, world: GeneratedWorld, folder: Path, start: Start, side: Side):
-        """Begin an episode, recorded in a new session of a folder."""
+        """Begin an episode, recorded as a new session in the folder."""
         check_size(start, world.video)
         self.world = world
         self.side: Side = side
         self.scene = _true_scene(start, world)
-        self.goal = None if self.scene is None else first_goal(self.scene, side)
-        """Object and place that are suggested for a first clip."""
+        self.goal = None if self.scene is None else suggest_goal(self.scene, side)
+        """Suggested object and place for a first clip."""
         name = f"play-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         actions = ActionSpec(sides=(side,), camera=True)
         if self.scene is not None and self.goal is not None and start.row is None:
-            row = ready(self.scene, self.goal[0], side).row(side, np.zeros(6))
+            row = ready_pose(self.scene, self.goal[0], side).row(side, np.zeros(6))
             start = replace(start, row=np.clip(row, *actions.bounds))
         self.session = Session.create(folder / name, world, actions, start)
         self._filming = ThreadPoolExecutor(1, thread_name_prefix="truth")
@@ -102,33 +102,33 @@ class Played:
         self.at = 0
 
     def close(self) -> None:
-        """End the thread that films the true world, once it has filmed what was asked of it."""
+        """End the thread that renders the true world, after the requested clips."""
         self._filming.shutdown(wait=False)
 
     @property
     def now(self) -> Moment:
-        """Moment from which the next clip continues."""
+        """Current moment, from which the next clip continues."""
         return self.moments[self.at]
 
     @property
     def row(self) -> Float[np.ndarray, " d"]:
-        """Row of hand and camera."""
+        """Current row of hand and camera."""
         row = self.now.start.row
         return self.session.actions.rest if row is None else row
 
     @property
     def hand(self) -> Pose:
-        """Pose of the hand."""
+        """Current pose of the hand."""
         return Pose.of_row(self.row, self.side)
 
     @property
     def state(self) -> SceneState:
-        """State of the present moment."""
+        """State of the current moment."""
         return self.now.start.state
 
-    def believed(self) -> Scene | None:
-        """Return the scene as the state remembers it; None if the true world does not know it."""
-        return None if self.scene is None else remembered(self.scene, self.state)
+    def current_scene(self) -> Scene | None:
+        """Return the tabletop scene with the object poses of the state, or None without a seed."""
+        return None if self.scene is None else scene_from_state(self.scene, self.state)
 
     def step(
         self,
@@ -137,11 +137,10 @@ class Played:
         caption: str,
         show: Callable[[Frames, bool], None],
     ) -> Timing:
-        """Make the clip in which the hand takes these poses and the camera ends there.
+        """Make a clip of these hand poses, in which the camera moves to the given row.
 
-        Later moments than the present one are forgotten. `show` is called with each group of frames
-        and whether it is the last one: the clip is perceived afterwards. Raises `InputError` for a
-        hand out of view.
+        Moments after the current one are dropped. `show` gets each group of frames, and True with
+        the last group, before perception starts. Raises `InputError` for a hand out of view.
         """
         then, times, count = time.monotonic(), [], 0
         number, before = self.session.committed + 1, self.now
@@ -152,7 +151,7 @@ class Played:
             nonlocal count, truth
             count += len(frames)
             last = count == self.world.video.frames
-            if last and before.truth is not None:
+            if last and before.truth is not None:  # renders while perception runs
                 action = self.session.action(number)
                 truth = self._filming.submit(partial(_film, before.truth, action))
             show(frames, last)
@@ -175,9 +174,7 @@ class Played:
     def _rows(
         self, poses: Sequence[Pose], camera: Float[np.ndarray, " 6"]
     ) -> Float[np.ndarray, "k d"]:
-        before = self.row[-6:]
-        shares = np.linspace(0, 1, len(poses) + 1)[1:, None]
-        cameras = before + shares * (camera - before)
+        cameras = straight_path(self.row[-6:], camera, len(poses) + 1)
         rows = [pose.row(self.side, own) for pose, own in zip(poses, cameras, strict=True)]
         return np.clip(rows, *self.session.actions.bounds)
 
@@ -191,7 +188,7 @@ class Played:
         self.at = number
 
     def episode(self) -> Episode:
-        """Return the actions that led to the present moment, as an episode to simulate."""
+        """Return the actions up to the current moment as an episode to simulate."""
         made = self.moments[: self.at + 1]
         first = made[0].start
         return Episode(
@@ -202,7 +199,7 @@ class Played:
         )
 
     def preview(self, hand: Pose, camera: Float[np.ndarray, " 6"]) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the state as the wearer would see it, with the hand's skeleton in it."""
+        """Return the wearer's view of the state, with the hand's skeleton drawn over it."""
         action = self._posed(hand, camera)
         simulator = self.world.simulator(self.now.start)
         view = view_of(simulator, self.state, action.cameras)
@@ -212,7 +209,7 @@ class Played:
         return np.where(np.isfinite(depth)[..., None], drawn, view.frames)[0]
 
     def camera(self, moved: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
-        """Return the pose `world_from_camera` of the wearer's camera, moved from the first one."""
+        """Return `world_from_camera` of the wearer's camera, moved from the first camera."""
         return self._posed(self.hand, moved).cameras.world_from_camera[0]
 
     def _posed(self, hand: Pose, camera: Float[np.ndarray, " 6"]) -> Action:
@@ -222,7 +219,7 @@ class Played:
 
 
 def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
-    """Return the true world's scene of a start; None if it is of no seed."""
+    """Return the tabletop scene of a start, or None if it does not come from a seed."""
     origin = start.state.provenance
     own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
     if not own or start.state.step:
@@ -231,7 +228,7 @@ def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
 
 
 def _film(before: Future[Filmed], action: Action) -> Filmed:
-    """Execute an action in the true world, and film it."""
+    """Execute an action in the true world, and render it."""
     scenes, world = before.result()[0].move(action)
     arms = arms_of(action.joints_m, action.kind)
     rendered = render_scenes(scenes, action.cameras, arms=arms)

@@ -1,14 +1,15 @@
-"""The start of a clip: scene, camera, hands and prompt, as a folder.
+"""Start of a clip: scene, camera, hands and prompt, stored as a folder.
 
-state/          scene (state/snapshot.py)
-start.json      camera, row, prompt, seed, clips since the seed, kinds of past actions
-first_frame.png first frame without hands, if it is known
-past/1.npz ...  actions that led here from the seed, which the true world repeats; one with a hand
-                out of view has that hand's joints in 1_hands.npz
+state/           scene (state/snapshot.py)
+start.json       camera, row, prompt, seed, clips since the seed, kind and prompt of past actions
+first_frame.png  first frame without hands, if known
+past/1.npz ...   actions since the seed, which the true world executes again
+past/1_hands.npz joints of all hands, if a hand of action 1 is out of view
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import no_type_check
@@ -17,11 +18,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from egosim_jax.interactive.env.placed import load_placed, save_placed
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.images import read_image
-from egosim_jax.io.run import write_json
+from egosim_jax.simulation.actions import load_placed, save_placed
 from egosim_jax.simulation.episode import MAX_CLIPS, Episode
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState, VideoSpec
@@ -34,24 +34,24 @@ FIELDS = {"world_from_camera": list, "intrinsics_px": list, "height": int, "widt
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Scene, camera and hands before an action."""
+    """Scene, camera and hands from which the next clip continues."""
 
     state: SceneState
-    """Scene before the first clip."""
+    """Scene before the next clip."""
     camera: Cameras
-    """First camera of the episode, to which the camera of an action is relative."""
+    """First camera of the episode; the cameras of actions are relative to it."""
     prompt: str
-    """Prompt of clips whose action has none."""
+    """Default prompt of a clip."""
     seed: int
     """Seed of the scene; clip N draws its noise from this seed plus N."""
     steps: int = 0
-    """Clips since the seed, which the noise of the next one depends on."""
+    """Number of clips since the seed."""
     row: Float[np.ndarray, " d"] | None = None
-    """Row of the hands and camera (`actions.py`); None at rest."""
+    """Row of hands and camera (`interactive/env/action_spec.py`); None at rest."""
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None
-    """First frame of the first clip, without hands; None if it is not known."""
+    """First frame of the next clip, without hands; None if unknown."""
     past: tuple[Action, ...] = ()
-    """Actions since the seed, which the true world executes first."""
+    """Actions since the seed; the true world executes them first."""
 
     @classmethod
     def of(cls, episode: Episode, *, seed: int = 0) -> Start:
@@ -60,7 +60,9 @@ class Start:
         cameras = first.cameras
         return cls(
             state=episode.state,
-            camera=_one(cameras.world_from_camera[:1], cameras),
+            camera=replace(
+                cameras, world_from_camera=np.asarray(cameras.world_from_camera[:1], float)
+            ),
             prompt=first.prompt,
             seed=seed,
             first_frame=episode.first_frame,
@@ -69,18 +71,18 @@ class Start:
     def after(
         self, state: SceneState, row: Float[np.ndarray, " d"], action: Action | None
     ) -> Start:
-        """Return the start of what follows a clip; the `action` is kept if it is given."""
+        """Return the start after a clip; `past` gets the action, unless it is None."""
         past = self.past if action is None else (*self.past, action)
         return replace(
             self, state=state, row=row, steps=self.steps + 1, first_frame=None, past=past
         )
 
     def save(self, folder: Path) -> None:
-        """Write the folder, complete or absent. Raises `InputError` for a past too long to read."""
-        if len(self.past) > MAX_CLIPS:
+        """Write the folder atomically. Raises `InputError` for more than `MAX_CLIPS` actions."""
+        if len(self.past) > MAX_CLIPS:  # `load` refuses it
             raise InputError(
-                f"The start has {len(self.past)} past actions: at most {MAX_CLIPS} are read again. "
-                "Save one after fewer steps, or reset before."
+                f"The start has {len(self.past)} past actions: at most {MAX_CLIPS} can be loaded. "
+                "Save after fewer steps, or reset first."
             )
         with atomic_folder(folder) as temporary:
             snapshot.save(temporary / "state", self.state)
@@ -88,24 +90,23 @@ class Start:
                 Image.fromarray(self.first_frame).save(temporary / FIRST_FRAME)
             for number, action in enumerate(self.past, start=1):
                 save_placed(temporary / "past", str(number), action)
-            write_json(
-                temporary / DESCRIPTION,
-                {
-                    "world_from_camera": self.camera.world_from_camera[0].tolist(),
-                    "intrinsics_px": np.asarray(self.camera.intrinsics_px, float).tolist(),
-                    "height": int(self.camera.height),
-                    "width": int(self.camera.width),
-                    "row": [] if self.row is None else self.row.tolist(),
-                    "prompt": self.prompt,
-                    "seed": int(self.seed),
-                    "steps": int(self.steps),
-                    "past": [[action.kind, action.prompt] for action in self.past],
-                },
-            )
+            description = {
+                "world_from_camera": self.camera.world_from_camera[0].tolist(),
+                "intrinsics_px": np.asarray(self.camera.intrinsics_px, float).tolist(),
+                "height": int(self.camera.height),
+                "width": int(self.camera.width),
+                "row": [] if self.row is None else self.row.tolist(),
+                "prompt": self.prompt,
+                "seed": int(self.seed),
+                "steps": int(self.steps),
+                "past": [[action.kind, action.prompt] for action in self.past],
+            }
+            text = json.dumps(description, indent=2) + "\n"
+            (temporary / DESCRIPTION).write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path) -> Start:
-        """Read the folder. Raises `InputError` for what is damaged."""
+        """Read the folder. Raises `InputError` if it is damaged."""
         written = read_json(folder / DESCRIPTION)
         for name, kind in FIELDS.items():
             value = written.get(name) if isinstance(written, dict) else None
@@ -116,7 +117,9 @@ class Start:
                 )
         size = written["height"], written["width"]
         if len(written["past"]) > MAX_CLIPS:
-            raise InputError(f"{quote_path(folder)}: more than {MAX_CLIPS} past actions.")
+            raise InputError(
+                f"{quote_path(folder)}: it has more than {MAX_CLIPS} past actions. Restore it."
+            )
         image = folder / FIRST_FRAME
         return cls(
             state=snapshot.load(folder / "state"),
@@ -138,20 +141,12 @@ class Start:
         )
 
 
-def _one(pose: np.ndarray, cameras: Cameras) -> Cameras:
-    return Cameras(
-        world_from_camera=np.asarray(pose, float),
-        intrinsics_px=cameras.intrinsics_px,
-        height=cameras.height,
-        width=cameras.width,
-    )
-
-
 def check_size(start: Start, video: VideoSpec) -> None:
-    """Raise `InputError` unless the pictures of a start are as large as the world's."""
-    have, want = (start.camera.height, start.camera.width), (video.height, video.width)
-    if have != want:
+    """Raise `InputError` unless a start's camera has the frame size of the world."""
+    camera = start.camera
+    if (camera.height, camera.width) != (video.height, video.width):
         raise InputError(
-            f"The episode has pictures of {have[1]}x{have[0]}, this world makes {want[1]}x"
-            f"{want[0]}: they must be equal. Make the episode for this world's model."
+            f"The episode has frames of {camera.width}x{camera.height}, this world generates "
+            f"{video.width}x{video.height}: they must be equal. Make the episode for this world's "
+            "model."
         )
