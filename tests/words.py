@@ -82,37 +82,6 @@ PROSE = {
 }
 """Regular expressions of words in prose alone."""
 
-RENAMED = {
-    "usual_norm": "grad_norm_ema",
-    "SETTLED": "guard_warmup",
-    "MAX_LEFT_OUT": "max_consecutive_skips",
-    "patience": "hang_timeout_s",
-    "gradient_norm": "grad_norm",
-    "minutes_left": "eta_min",
-    "gigabytes": "peak_mem_gb",
-    "changed_places": "change_loss_weight",
-    "MAY_DIFFER": "RESUME_MUTABLE",
-    "may_differ": "RESUME_MUTABLE",
-    "HOW_COMPUTED": "NUMERICS_ONLY",
-    "in_parts": "accumulate_gradients",
-    "own_address": "free_local_address",
-    "check_alone": "require_single_process",
-    "with_paths": "fill_unused_paths",
-    "guarded": "run_with_exit_codes",
-    "THROUGH_M": "FREE_SPACE_MARGIN_M",
-    "DOUBT": "VOTE_LIMIT",
-    "widened": "dilate",
-    "flesh": "hand_silhouette",
-    "CHEST_M": "SHOULDER_OFFSET_M",
-    "MIN_GAIN": "MIN_IMPROVEMENT",
-    "seen_from": "estimate_cameras",
-    "TELLTALES": "SIGNATURE_KEYS",
-    "TooLarge": "OutOfMemory",
-    "least_s": "roofline_s",
-    "ALONE": "OFFLINE_ENV",
-}
-"""Identifiers that were renamed, and their names today."""
-
 OPENINGS = re.compile(r"(?:What|How|Of|Those|That|Whether|Where|Which|Who|Why)\b")
 """Words with which the first line of a docstring does not make sense alone."""
 
@@ -204,9 +173,6 @@ def phrases(text: str, line: int) -> Iterator[tuple[int, str, str]]:
 
 def identifier(name: str, line: int) -> Iterator[tuple[int, str, str]]:
     """Yield what is wrong with an identifier, read as the words that it joins."""
-    if name in RENAMED:
-        yield line, name, RENAMED[name]
-        return
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|_+", " ", name)
     for rule, fix in _WORDS:
         if rule.search(words):

@@ -15,9 +15,8 @@ import optax
 from flax import nnx
 from optax.contrib import MuonDimensionNumbers, muon
 
-from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.metric_writers import EXTRAS, check_installed
-from egosim_jax.types import InputError, check_counts, check_seed
+from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 WeightsDtype = Literal["float32", "bfloat16", "float16"]
 """Dtypes of the weights that a training writes."""

@@ -58,8 +58,6 @@ logger = logging.getLogger(__name__)
 
 MAX_PARTS = 100_000
 """Maximum number of shards, whose names have five digits."""
-OLD_MASK = {"packing": "space", "channels": 4}
-"""Packing and channels of the mask in shards that do not name them."""
 
 
 class Encoding:
@@ -177,9 +175,8 @@ def encode_shards(
         "source": source.manifest.fingerprint,
         "encoders": hashes(folder, only=config.cached_networks),
         "decoding": decoding,
+        "mask": mask_of(config),
     }
-    if (mask := mask_of(config)) != OLD_MASK:
-        provenance["mask"] = mask
     if config.layout.mask_packing == "observed":
         check_static(source.manifest, source=str(source.folder))
     _open(
@@ -323,7 +320,7 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
         )
         if have != want
     ]
-    mask = manifest.provenance.get("mask", OLD_MASK)
+    mask = manifest.provenance.get("mask", "no record of it")
     if "mask" in config.layout and mask != mask_of(config):
         problems.append(f"mask: the shards have {mask}, this training has {mask_of(config)}")
     if config.posterior is not None and f"target{STD}" not in manifest.arrays:

@@ -19,7 +19,7 @@ class PartWindows:
     """The windows of one part, as listed in a file next to its folder."""
 
     windows: Sequence[Window]
-    """Windows of the part, in order; none if there is no list, as in earlier versions."""
+    """Windows of the part, in order; none if there is no list yet."""
     skipped: Sequence[Window]
     """Windows among them that could not be read."""
 
@@ -44,6 +44,5 @@ class PartWindows:
 
     def is_done(self, part: Path, todo: Sequence[Window]) -> bool:
         """Return whether a part is written, and has these windows."""
-        if self.windows and self.windows != list(todo):
-            return False
-        return self.is_empty or (part / MANIFEST).exists()
+        written = self.is_empty or (part / MANIFEST).exists()
+        return written and self.windows == list(todo)

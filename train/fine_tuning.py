@@ -59,8 +59,8 @@ class FineTuning(Recipe):
     """Difference from the target above which an element's error counts as 0; None: none."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
-    navigation: float | None = None
-    """Rate of samples without hands whose target is the prior (DWM's regularizer); None: none."""
+    navigation: float = 0.0
+    """Rate of samples without hands whose target is the prior (DWM's regularizer)."""
     remat: str | None = None
     """Rematerialization in the backward pass, if not the model's (`remat_levels`)."""
     attention: Kernel | None = None

@@ -346,17 +346,16 @@ class FromTabletop(FromScratch):
     """Seed of the first of these scenes; other scenes train given weights further."""
     held_out: int = 48
     """Scenes to validate on, one clip of each."""
-    black_cloths: int | None = None
-    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
-    attempts: float | None = None
-    """Share of the scenes in which a policy may fail and the head turns, not a script; None: none.
-    """
-    rollouts: int | None = None
-    """Further scenes to train on, with states of the given weights' own rollouts; None: none."""
+    black_cloths: int = 0
+    """Maximum number of black cloths on a table, which in a prior look like unobserved places."""
+    attempts: float = 0.0
+    """Share of the scenes in which a policy may fail and the head turns, not a script."""
+    rollouts: int = 0
+    """Further scenes to train on, with states of the given weights' own rollouts."""
     rollout_clips: int = 4
     """Clips of each of these scenes."""
-    twins: bool | None = None
-    """True: static twins and hands as meshes, as DWM is conditioned on, of human hands alone."""
+    twins: bool = False
+    """Static twins and hands as meshes, as DWM is conditioned on, of human hands alone."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` for scenes that are held out, and for rollouts that cannot be made.
@@ -368,14 +367,14 @@ class FromTabletop(FromScratch):
                 f"Scenes of seeds below {FIRST_TRAINED} are held out: --first-scene must be at "
                 f"least {FIRST_TRAINED}, not {self.first_scene}."
             )
-        if self.twins and self.rollouts is not None:
+        if self.twins and self.rollouts:
             raise InputError(
                 f"{self.rollouts} scenes of rollouts cannot have static twins, which show each "
                 "clip's own first frame: omit one of them. (--rollouts, --twins)"
             )
-        if self.rollouts is not None and (self.weights is None or self.rollouts < 1):
+        if self.rollouts < 0 or (self.rollouts and self.weights is None):
             raise InputError(
-                f"{self.rollouts} scenes of rollouts cannot be made: there must be at least 1, and "
+                f"{self.rollouts} scenes of rollouts cannot be made: there must be at least 0, and "
                 "weights of the model whose rollouts they are. (--rollouts, --weights)"
             )
 
@@ -386,7 +385,7 @@ class FromTabletop(FromScratch):
             "train": self._make("train", range(first, last), 2, out),
             "test": self._make("test", range(self.held_out), 1, out),
         }
-        if self.rollouts is not None:
+        if self.rollouts:
             seeds = range(last, last + self.rollouts)
             frames["rollouts"] = self._make("rollouts", seeds, self.rollout_clips, out)
         return frames
@@ -402,7 +401,7 @@ class FromTabletop(FromScratch):
             spec=model.video,
             kind="human" if self.twins else "mixed",
             black_cloths=self.black_cloths,
-            attempts=self.attempts if split == "train" else None,
+            attempts=self.attempts if split == "train" else 0.0,
             prior="static" if self.twins else "state",
             hands="mesh" if self.twins else "skeleton",
         )

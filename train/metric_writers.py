@@ -13,7 +13,6 @@ from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.bounded import read_lines
-from egosim_jax.io.renamed import upgrade_metrics
 from egosim_jax.io.run import write_text
 from egosim_jax.types import InputError
 
@@ -74,7 +73,7 @@ class JsonLines:
             if not isinstance(line, dict) or type(line.get("step")) is not int:
                 raise InputError(f"{path}, line {number} has no step. Restore or remove it.")
             if line["step"] <= resume_after and resume_after > 0:
-                kept.append(json.dumps(upgrade_metrics(line)))
+                kept.append(json.dumps(line))
         write_text(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

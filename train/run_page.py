@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.bounded import read_bytes, read_json, read_lines
-from egosim_jax.io.renamed import upgrade, upgrade_metrics
 from egosim_jax.io.run import CONFIG, ENVIRONMENT, write_text
 from egosim_jax.types import InputError
 
@@ -137,7 +136,7 @@ class Stage:
         for _, line in read_lines(self.folder / METRICS):
             if not isinstance(line, dict) or type(line.get("step")) is not int:
                 continue
-            for name, value in upgrade_metrics(line).items():
+            for name, value in line.items():
                 if name != "step" and isinstance(value, int | float):
                     found.setdefault(name, []).append((line["step"], float(value)))
         return {
@@ -160,9 +159,9 @@ class Stage:
         return {name: plots[name] for name in [*first, *(n for n in plots if n not in first)]}
 
     def json(self, name: str) -> dict[str, Any]:
-        """Return the values of a file under today's names; none if it is not there."""
+        """Return the values of a JSON file; none if it is not there."""
         path = self.folder / name
-        value = upgrade(read_json(path)) if path.exists() else {}
+        value = read_json(path) if path.exists() else {}
         return value if isinstance(value, dict) else {}
 
     def _samples(self) -> Iterator[str]:

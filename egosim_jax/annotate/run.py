@@ -42,7 +42,6 @@ T = TypeVar("T")
 CALIBRATED = ("incremental", "global")
 """Rungs that estimate a focal length."""
 REPORT, METADATA = "report.json", "metadata.csv"
-MAX_REPORT_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ def scan_sources(
     sources: Sequence[Source], out: Path, config: AnnotateConfig, *, workers: int
 ) -> Iterator[Scanned]:
     """Scan videos, in parallel; yield each when it is done."""
-    yield from _each(_scan_one, [(source, out, config) for source in sources], workers)
+    yield from _each(scan_source, [(source, out, config) for source in sources], workers)
 
 
 def annotate_jobs(
@@ -152,10 +151,6 @@ def _each(run: Callable[..., T], calls: Sequence[tuple[Any, ...]], workers: int)
             "command again with fewer --workers; finished stages are kept.",
             ExitCode.FAILED,
         ) from error
-
-
-def _scan_one(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
-    return scan_source(source, out, config)
 
 
 _built: dict[AnnotateConfig, Any] = {}

@@ -158,9 +158,10 @@ class Encode:
         from egosim_jax import configs
         from egosim_jax.data.shards import ShardReader
         from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.sharding import MeshConfig, make_mesh
+        from egosim_jax.sharding import make_mesh
         from egosim_jax.train.distributed import launched_context
         from egosim_jax.train.encode import encode_shards
+        from egosim_jax.types import MeshConfig
 
         share_with_jax()
         source = ShardReader(self.shards)
@@ -210,11 +211,10 @@ class Make:
     """Columns in pixels, a multiple of 16."""
     fps: int = 8
     """Frame rate of the clips in frames per second."""
-    black_cloths: int | None = None
-    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
-    attempts: float | None = None
-    """Share of the scenes in which a policy may fail and the head turns, not a script; None: none.
-    """
+    black_cloths: int = 0
+    """Maximum number of black cloths on a table, which in a prior look like unobserved places."""
+    attempts: float = 0.0
+    """Share of the scenes in which a policy may fail and the head turns, not a script."""
     fixed_camera: bool = False
     """Leave the camera where it is in the first frame."""
     prior: Literal["state", "static"] = "state"
@@ -245,7 +245,7 @@ class Make:
             attempts=self.attempts,
             prior=self.prior,
             hands=self.hands,
-            fixed_camera=self.fixed_camera or None,
+            fixed_camera=self.fixed_camera,
         )
         progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))
         for _ in track(progress, "making", total=self.scenes):

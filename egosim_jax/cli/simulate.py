@@ -110,7 +110,7 @@ class Simulate:
             "weights": hashes(weights),
             "episode": fingerprint(episode),
         }
-        Journal(folder, outputs=OUTPUTS)  # a folder of an earlier version has another config, too
+        Journal(folder, outputs=OUTPUTS)  # a damaged one is refused before the weights are loaded
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
         simulator = Simulator(

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from egosim_jax.data.records import DTYPES, current_name
-from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
+from egosim_jax.data.records import DTYPES
+from egosim_jax.io.bounded import check_version, quote, quote_path, quote_text, read_json
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec
+from egosim_jax.types import InputError, VideoGrid, VideoSpec
 
 RecordKind = Literal["videos", "frames", "latents"]
 
@@ -63,7 +63,7 @@ class Manifest:
     """Kind of the records."""
     spec: VideoSpec | None
     """Length and size of the decoded frames, or of the videos behind latents; None for videos."""
-    grid: VideoGrid = WAN_GRID
+    grid: VideoGrid
     """Latent grid of the videos."""
     arrays: Mapping[str, ArrayInfo]
     """Arrays of every record, by name."""
@@ -97,8 +97,7 @@ def read_manifest(folder: Path) -> Manifest:
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         reason = quote_text(f"{type(error).__name__}: {error}")
         raise InputError(f"{name} is not a manifest of shards: {reason}.") from error
-    sealed = fields.pop(SEAL, None)  # earlier versions have none
-    if sealed not in (None, _sealed(fields)):
+    if fields.pop(SEAL, None) != sealed(fields):
         raise InputError(
             f"{name} was modified after it was written: its {SEAL} does not match. Restore it."
         )
@@ -107,11 +106,11 @@ def read_manifest(folder: Path) -> Manifest:
 
 def _manifest(fields: Any, name: str) -> Manifest:
     """Build a manifest from JSON. Raises `InputError`, `TypeError` and others for wrong types."""
-    version, kind, spec = fields["version"], fields["kind"], fields["spec"]
-    if type(version) is not int or version != VERSION or kind not in get_args(RecordKind):
+    check_version(fields["version"], VERSION, source=name)
+    kind, spec = fields["kind"], fields["spec"]
+    if kind not in get_args(RecordKind):
         raise InputError(
-            f"{name} has version {quote(version)} and kind {quote(kind)}; supported are version "
-            f"{VERSION} and kinds {', '.join(get_args(RecordKind))}."
+            f"{name} has kind {quote(kind)}; supported are {', '.join(get_args(RecordKind))}."
         )
     shards = tuple(ShardInfo(**shard) for shard in fields["shards"])
     for shard in shards:
@@ -127,7 +126,7 @@ def _manifest(fields: Any, name: str) -> Manifest:
             f"one record each, not {', '.join(unsafe[:8]) or 'none, duplicate or empty ones'}."
         )
     arrays = {
-        current_name(key): ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
+        key: ArrayInfo(dtype=info["dtype"], shape=tuple(info["shape"]))
         for key, info in fields["arrays"].items()
     }
     axes = [axis for info in arrays.values() for axis in info.shape]
@@ -137,7 +136,7 @@ def _manifest(fields: Any, name: str) -> Manifest:
         raise TypeError("an array has an unsupported dtype")
     if spec is not None and not all(type(value) is int for value in spec.values()):
         raise TypeError("a field of the spec is not an integer")
-    grid = VideoGrid(**fields["grid"]) if "grid" in fields else WAN_GRID
+    grid = VideoGrid(**fields["grid"])
     if any(type(value) is not int or value < 1 for value in vars(grid).values()):
         raise TypeError("a stride of the grid is not a positive integer")
     video = None if spec is None else VideoSpec(**spec)
@@ -165,8 +164,9 @@ def file_problems(folder: Path, shard: ShardInfo) -> list[str]:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest of a folder, with the hash of its fields."""
     fields = plain(dataclasses.asdict(manifest))
-    write_json(folder / MANIFEST, {**fields, SEAL: _sealed(fields)})
+    write_json(folder / MANIFEST, {**fields, SEAL: sealed(fields)})
 
 
-def _sealed(fields: Mapping[str, Any]) -> str:
+def sealed(fields: Mapping[str, Any]) -> str:
+    """Return the hash of a manifest's other fields, which `SEAL` names."""
     return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()

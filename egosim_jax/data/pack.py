@@ -45,14 +45,12 @@ def pack(
     """
     failed = 0
     check_presence(items)
-    decoded = {} if spec is None else {"decoding": decoding}
-    if resampling != "first":
-        if spec is None:
-            raise InputError(
-                f"Source files are packed as they are: frames taken by the rule {resampling} need "
-                "a size. (--size, --resampling)"
-            )
-        decoded["resampling"] = resampling
+    if spec is None and resampling != "first":
+        raise InputError(
+            f"Source files are packed as they are: frames taken by the rule {resampling} need a "
+            "size. (--size, --resampling)"
+        )
+    decoded = {} if spec is None else {"decoding": decoding, "resampling": resampling}
     shards = ShardWriter(
         out,
         kind="frames" if spec else "videos",
@@ -161,7 +159,7 @@ def frame_rates(source: ShardReader, count: int) -> set[Fraction]:
             ).fps
             for number in range(count)
         }
-    if "decoding" in manifest.provenance and manifest.provenance.get("resampling") != "rate":
+    if manifest.provenance.get("resampling", "rate") != "rate":
         return set()
     return {Fraction(manifest.spec.fps)}
 

@@ -36,7 +36,7 @@ from egosim_jax.data.recorded_files import (
 )
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import check_version, quote, quote_path, read_json
 from egosim_jax.io.depth_images import read_depth_image
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
@@ -352,10 +352,7 @@ def _load(folder: Path) -> Recording:
     written = read_json(folder / DESCRIPTION, limit=MAX_BYTES)
     if not isinstance(written, dict) or written.get("format") != FORMAT:
         raise InputError(f"{DESCRIPTION} does not describe a recording ({FORMAT}).")
-    if type(written.get("version")) is not int or written["version"] != VERSION:
-        raise InputError(
-            f"it has version {quote(written.get('version'))}; this program reads {VERSION}."
-        )
+    check_version(written.get("version"), VERSION, source=DESCRIPTION)
     for name, kind in {"recording_id": str, "start": int, "frames": int, "fps": str, "height": int,
                        "width": int, "metric": bool, "kind": str, "names": list,
                        "provenance": dict}.items():  # fmt: skip

@@ -47,9 +47,7 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     """Parse the bytes of a record. Raises `RecordError` if they are invalid."""
     try:
         arrays = {
-            current_name(key): np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(
-                tensor["shape"]
-            )
+            key: np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(tensor["shape"])
             # safetensors returns them in any order.
             for key, tensor in sorted(safetensors.deserialize(data), key=lambda pair: pair[0])
         }
@@ -63,8 +61,3 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     except (safetensors.SafetensorError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise RecordError(f"{name} is not a valid record: {quote_text(str(error))}.") from error
     return Record(arrays=arrays, metadata=metadata)
-
-
-def current_name(key: str) -> str:
-    """Return the current name of an array, given its name in this or an earlier version."""
-    return "target" if key == "truth" else key

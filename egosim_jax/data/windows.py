@@ -59,15 +59,23 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]] | None:
         return None
     results = {}
     for number, line in read_lines(path):
-        output_id = line.get("video_id") if isinstance(line, dict) else None
-        start = line.get("start", 0) if isinstance(line, dict) else None
-        if not (isinstance(output_id, str) and is_safe_id(output_id)) or type(start) is not int:
+        if not _is_result(line):
             raise InputError(
-                f"{quote_path(path)}, line {number} is not a result: it needs a valid video_id and "
-                "an integer start."
+                f"{quote_path(path)}, line {number} is not a result: it needs a valid video_id, a "
+                "source_id, a status and an integer start."
             )
-        results[output_id] = line
+        results[line["video_id"]] = line
     return results
+
+
+def _is_result(line: Any) -> bool:
+    texts = ("video_id", "source_id", "status")
+    return (
+        isinstance(line, dict)
+        and all(isinstance(line.get(name), str) for name in texts)
+        and is_safe_id(line["video_id"])
+        and type(line.get("start")) is int
+    )
 
 
 def conditions_sha256(files: ClipFiles) -> str:

@@ -152,12 +152,13 @@ class Scoring:
                 raise InputError(f"There is no folder {folder.path}. (--generated)")
             results = read_results(folder.path)
             if results is None:
-                results = {name: {"source_id": name, "start": 0} for name in rows}
+                done = {"start": 0, "status": "done"}
+                results = {name: {"source_id": name, **done} for name in rows}
             for output_id, line in results.items():
-                files, start = rows.get(str(line.get("source_id"))), int(line.get("start", 0))
+                files, start = rows.get(line["source_id"]), line["start"]
                 if files is None:
                     continue
-                if line.get("status") == "failed":
+                if line["status"] == "failed":
                     self.skipped.append(f"{output_id}: its generation failed")
                     continue
                 window = windows.setdefault(output_id, Window(files, start, output_id))

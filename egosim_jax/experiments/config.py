@@ -40,8 +40,8 @@ class Tabletop(ModelExperiment):
     """Repetitions of each clip with different noise."""
     batch_size: int = 8
     """Number of clips that are generated together."""
-    black_cloths: int | None = None
-    """Most black cloths on a table, which in a prior look like unobserved places; None: none."""
+    black_cloths: int = 0
+    """Maximum number of black cloths on a table, which in a prior look like unobserved places."""
     worst: int | None = None
     """Scenes of each kind on a sheet of the worst ones, with what each lacks; None: no sheet."""
 

@@ -97,7 +97,7 @@ class Training:
             kind="human",
             prior="static",
             hands="mesh",
-            fixed_camera=split == "fixed" or None,
+            fixed_camera=split == "fixed",
         )
         workers = os.cpu_count() or 1
         scenes = make_shards(plan, out=out, workers=workers, grid=self.config.grid)

@@ -64,7 +64,7 @@ class HeldOutClip:
         spec: VideoSpec,
         kind: Kind,
         *,
-        black_cloths: int | None = None,
+        black_cloths: int = 0,
         fixed_camera: bool = False,
         prior: PriorName = "state",
         hands: HandsName = "skeleton",

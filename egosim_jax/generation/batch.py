@@ -35,8 +35,8 @@ from egosim_jax.io.digest import sha256_within
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
-from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, parts
-from egosim_jax.types import Clip, InputError, Triplet
+from egosim_jax.sharding import check_batch, make_mesh, parts
+from egosim_jax.types import Clip, InputError, MeshConfig, Triplet
 
 SHEET_CLIPS = 6
 """Maximum number of clips on the contact sheet."""
@@ -113,11 +113,9 @@ class BatchJob:
             "lora": None if self.lora is None else [sha256_within(self.lora), self.lora_scale],
             "seed": self.seed,
             "policy": self.policy,
+            "decoding": self.decoding,
+            "baseline": self.baseline,
         }
-        if self.decoding != "accurate":
-            settings["decoding"] = self.decoding
-        if self.baseline is not None:
-            settings["baseline"] = self.baseline
         open_folder(self.out, settings)
         for name, digest in (digests or {}).items():
             print(f"{self.model.name}: {name} sha256 {digest[:16]}", file=sys.stderr)
@@ -184,11 +182,12 @@ class BatchJob:
             own = {"source_id": window.files.video_id, "start": window.start,
                    "prompt": window.files.prompt,
                    "conditions_sha256": conditions_sha256(window.files)}  # fmt: skip
-            if differing := [name for name in own if line.get(name, own[name]) != own[name]]:
+            if differing := [name for name in own if line.get(name) != own[name]]:
                 raise InputError(
                     f"{self._video(window)} exists and cannot be skipped, because it has another "
-                    f"{differing[0]}: {quote(line[differing[0]])}, not {quote(own[differing[0]])}. "
-                    "Choose another folder, or remove the clip. (--out)"
+                    f"{differing[0]}: {quote(line.get(differing[0]))}, not "
+                    f"{quote(own[differing[0]])}. Choose another folder, or remove the clip. "
+                    "(--out)"
                 )
             finished.add(window.output_id)
         return finished

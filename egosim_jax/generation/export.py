@@ -50,15 +50,13 @@ Static = tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"]]
 """Video of a static scene, and its mask: 255 where the scene was not observed."""
 
 
-def static_of(
-    scene: Path, cameras: Cameras, *, renderer: Renderer = jitted, point_px: int = 2
-) -> Static:
+def static_of(scene: Path, cameras: Cameras) -> Static:
     """Return the video of a static scene: a state's folder, or a PLY of points or triangles."""
     if scene.suffix == ".ply" and has_triangles(scene):
         state = read_ply(scene)
         return draw_scene(state.points_m, read_triangles(scene), state.colors, cameras)
     state = read_ply(scene) if scene.suffix == ".ply" else load(scene)
-    view = renderer.render(state, cameras, point_px=point_px)
+    view = jitted.render(state, cameras, point_px=2)
     return view.frames, view.mask
 
 
@@ -94,7 +92,6 @@ def static_triplet(
     video_id: str,
     meshes: MovingMesh | None = None,
     target: UInt8[np.ndarray, "f h w 3"] | None = None,
-    renderer: Renderer = jitted,
 ) -> Triplet:
     """Return a triplet of DWM: a static scene, hand meshes along the action, and the ground truth.
 
@@ -117,7 +114,7 @@ def static_triplet(
         prompt=action.prompt,
         prior=static[0],
         mask=static[1],
-        hands=renderer.draw_mesh(mesh, cameras)[0],
+        hands=jitted.draw_mesh(mesh, cameras)[0],
         first_frame=static[0][0],
         target=target,
     )

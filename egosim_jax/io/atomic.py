@@ -170,20 +170,20 @@ _held: dict[Path, tuple[int, int]] = {}
 
 
 @contextmanager
-def lock_folder(folder: Path, *, option: str = "--out", wait: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Keep other processes from writing to a folder, which is made if need be.
 
     The same process may lock a folder again. Raises `InputError` naming the process that has it,
     or, with `wait`, waits for it.
     """
-    hold_folder(folder, option=option, wait=wait)
+    hold_folder(folder, wait=wait)
     try:
         yield
     finally:
         _release(folder.resolve())
 
 
-def hold_folder(folder: Path, *, option: str = "--out", wait: bool = False) -> None:
+def hold_folder(folder: Path, *, wait: bool = False) -> None:
     """Lock a folder (`lock_folder`) until the process ends."""
     folder.mkdir(parents=True, exist_ok=True)
     key = folder.resolve()
@@ -202,7 +202,7 @@ def hold_folder(folder: Path, *, option: str = "--out", wait: bool = False) -> N
             raise
         raise InputError(
             f"{folder} is in use by another process (PID {holder}): one process at a time can "
-            f"write to a folder. Wait for it, or choose another folder. ({option})"
+            f"write to a folder. Wait for it, or choose another folder. (--out)"
         ) from error
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)

@@ -107,6 +107,15 @@ def refusing(what: str, kind: type[InputError] = InputError) -> Iterator[None]:
         raise kind(f"{what}: {quote_text(reason or type(error).__name__)}.") from error
 
 
+def check_version(found: Any, supported: int, *, source: str) -> None:
+    """Raise `InputError` unless a file has the version of its format that this program reads."""
+    if type(found) is not int or found != supported:
+        raise InputError(
+            f"{source} has version {quote(found)}; this program reads version {supported}. Make it "
+            "again, or read it by the egosim_jax that made it."
+        )
+
+
 def quote(value: Any) -> str:
     """Describe an untrusted value for a message, in at most some `MAX_QUOTED` characters.
 

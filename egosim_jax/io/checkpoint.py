@@ -8,7 +8,6 @@ notice a changed byte; they are compared before it is read.
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -24,7 +23,6 @@ from orbax.checkpoint import v1 as ocp
 from egosim_jax.io.atomic import TEMPORARY
 from egosim_jax.io.bounded import listing, quote_text, read_json
 from egosim_jax.io.digest import sha256
-from egosim_jax.io.renamed import STATE as STATE_NAMES
 from egosim_jax.io.run import write_json
 from egosim_jax.types import InputError
 
@@ -205,12 +203,8 @@ class Checkpoints:
         self._checkpointer.reload()
 
     def _load(self, step: int, state: Any, data: Any) -> Any:
-        kind = type(state)
         try:
-            saved = self._checkpointer.metadata(step).metadata
-            fields = _saved_fields(saved, state)
-            state = {name: getattr(state, field) for name, field in fields.items()} or state
-            self._check_shapes(step, saved, state)
+            self._check_shapes(step, self._checkpointer.metadata(step).metadata, state)
             loaded = self._checkpointer.load_checkpointables(step, {STATE: state, DATA: data})
         except InputError:
             raise
@@ -223,8 +217,7 @@ class Checkpoints:
                 f"files match {HASHES}: {quote_text(str(error))}. Move it away to resume from the "
                 "one before it."
             ) from error
-        values = loaded[STATE]
-        return kind(**{field: values[name] for name, field in fields.items()}) if fields else values
+        return loaded[STATE]
 
     def _check_shapes(self, step: int, metadata: Any, state: Any) -> None:
         saved, wanted = _shapes(metadata), _shapes(state)
@@ -257,14 +250,6 @@ def _is_hashes(path: Path) -> bool:
 def _files(folder: Path) -> dict[str, Path]:
     found = (path for path in folder.rglob("*") if path.is_file() and not _is_hashes(path))
     return {str(path.relative_to(folder)): path for path in sorted(found)}
-
-
-def _saved_fields(saved: Any, state: Any) -> dict[str, str]:
-    """Return the fields of `state` by their old names, if a checkpoint has those; else nothing."""
-    if not dataclasses.is_dataclass(state) or not STATE_NAMES.keys() & set(saved):
-        return {}
-    old = {field: name for name, field in STATE_NAMES.items()}
-    return {old.get(field.name, field.name): field.name for field in dataclasses.fields(state)}
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:

@@ -31,8 +31,8 @@ MAX_BYTES = 64 << 20
 class Journal:
     """Journal of the finished phases of a run, in the run's folder.
 
-    Raises `InputError` if it is damaged, of an earlier version, or missing although a file matches
-    one of `outputs`, globs of files that only a journaled run writes.
+    Raises `InputError` if it is damaged, or missing although a file matches one of `outputs`, globs
+    of files that only a journaled run writes.
     """
 
     def __init__(self, folder: Path, *, outputs: tuple[str, ...] = ()):
@@ -50,15 +50,12 @@ class Journal:
             )
 
     def _read(self, number: int, entry: Any) -> None:
-        fix = f"Restore it, or remove {self._folder} to start over."
-        if isinstance(entry, dict) and "phase" in entry and "chain" not in entry:
-            raise InputError(
-                f"{self._path} is of an earlier version, which did not record the inputs of its "
-                f"run: it cannot be resumed. Choose another folder, or remove {self._folder}."
-            )
         chain = entry.pop("chain", None) if isinstance(entry, dict) else None
         if chain is None or chain != _chained(self._chain, entry):
-            raise InputError(f"{self._path}, line {number} was changed or is missing. {fix}")
+            raise InputError(
+                f"{self._path}, line {number} was changed or is missing. Restore it, or remove "
+                f"{self._folder} to start over."
+            )
         self._chain, self.done[entry["phase"]] = chain, entry
 
     def require(self, phase: str, made_of: Mapping[str, str]) -> None:
@@ -106,18 +103,15 @@ class Journal:
         then = time.monotonic()
         output.parent.mkdir(parents=True, exist_ok=True)
         save(output, make())
-        self._enter(name, output, time.monotonic() - then)
-        return load(output)
-
-    def _enter(self, name: str, output: Path, seconds: float) -> None:
         self._append(
             {
                 "phase": name,
                 "file": str(output.relative_to(self._folder)),
                 "sha256": digest(output),
-                "seconds": round(seconds, 3),
+                "seconds": round(time.monotonic() - then, 3),
             }
         )
+        return load(output)
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._chain = _chained(self._chain, entry)

@@ -15,7 +15,6 @@ from typing import Any
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
 from egosim_jax.io.bounded import listing, quote, quote_text, read_json
-from egosim_jax.io.renamed import upgrade
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
@@ -94,9 +93,9 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
 
     The folder is locked until the process ends. Fields named `out` are not compared, so that a
     folder can be moved, and neither are fields whose dotted paths are in `mutable`, or below them.
-    A config of an earlier version is compared under today's names. Of several processes the first
-    one locks and writes. Raises `InputError` when the folder cannot be written, is in use, lost its
-    config, or holds a run of another config, naming the fields that differ.
+    Of several processes the first one locks and writes. Raises `InputError` when the folder cannot
+    be written, is in use, lost its config, or holds a run of another config, naming the fields that
+    differ.
     """
     import jax
 
@@ -117,7 +116,7 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
             raise InputError(f"{path} is not a config. Restore it. (--out)")
         differing = [
             f"{field}: {what}"
-            for field, what in sorted(_differences(upgrade(recorded), wanted).items())
+            for field, what in sorted(_differences(recorded, wanted).items())
             if not any(f"{field}.".startswith(f"{free}.") for free in mutable)
         ]
         if differing:

@@ -19,7 +19,6 @@ from egosim_jax.io.boxes import MAX_SAMPLES
 from egosim_jax.io.decoding import (
     MAX_FRAMES,
     DamagedError,
-    Decoding,
     File,
     FrameBuffer,
     check_size,
@@ -72,7 +71,6 @@ def read_segment(
     *,
     start: int,
     count: int,
-    decoding: Decoding = "accurate",
     each: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Video:
     """Decode `count` frames of a video of any length, from frame `start` on.
@@ -99,7 +97,7 @@ def read_segment(
                     continue
                 if time != listing.times[start + len(kept)]:
                     break
-                frame = to_rgb(decoded, decoding)
+                frame = to_rgb(decoded, "accurate")
                 kept.append(frame if each is None else each(frame))
                 if time >= last:
                     break

@@ -19,8 +19,6 @@ _DTYPES = {
     "paths": "float64", "frames": "uint8", "depth_m": "float32", "object_ids": "int32",
     "interacted_ids": "int32", "interacted_frames": "bool",
 }  # fmt: skip
-_RENAMED = {"touched_ids": "interacted_ids", "touched_frames": "interacted_frames"}
-"""Names of arrays in files of earlier versions."""
 
 
 def save(path: Path, perceived: Perceived) -> None:
@@ -47,7 +45,7 @@ def save(path: Path, perceived: Perceived) -> None:
 
 def load(path: Path) -> Perceived:
     """Read a `Perceived` that `save` wrote. Raises `InputError` for other or damaged files."""
-    arrays = read_arrays(path, _DTYPES, renamed=_RENAMED)
+    arrays = read_arrays(path, _DTYPES)
     about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
     try:
         cameras = Cameras(

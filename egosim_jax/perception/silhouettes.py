@@ -50,18 +50,14 @@ class HandShape:
 
 
 def hand_silhouettes(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    tracks: HandTracks,
-    *,
-    shape: HandShape | None = None,
-    focal_px: float | None = None,
+    frames: UInt8[np.ndarray, "f h w 3"], tracks: HandTracks
 ) -> Bool[np.ndarray, "f h w"]:
     """Return the pixels of hands and forearms of tracked hands, by geometry.
 
     Cameras need not be known. A hand that is missing from a frame covers nothing there.
     """
     height, width = frames.shape[1:3]
-    focal = focal_px or ASSUMED_FOCAL * width
+    focal = ASSUMED_FOCAL * width
     center = (width - 1) / 2, (height - 1) / 2
     cameras = Cameras(
         world_from_camera=np.repeat(np.eye(4)[None], len(frames), axis=0),
@@ -70,7 +66,7 @@ def hand_silhouettes(
         width=width,
     )
     joints_m = lift(tracks, cameras.intrinsics_px)
-    return hand_silhouette(joints_m, "human", cameras, shape or HandShape()) >= 0
+    return hand_silhouette(joints_m, "human", cameras, HandShape()) >= 0
 
 
 def hand_silhouette(

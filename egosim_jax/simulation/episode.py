@@ -35,7 +35,14 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax.io.atomic import atomic_folder, atomic_write, check_replaceable
-from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes, read_json
+from egosim_jax.io.bounded import (
+    check_version,
+    quote,
+    quote_path,
+    quote_text,
+    read_bytes,
+    read_json,
+)
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_image
 from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
@@ -258,11 +265,7 @@ def _read(folder: Path) -> Episode:
     written = read_json(folder / DESCRIPTION)
     if not isinstance(written, dict) or written.get("format") != FORMAT:
         raise InputError(f"{DESCRIPTION} does not describe an episode ({FORMAT}).")
-    if type(written.get("version")) is not int or written["version"] != VERSION:
-        raise InputError(
-            f"episode of version {quote(written.get('version'))}; this program reads version "
-            f"{VERSION}."
-        )
+    check_version(written.get("version"), VERSION, source=DESCRIPTION)
     for name, kind in {"kind": str, "fps": int, "height": int, "width": int, "prompts": list,
                        "target_ids": list, "sha256": dict}.items():  # fmt: skip
         if type(written.get(name)) is not kind:

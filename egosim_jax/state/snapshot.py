@@ -1,7 +1,7 @@
 """Storage of a state: a folder of `points.npz` and `state.json`, and PLY for other programs.
 
 `state.json` names the version and the SHA-256 of `points.npz`; nothing is unpickled. Equal states
-have equal fingerprints, independent of the file version.
+have equal fingerprints.
 """
 
 from __future__ import annotations
@@ -17,16 +17,13 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_folder, check_replaceable
-from egosim_jax.io.bounded import quote, quote_path, quote_text, read_json
+from egosim_jax.io.bounded import check_version, quote, quote_path, quote_text, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state.ply import read_points, write_points
 from egosim_jax.types import InputError, SceneState
 
-VERSION = 3
-"""Version of files that `save` writes."""
-READABLE = (1, 2, VERSION)
-"""Versions that `load` reads: 1 has no description hash; 1 and 2 spell colors the British way."""
+VERSION = 1
 POINTS, DESCRIPTION = "points.npz", "state.json"
 _NAMES = re.compile(r"points\.npz|state\.json")
 ARRAYS = ("points_m", "colors", "object_ids", "last_seen")
@@ -64,7 +61,7 @@ def save(folder: Path | str, state: SceneState) -> None:
 
 
 def load(folder: Path | str) -> SceneState:
-    """Read a state. Raises `InputError` if it is damaged, not a state, or of an unknown version."""
+    """Read a state. Raises `InputError` if it is damaged, not a state, or of another version."""
     folder = Path(folder)
     try:
         return _load(folder)
@@ -76,25 +73,18 @@ def _load(folder: Path) -> SceneState:
     written = read_json(folder / DESCRIPTION)
     if not isinstance(written, dict) or "version" not in written:
         raise InputError(f"{DESCRIPTION} is not the description of a state.")
-    version = written["version"]
-    if version not in READABLE or isinstance(version, (bool, float)):
-        raise InputError(f"it has version {quote(version)}; readable versions are {READABLE}.")
+    check_version(written["version"], VERSION, source=DESCRIPTION)
     if sha256(folder / POINTS) != written.get("sha256"):
         raise InputError(
             f"{folder / POINTS} is damaged: it is not what {DESCRIPTION} was written for "
             "(SHA-256). Use another copy."
         )
-    spelled = "colors" if version == VERSION else "colours"
-    dtypes = {spelled if name == "colors" else name: dtype for name, dtype in _DTYPES.items()}
-    arrays = read_arrays(folder / POINTS, dtypes)
-    arrays["colors"] = arrays.pop(spelled)
+    arrays = read_arrays(folder / POINTS, _DTYPES)
     try:
-        description = _checked(written)
-        state = SceneState(**arrays, **description)
+        state = SceneState(**arrays, **_checked(written))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{DESCRIPTION}: {quote_text(str(error))}.") from error
-    seal = written.get("description_sha256")
-    changed = version > 1 and seal != _sealed(_description(state))
+    changed = written.get("description_sha256") != _sealed(_description(state))
     if changed or written.get("points") != len(state.points_m):
         raise InputError(
             f"{folder / DESCRIPTION} was changed after it was written. Use another copy."

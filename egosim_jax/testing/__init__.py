@@ -25,7 +25,7 @@ from egosim_jax.data.shards import ShardWriter
 from egosim_jax.io.video import write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.models.wan.dit import WanDiTConfig
-from egosim_jax.train.encode import example_shapes
+from egosim_jax.train.encode import example_shapes, mask_of
 from egosim_jax.types import Triplet, VideoSpec
 
 
@@ -131,7 +131,7 @@ def write_latents(
         kind="latents",
         spec=model.video,
         grid=model.grid,
-        provenance={"config": model.name, "encoders": encoders},
+        provenance={"config": model.name, "encoders": encoders, "mask": mask_of(model)},
     )
     shapes = example_shapes(model, 1)
     with shards as writer:

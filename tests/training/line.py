@@ -18,10 +18,10 @@ from flax import nnx
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
-from egosim_jax.sharding import MeshConfig
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.distributed import distributed_context
 from egosim_jax.train.loop import train
+from egosim_jax.types import MeshConfig
 
 WIDTH, POINTS = 8, 40
 

@@ -15,11 +15,11 @@ from egosim_jax.conditioning.dropout import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiTConfig
-from egosim_jax.sharding import MeshConfig, batch_sharding, make_mesh, state_sharding
+from egosim_jax.sharding import batch_sharding, make_mesh, state_sharding
 from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import TrainState, make_update
-from egosim_jax.types import VideoSpec
+from egosim_jax.types import MeshConfig, VideoSpec
 from tests.training.run_tiny import TASKS as TINY
 
 STEPS, BATCH = 20, 8

@@ -111,6 +111,7 @@ def test_the_manifest_names_what_made_the_arrays_alone(encoded, source, weights)
         "source": source.manifest.fingerprint,
         "encoders": {"vae": hashes(weights)["vae"]},
         "decoding": "accurate",
+        "mask": {"packing": "space", "channels": 4},
     }
 
 
@@ -310,6 +311,14 @@ def test_shards_without_hashes_of_encoders_are_refused(tmp_path):
     with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video) as writer:
         writer.add({"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
     with pytest.raises(InputError, match="without the hashes of their encoders"):
+        check_encoders(tmp_path, CONFIG, None)
+
+
+def test_shards_that_do_not_name_the_packing_of_their_mask_are_refused(tmp_path):
+    known = {"config": "debug", "encoders": {"vae": "1" * 64}}
+    with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video, provenance=known) as writer:
+        writer.add({"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
+    with pytest.raises(InputError, match=r"mask: the shards have no record of it.*Encode again"):
         check_encoders(tmp_path, CONFIG, None)
 
 

@@ -12,11 +12,12 @@ import pytest
 from flax import nnx
 
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.io.run import open_folder
 from egosim_jax.runtime.command import CommandExit, ExitCode
-from egosim_jax.sharding import MeshConfig
-from egosim_jax.train.config import OptimizerConfig
+from egosim_jax.train.config import OptimizerConfig, numerics_only
 from egosim_jax.train.loop import train
-from egosim_jax.types import InputError
+from egosim_jax.train.recipes import DEBUG
+from egosim_jax.types import InputError, MeshConfig
 from tests.training.killing import logged
 from tests.training.line import POINTS, Line, training, write_points
 
@@ -140,6 +141,13 @@ def test_a_run_resumes_with_other_intervals_but_not_with_another_seed(points, tm
     fit(tmp_path, points, log_every=7, save_every=3, keep=5, hang_timeout_s=9.0)
     with pytest.raises(InputError, match=r"training\.seed"):
         fit(tmp_path, points, seed=1)
+
+
+def test_a_training_resumes_though_its_model_samples_in_other_steps(tmp_path):
+    task = DEBUG.stages()["denoiser"].task
+    open_folder(tmp_path, {"task": task})
+    fewer = dataclasses.replace(task, model=dataclasses.replace(task.model, steps=2))
+    open_folder(tmp_path, {"task": fewer}, mutable=list(numerics_only(task, "task")))
 
 
 def test_a_batch_that_devices_cannot_share_says_what_would_do(points, tmp_path):

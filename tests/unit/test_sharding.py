@@ -7,8 +7,8 @@ from jax.sharding import AbstractMesh, PartitionSpec
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
-from egosim_jax.sharding import MeshConfig, check_batch, make_mesh, state_sharding
-from egosim_jax.types import InputError
+from egosim_jax.sharding import check_batch, make_mesh, state_sharding
+from egosim_jax.types import InputError, MeshConfig
 
 
 @pytest.fixture(scope="module")

@@ -48,14 +48,14 @@ class Denoising:
     and are all that has to be learned."""
     rank: int | None = None
     """Rank of a LoRA, which is then trained instead of the weights; None: no LoRA."""
-    navigation: float | None = None
+    navigation: float = 0.0
     """Rate of samples without hands whose target is the prior, so that the camera alone moves.
 
-    DWM's regularizer, on in none of its releases; None: no such samples."""
+    DWM's regularizer, on in none of its releases."""
 
     def __post_init__(self) -> None:
         """Check that a weight of changes, and navigation, have a prior to compare with."""
-        if self.navigation is not None and not 0 <= self.navigation <= 1:
+        if not 0 <= self.navigation <= 1:
             raise InputError(
                 f"The rate of samples without hands must be in [0, 1], not {self.navigation}. "
                 "(--navigation)"

@@ -24,9 +24,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from egosim_jax.io.bounded import quote
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.simulation.actions import with_places
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
-from egosim_jax.worlds.tabletop.hands import Side, joints_of
+from egosim_jax.worlds.tabletop.hands import joints_of
 
 Layout = Literal["keypoints", "wrist", "gripper"]
 LAYOUTS: tuple[Layout, ...] = ("keypoints", "wrist", "gripper")

@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.types import SceneState
 from egosim_jax.worlds.tabletop import hand_motion
 from egosim_jax.worlds.tabletop.hand_motion import Grip, Hand, Intent
-from egosim_jax.worlds.tabletop.hands import Side, joints_of, pinch
+from egosim_jax.worlds.tabletop.hands import joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import DRAWER_M, Scene, moving_part
 
 Interaction = Literal["carry", "lift", "open or close"]

@@ -23,12 +23,12 @@ from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import straight_path, view_of
 from egosim_jax.interactive.play.moves import Pose, ready_pose, scene_from_state, suggest_goal
 from egosim_jax.interactive.server.session import Session
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 from egosim_jax.worlds.tabletop import Scene, World, start_of_sequence
 from egosim_jax.worlds.tabletop.clips import render_scenes
-from egosim_jax.worlds.tabletop.hands import Side
 from egosim_jax.worlds.tabletop.world import arms_of
 
 Frames = UInt8[np.ndarray, "f h w 3"]

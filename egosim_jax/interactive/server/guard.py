@@ -26,8 +26,8 @@ BODY_TIMEOUT_S = 60.0
 class Guard:
     """ASGI middleware that checks token, origin, host and size before a request is read."""
 
-    def __init__(self, app: ASGIApp, *, token: str | None, limit: int = wire.MAX_BYTES):
-        self._app, self._token, self._limit = app, token, limit
+    def __init__(self, app: ASGIApp, *, token: str | None):
+        self._app, self._token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward the request, or refuse it."""
@@ -71,8 +71,8 @@ class Guard:
                     "or give openpi-client the token as api_key.",
                 )
         size = headers.get("content-length", "0")
-        if not size.isdecimal() or int(size) > self._limit:
-            raise too_large(self._limit)
+        if not size.isdecimal() or int(size) > wire.MAX_BYTES:
+            raise too_large()
 
     def _bounded(self, receive: Receive) -> Receive:
         total, complete = 0, False
@@ -87,7 +87,7 @@ class Guard:
                 raise HTTPException(408) from None
             complete = not message.get("more_body", False)
             total += len(message.get("body", b""))
-            if total > self._limit:
+            if total > wire.MAX_BYTES:
                 raise HTTPException(413)
             return message
 
@@ -103,13 +103,13 @@ def _address(url: str) -> SplitResult:
         ) from None
 
 
-def too_large(limit: int) -> RequestError:
+def too_large() -> RequestError:
     """Return the error for a message above the limit."""
     return RequestError(
         413,
         "too_large",
-        f"The message is larger than the maximum of {limit:,} bytes. Send fewer rows or a smaller "
-        "episode.",
+        f"The message is larger than the maximum of {wire.MAX_BYTES:,} bytes. Send fewer rows or a "
+        "smaller episode.",
     )
 
 

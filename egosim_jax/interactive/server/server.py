@@ -113,7 +113,7 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
     @app.exception_handler(HTTPException)
     async def refused(_: Any, error: HTTPException) -> JSONResponse:
         if error.status_code == 413:
-            return response(too_large(wire.MAX_BYTES))
+            return response(too_large())
         if error.status_code == 408:
             return response(too_slow())
         code = "unknown_path" if error.status_code in (404, 405) else "invalid"

@@ -28,17 +28,15 @@ def read_arrays(
     *,
     others: Collection[str] = (),
     packed: bool = False,
-    renamed: Mapping[str, str] | None = None,
     optional: Mapping[str, str] | None = None,
 ) -> dict[str, np.ndarray]:
     """Read exactly the named arrays of an npz that `np.savez` wrote.
 
     `dtypes` names the dtype of each array, and `optional` that of arrays which may be absent; those
     in `others` may have any that holds numbers.
-    Compressed ones are read if `packed`. `renamed` maps the names of arrays in earlier files to
-    those of now. Raises `InputError` if an array is missing, unknown, of another dtype, too large
-    or damaged: shapes are checked against sizes before anything is built, contents against their
-    CRC-32.
+    Compressed ones are read if `packed`. Raises `InputError` if an array is missing, unknown, of
+    another dtype, too large or damaged: shapes are checked against sizes before anything is built,
+    contents against their CRC-32.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -46,7 +44,6 @@ def read_arrays(
             with zipfile.ZipFile(file) as archive:
                 found = archive.infolist()
                 names = [entry.filename.removesuffix(".npy") for entry in found[:MAX_ENTRIES]]
-                names = [(renamed or {}).get(n, n) for n in names]
                 dtypes = {**dtypes, **{n: d for n, d in (optional or {}).items() if n in names}}
                 if len(found) > MAX_ENTRIES or sorted(names) != sorted({*dtypes, *others}):
                     listing = ", ".join(quote_text(n) for n in names[:8])

@@ -59,15 +59,11 @@ def _check_sizes(metadata: Any, wanted: Sequence[str], name: str) -> None:
         group = metadata.row_group(number)
         for index in range(group.num_columns):
             chunk = group.column(index)
-            if any(chunk.path_in_schema in (w, *_nested(w, chunk.path_in_schema)) for w in wanted):
+            path = chunk.path_in_schema  # of a list column, `name.list.element`
+            if any(path == column or path.startswith(f"{column}.") for column in wanted):
                 size += max(0, chunk.total_uncompressed_size)
     if metadata.num_rows > MAX_ROWS or size > MAX_COLUMN_BYTES:
         raise InputError(
             f"{name} declares {metadata.num_rows:,} rows and {size:,} bytes to read: at most "
             f"{MAX_ROWS:,} rows and {MAX_COLUMN_BYTES:,} bytes are read."
         )
-
-
-def _nested(column: str, path: str) -> tuple[str, ...]:
-    """Return the path itself if it is that of the values in a list column."""
-    return (path,) if path.startswith(f"{column}.") else ()

@@ -26,10 +26,10 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
+from egosim_jax.models.conv import Conv
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.wan.vae_layers import (
     Cache,
-    Conv,
     Downsample,
     Input,
     Layer,

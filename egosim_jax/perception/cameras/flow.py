@@ -15,6 +15,10 @@ MIN_CORNERS = 20
 """Fewest background corners of an image with enough texture."""
 MAX_RETURN_PX = 0.7
 """Largest distance from a corner to where its track returns when followed backward."""
+MARGIN = 0.015
+"""Width of the border around what moves that is not background, in image widths."""
+MIN_SURVIVAL = 0.1
+"""Minimum share of corners that are found again in a connected frame."""
 _CORNERS, _QUALITY, _APART_PX = 600, 0.003, 8
 _WINDOW, _LEVELS = (21, 21), 4
 
@@ -74,19 +78,16 @@ class Background:
 
 
 def background(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    moving: Bool[np.ndarray, "f h w"],
-    *,
-    margin: float = 0.015,
+    frames: UInt8[np.ndarray, "f h w 3"], moving: Bool[np.ndarray, "f h w"]
 ) -> Background:
-    """Return the background of a video: all but what moves and a margin, in image widths."""
+    """Return the background of a video: all but what moves and a margin."""
     import cv2
 
     height, width = frames.shape[1:3]
     reduction = max(1.0, max(height, width) / WORKING_PX)
     size = round(width / reduction), round(height / reduction)
     equalize = cv2.createCLAHE(clipLimit=2.0, tileGridSize=(8, 8))
-    wide = 2 * max(1, round(margin * max(size))) + 1
+    wide = 2 * max(1, round(MARGIN * max(size))) + 1
     kernel = np.ones((wide, wide), np.uint8)
     gray, still = [], []
     for frame, mask in zip(frames, moving, strict=True):
@@ -112,7 +113,7 @@ class Breaks:
     """Share of the corners of each frame, but the last, that are found in the next."""
 
 
-def find_breaks(video: Background, *, min_survival: float = 0.1, bridge: int = 5) -> Breaks:
+def find_breaks(video: Background, *, bridge: int) -> Breaks:
     """Find blank frames and cuts; at most `bridge` bad frames between connected ones are no cut."""
     count = len(video.gray)
     corners = [video.corners(frame) for frame in range(count)]
@@ -127,10 +128,10 @@ def find_breaks(video: Background, *, min_survival: float = 0.1, bridge: int = 5
     cuts: list[int] = []
     reached = 0
     for frame in range(1, count):
-        if shares[frame - 1] >= min_survival and reached == frame - 1:
+        if shares[frame - 1] >= MIN_SURVIVAL and reached == frame - 1:
             reached = frame
             continue
-        if survival(reached, frame) >= min_survival:
+        if survival(reached, frame) >= MIN_SURVIVAL:
             reached = frame
         elif frame - reached > bridge and frame not in blank:
             cuts.append(frame if reached + 1 in blank else reached + 1)

@@ -17,6 +17,8 @@ INPUT = 192
 """Height and width of the detector's input in pixels."""
 PALM_KEYPOINTS = 7
 """Number of keypoints of a detected palm: wrist, four knuckles, two of the thumb."""
+MAX_IOU = 0.3
+"""Maximum intersection over union of detections of different palms."""
 _GRIDS = ((24, 2), (12, 6))
 _POSITIONS = [0, *range(2, 2 + PALM_KEYPOINTS)]
 """Rows of a detection that are positions: its center and keypoints. Row 1 is its size."""
@@ -109,7 +111,7 @@ def decode_palms(
 
 
 def suppress_duplicates(
-    values: Float[np.ndarray, "n 9 2"], score: Float[np.ndarray, " n"], *, max_iou: float = 0.3
+    values: Float[np.ndarray, "n 9 2"], score: Float[np.ndarray, " n"]
 ) -> Palms:
     """Merge overlapping detections into their mean, weighted by score.
 
@@ -118,7 +120,7 @@ def suppress_duplicates(
     merged, scores = [], []
     order = np.argsort(-score, kind="stable")
     while len(order):
-        same = _iou(values[order[0]], values[order]) > max_iou
+        same = _iou(values[order[0]], values[order]) > MAX_IOU
         same[0] = True
         group = order[same]
         merged.append(np.average(values[group], axis=0, weights=score[group]))

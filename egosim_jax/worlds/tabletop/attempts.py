@@ -33,7 +33,7 @@ def make_attempts(
     spec: VideoSpec,
     clips: int = 1,
     kind: Kind = "human",
-    black_cloths: int | None = None,
+    black_cloths: int = 0,
 ) -> Iterator[TabletopClip]:
     """Yield the clips of a scene: a policy tries to carry a body, then the head turns.
 
@@ -72,7 +72,7 @@ def turn_camera(cameras: Cameras, first: float, last: float, frames: int) -> Cam
     return replace(cameras, world_from_camera=poses)
 
 
-def _carrying(seed: int, *, spec: VideoSpec, kind: Kind, black_cloths: int | None) -> Script | None:
+def _carrying(seed: int, *, spec: VideoSpec, kind: Kind, black_cloths: int) -> Script | None:
     """Return the first variant of a scene's script that carries a body, or None."""
     scripts = (
         next(make_scripts(seed, spec=spec, kind=kind, black_cloths=black_cloths, variant=variant))

@@ -18,7 +18,7 @@ from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.hand_mesh import pose_hands
-from egosim_jax.rendering.mesh import hand_mask
+from egosim_jax.rendering.mesh import Side, hand_mask
 from egosim_jax.rendering.mesh_reference import draw_mesh
 from egosim_jax.rendering.reference import draw_hands, render
 from egosim_jax.simulation.episode import Episode
@@ -34,7 +34,6 @@ from egosim_jax.types import (
     near_view,
 )
 from egosim_jax.worlds.tabletop.bodies import Part
-from egosim_jax.worlds.tabletop.hands import Side
 from egosim_jax.worlds.tabletop.raycast import Frame, Placed, RayCaster
 from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene
 

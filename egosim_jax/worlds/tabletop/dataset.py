@@ -54,15 +54,15 @@ class DatasetConfig:
     """Length and size of the clips."""
     kind: Kind | Literal["mixed"]
     """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
-    black_cloths: int | None = None
-    """Maximum number of black cloths on a table, which look like holes of a prior; None: 0."""
-    attempts: float | None = None
+    black_cloths: int = 0
+    """Maximum number of black cloths on a table, which look like holes of a prior."""
+    attempts: float = 0.0
     """Fraction of the scenes in which a policy may fail and the head turns (`attempts.py`)."""
     prior: PriorName = "state"
     """Rendering of the scene: points of the state, or the ray-cast scene of the first frame."""
     hands: HandsName = "skeleton"
     """Rendering of the hands: skeletons, shaded meshes, or the meshes' binary mask."""
-    fixed_camera: bool | None = None
+    fixed_camera: bool = False
     """True: the camera keeps its pose of the first frame."""
 
     def kind_of(self, seed: int) -> Kind:
@@ -85,7 +85,7 @@ class DatasetConfig:
             clips=self.clips,
             kind=kind,
             black_cloths=cloths,
-            fixed_camera=bool(self.fixed_camera),
+            fixed_camera=self.fixed_camera,
         )
 
     def __post_init__(self) -> None:
@@ -96,7 +96,7 @@ class DatasetConfig:
                 "both must be at least 1. (--scenes, --clips)"
             )
         check_seed(min(self.seeds))
-        if self.attempts is not None and not 0 <= self.attempts <= 1:
+        if not 0 <= self.attempts <= 1:
             raise InputError(
                 f"{self.attempts:g} is not a fraction of the scenes: it must be between 0 and 1. "
                 "(--attempts)"

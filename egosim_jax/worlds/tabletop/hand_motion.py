@@ -16,16 +16,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from egosim_jax.geometry import rotation_z
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import Body, Part
-from egosim_jax.worlds.tabletop.hands import (
-    Side,
-    closure_for,
-    elbow_of,
-    hand_meshes,
-    joints_of,
-    pinch,
-)
+from egosim_jax.worlds.tabletop.hands import closure_for, elbow_of, hand_meshes, joints_of, pinch
 from egosim_jax.worlds.tabletop.scene import Scene, moving_part
 
 Verb = Literal["carry", "lift", "turn", "stack", "open", "close"]

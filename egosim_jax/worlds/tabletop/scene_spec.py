@@ -24,7 +24,7 @@ import numpy as np
 
 from egosim_jax.geometry import rotation_z
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import check_version, quote, quote_path, read_json
 from egosim_jax.types import InputError, check_seed
 from egosim_jax.worlds.tabletop.bodies import (
     COLORS,
@@ -238,11 +238,7 @@ def read_scene(path: Path | str) -> Scene:
     name = quote_path(path)
     if not isinstance(written, dict) or written.get("format") != FORMAT:
         raise InputError(f"{name} does not describe a scene: its format must be {FORMAT}.")
-    if written.get("version") != VERSION or isinstance(written["version"], bool):
-        raise InputError(
-            f"{name} is a scene of version {quote(written.get('version'))}; this program reads "
-            f"version {VERSION}."
-        )
+    check_version(written.get("version"), VERSION, source=name)
     unknown = sorted(written.keys() - {"format", "version", "room", "objects"})
     objects, room = written.get("objects"), written.get("room", 0)
     if unknown or not isinstance(objects, list) or type(room) is not int:

@@ -62,7 +62,7 @@ def make_sequence(
     clips: int = 1,
     kind: Kind = "human",
     bare: bool = False,
-    black_cloths: int | None = None,
+    black_cloths: int = 0,
     fixed_camera: bool = False,
     variant: int = 0,
 ) -> Iterator[TabletopClip]:
@@ -106,7 +106,7 @@ def make_scripts(
     spec: VideoSpec,
     clips: int = 1,
     kind: Kind = "human",
-    black_cloths: int | None = None,
+    black_cloths: int = 0,
     fixed_camera: bool = False,
     variant: int = 0,
 ) -> Iterator[Script]:
@@ -139,22 +139,21 @@ def start_of_sequence(
     seed: int, *, spec: VideoSpec, kind: Kind = "human"
 ) -> tuple[Scene, Cameras, Frame, SceneState]:
     """Return the scene, camera, frame without hands and state at the start of a sequence."""
-    _, scene, eye, sway = _begin(seed, kind, None)
+    _, scene, eye, sway = _begin(seed, kind, black_cloths=0)
     cameras = _cameras(np.zeros(1), eye, sway, spec)
     first, state = first_view(scene, cameras)
     return scene, cameras, first, replace(state, provenance=provenance(seed))
 
 
 def _begin(
-    seed: int, kind: Kind, black_cloths: int | None
+    seed: int, kind: Kind, black_cloths: int
 ) -> tuple[np.random.Generator, Scene, np.ndarray, tuple[Any, Any]]:
     """Return the random generator, scene, eye position and head sway of a seed."""
     stream = 0 if kind == "human" else 1
     rng = np.random.default_rng([seed, stream])
     scene = sample_scene(rng)
-    if black_cloths is not None:
-        # Cloths have their own generator, so that they change no other random number.
-        scene = with_cloths(scene, np.random.default_rng([seed, stream, 1]), black_cloths)
+    # Cloths have their own generator, so that they change no other random number.
+    scene = with_cloths(scene, np.random.default_rng([seed, stream, 1]), black_cloths)
     sway = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.6, 1.4, 6)
     eye = np.array([0.0, -0.10, 0.46]) + rng.normal(0, [0.025, 0.015, 0.02])
     return rng, scene, eye, sway

@@ -16,10 +16,11 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
 from egosim_jax.worlds.tabletop.clips import Arm, TabletopClip, first_view, provenance, render_clip
 from egosim_jax.worlds.tabletop.contact import Contact, Grasp, advance, start
-from egosim_jax.worlds.tabletop.hands import Side, arm_of, side_of
+from egosim_jax.worlds.tabletop.hands import arm_of, side_of
 from egosim_jax.worlds.tabletop.raycast import Frame
 from egosim_jax.worlds.tabletop.scene import Scene
 

@@ -221,7 +221,21 @@ def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, r
 
 @pytest.mark.parametrize(
     "line",
-    ["[]", '{"video_id": "../../x"}', '{"video_id": 3}', '{"video_id": "a", "start": "x"}', "{"],
+    [
+        "[]",
+        "{",
+        *(
+            json.dumps({"video_id": "a", "source_id": "a", "start": 0, "status": "done", **change})
+            for change in (
+                {"video_id": "../../x"},
+                {"video_id": 3},
+                {"source_id": ["a"]},
+                {"start": "x"},
+                {"start": None},
+                {"status": None},
+            )
+        ),
+    ],
 )
 def test_invalid_results_are_refused(clips, run, line):
     (run / "results.jsonl").write_text(line + "\n")

@@ -11,7 +11,7 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.metadata import read_metadata
-from egosim_jax.data.windows import windows_of
+from egosim_jax.data.windows import conditions_sha256, windows_of
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.testing import write_weights
@@ -87,7 +87,8 @@ def test_a_clip_of_another_prompt_or_window_is_not_taken_for_this_one(
         windows_of(read_metadata(write_clips(tmp_path / name, [one], fps=8)), chosen)
         for name, one, chosen in (("before", clip, (0,)), ("after", changed, starts))
     )
-    job(out=out)._report(before[0], status="done")
+    digest = conditions_sha256(before[0].files)
+    job(out=out)._report(before[0], status="done", conditions_sha256=digest)
     (out / f"{clip.video_id}.mp4").touch()
     job(out=out, skip_existing=True).generate(before)
     with pytest.raises(InputError, match=message):

@@ -422,7 +422,7 @@ def test_verify_finds_one_changed_value(tmp_path, capsys):
     file.write_bytes(data)
     assert main(check) == 1
     assert "does not match its checksum" in capsys.readouterr().out
-    save_flax(load_flax(file), file)  # as before there were checksums
+    save_flax(load_flax(file), file)  # as other programs write weights
     assert main(check) == 1
     said = capsys.readouterr().out
     assert "dit: no checksums" in said

@@ -6,7 +6,7 @@ import ml_dtypes
 import numpy as np
 
 from egosim_jax.data.check import check
-from egosim_jax.data.manifest import MANIFEST, SEAL
+from egosim_jax.data.manifest import MANIFEST, SEAL, sealed
 from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.types import VideoSpec
@@ -38,10 +38,11 @@ def write_latents(folder):
 
 
 def rewrite_manifest(folder, change):
+    """Change a manifest and write it with its hash, as a liar would."""
     fields = json.loads((folder / MANIFEST).read_text())
-    del fields[SEAL]  # as in a manifest of an earlier version, or of a liar
+    del fields[SEAL]
     change(fields)
-    (folder / MANIFEST).write_text(json.dumps(fields))
+    (folder / MANIFEST).write_text(json.dumps({**fields, SEAL: sealed(fields)}))
 
 
 def first_shard(folder):

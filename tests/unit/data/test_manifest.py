@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from egosim_jax.data.manifest import MANIFEST, read_manifest
+from egosim_jax.data.manifest import MANIFEST, SEAL, read_manifest
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.types import InputError
 from tests.unit.data.latent_records import SPEC, rewrite_manifest
@@ -32,6 +32,7 @@ def test_axes_on_which_records_differ_are_none(tmp_path):
         (lambda fields: fields.update(version=2), "version 2"),
         (lambda fields: fields.update(kind="pickles"), "kind 'pickles'"),
         (lambda fields: fields.pop("shards"), "is not a manifest"),
+        (lambda fields: fields.pop("grid"), "is not a manifest"),
         (lambda fields: fields.update(shards=[]), "at least one record"),
         (lambda fields: fields["shards"][0].update(records=0), "at least one record"),
         (lambda fields: fields["spec"].update(frames=10), "4k[+]1"),
@@ -59,6 +60,7 @@ def test_a_manifest_that_is_not_json_is_refused(folder):
         lambda fields: fields["spec"].update(frames=13),
         lambda fields: fields["arrays"]["target"].update(shape=[None]),
         lambda fields: fields["shards"].reverse(),
+        lambda fields: fields.pop(SEAL),
     ],
 )
 def test_a_changed_manifest_is_named(folder, change):

@@ -11,7 +11,6 @@ from egosim_jax.data.records import RecordError
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.types import InputError
 from tests.unit.data.latent_records import (
-    SPEC,
     damage_record,
     first_shard,
     latents,
@@ -165,16 +164,6 @@ def test_a_shard_that_is_a_link_is_refused(folder):
     path.symlink_to(folder / "elsewhere")
     with pytest.raises(InputError, match="missing"):
         ShardReader(folder)
-
-
-def test_a_dataset_that_calls_the_target_truth_is_read(tmp_path):
-    arrays = {("truth" if name == "target" else name): a for name, a in latents(0).items()}
-    with ShardWriter(tmp_path / "old", kind="latents", spec=SPEC) as writer:
-        writer.add(arrays, {"video_id": "a", "prompt": ""})
-    reader = ShardReader(tmp_path / "old")
-    assert sorted(reader.manifest.arrays) == sorted(reader[0].arrays) == ["mask", "target", "text"]
-    np.testing.assert_array_equal(reader[0].arrays["target"], arrays["truth"])
-    assert problems(tmp_path / "old") == []
 
 
 def test_the_old_dataset_is_there_until_the_new_one_takes_its_place(folder, monkeypatch):

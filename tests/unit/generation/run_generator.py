@@ -11,9 +11,9 @@ from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
 from egosim_jax.models.wan.dit import WanDiTConfig
-from egosim_jax.sharding import MeshConfig, make_mesh
+from egosim_jax.sharding import make_mesh
 from egosim_jax.testing import random_triplet
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, MeshConfig, VideoSpec
 
 DEBUG = configs.get("debug")
 # 2 x 2 x 4 tokens and 8 heads, which eight devices divide.

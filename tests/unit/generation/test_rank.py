@@ -79,14 +79,15 @@ def test_a_candidate_whose_hands_were_corrected_is_not_ranked_by_its_old_clip(tm
     assert rank.rank(jobs(out), windows, brightness) == again
 
 
-def test_results_of_a_version_that_recorded_no_conditions_are_taken(tmp_path):
+def test_results_that_do_not_name_their_conditions_are_refused(tmp_path):
     out, windows = tmp_path / "out", candidates(tmp_path / "clips", a=40, b=200)
-    first = rank.rank(jobs(out), windows, brightness)
+    rank.rank(jobs(out), windows, brightness)
     for file in out.glob("*/results.jsonl"):
         lines = [json.loads(line) for line in file.read_text("utf-8").splitlines()]
         assert all(len(line.pop("conditions_sha256")) == 64 for line in lines)
         file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
-    assert rank.rank(jobs(out), windows, brightness) == first
+    with pytest.raises(InputError, match="another conditions_sha256: None"):
+        rank.rank(jobs(out), windows, brightness)
 
 
 def test_a_video_that_ends_at_the_goal_scores_highest():

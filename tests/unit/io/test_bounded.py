@@ -7,6 +7,7 @@ import pytest
 
 from egosim_jax.io.bounded import (
     MAX_QUOTED,
+    check_version,
     open_regular,
     parse_json,
     quote,
@@ -92,3 +93,10 @@ def test_what_is_quoted_is_short_and_printable(value):
 )
 def test_text_is_shown_without_quotation_marks(text, shown):
     assert quote_text(text) == shown
+
+
+@pytest.mark.parametrize("version", [0, 2, 1.0, True, "1", None, [1]])
+def test_another_version_of_a_format_is_refused_with_the_fix(version):
+    with pytest.raises(InputError, match=r"^state\.json has version .* reads version 1\. Make it"):
+        check_version(version, 1, source="state.json")
+    check_version(1, 1, source="state.json")

@@ -82,7 +82,8 @@ import jax, numpy as np
 from flax import nnx
 from egosim_jax.io import weights
 from egosim_jax.models.layers import Linear
-from egosim_jax.sharding import MeshConfig, make_mesh, state_sharding
+from egosim_jax.sharding import make_mesh, state_sharding
+from egosim_jax.types import MeshConfig
 
 class Net(nnx.Module):
     def __init__(self):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from egosim_jax.geometry import invert, transform
-from egosim_jax.perception.classical import ClassicalConfig, HandMasks, hand_silhouette
+from egosim_jax.perception.classical import ClassicalConfig, HandMasks
 from egosim_jax.perception.oracle import OracleConfig
+from egosim_jax.perception.silhouettes import hand_silhouette
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Clip, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth

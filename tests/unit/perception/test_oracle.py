@@ -68,18 +68,6 @@ def test_an_archive_keeps_everything(clips, tmp_path):
     assert (again.step, again.names) == (found.step, found.names)
 
 
-def test_an_archive_that_calls_interactions_touched_is_read(clips, tmp_path):
-    found = oracle(clips[1])(*asked(clips[1]))
-    found = replace(found, interacted_frames={10: np.array([False, True, True, False, False])})
-    archive.save(tmp_path / "new.npz", found)
-    with np.load(tmp_path / "new.npz") as file:
-        old = {name.replace("interacted_", "touched_"): file[name] for name in file.files}
-    assert {"touched_ids", "touched_frames"} < old.keys()
-    np.savez(tmp_path / "old.npz", **old)
-    again = archive.load(tmp_path / "old.npz")
-    np.testing.assert_array_equal(again.interacted_frames[10], found.interacted_frames[10])
-
-
 def test_a_file_that_is_no_archive_is_named(tmp_path):
     path = tmp_path / "perceived.npz"
     np.savez(path, about=np.zeros(3, np.uint8))

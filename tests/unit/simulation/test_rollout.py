@@ -191,10 +191,10 @@ def test_a_missing_journal_is_named_with_the_way_out(tmp_path):
         run(tmp_path)
 
 
-def test_a_journal_of_the_first_release_is_refused_with_the_way_out(tmp_path):
+def test_a_line_without_its_hash_is_refused_with_the_way_out(tmp_path):
     line = '{"phase": "1 generate", "file": "clip_1/frames.npz", "sha256": "0", "seconds": 1}\n'
     (tmp_path / "journal.jsonl").write_text(line)
-    with pytest.raises(InputError, match=r"of an earlier version.* Choose another folder"):
+    with pytest.raises(InputError, match=r"line 1 was changed or is missing.* to start over"):
         run(tmp_path)
 
 

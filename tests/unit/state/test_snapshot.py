@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.io.digest import sha256
 from egosim_jax.state.snapshot import fingerprint, load, read_ply, save, write_ply
 from egosim_jax.types import InputError, SceneState
 
@@ -74,8 +73,8 @@ def test_a_flipped_byte_is_named(tmp_path):
 def test_another_version_is_named(tmp_path):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 4}))
-    with pytest.raises(InputError, match=r"has version 4; readable versions are \(1, 2, 3\)"):
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 2}))
+    with pytest.raises(InputError, match="has version 2; this program reads version 1"):
         load(tmp_path / "state")
 
 
@@ -107,7 +106,7 @@ def test_a_changed_description_is_named(tmp_path, change):
         load(tmp_path / "state")
 
 
-def test_a_state_of_the_first_release_is_still_read(tmp_path):
+def test_a_description_without_its_hash_is_refused(tmp_path):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
     written = json.loads(path.read_text())
@@ -115,12 +114,6 @@ def test_a_state_of_the_first_release_is_still_read(tmp_path):
     path.write_text(json.dumps(written))
     with pytest.raises(InputError, match="was changed after it was written"):
         load(tmp_path / "state")
-    points = tmp_path / "state" / "points.npz"
-    with np.load(points) as arrays:
-        older = {{"colors": "colours"}.get(name, name): arrays[name] for name in arrays.files}
-    np.savez(points, **older)
-    path.write_text(json.dumps({**written, "version": 1, "sha256": sha256(points)}))
-    assert fingerprint(load(tmp_path / "state")) == fingerprint(state())
 
 
 def test_a_save_that_fails_leaves_the_older_state(tmp_path, monkeypatch):

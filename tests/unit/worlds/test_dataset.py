@@ -37,13 +37,6 @@ def test_a_finished_folder_is_not_written_again(tmp_path):
     assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
 
 
-def test_a_folder_of_an_earlier_version_is_continued(tmp_path):
-    list(make_shards(ROBOT, out=tmp_path, workers=1))
-    record = tmp_path / "config.json"
-    record.write_text(record.read_text("utf-8").replace("DatasetConfig", "Plan"), "utf-8")
-    assert list(make_shards(ROBOT, out=tmp_path, workers=1)) == [5]
-
-
 @dataclass(frozen=True)
 class OwnStates:
     """Every clip starts from its own state."""
