@@ -14,7 +14,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, UInt32
+from jaxtyping import Array, Key, UInt32
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.image import clip_pixels
@@ -134,9 +134,7 @@ def _latents(
     return networks.vae.encode(pixels)
 
 
-def _embeddings(
-    networks: Networks, batch: Batch, name: str, ids: str, mask: str
-) -> Float[Array, "b n d"] | None:
+def _embeddings(networks: Networks, batch: Batch, name: str, ids: str, mask: str) -> Any:
     """Return the embeddings of prompts, which a batch has itself where no encoder is given."""
     if networks.text is None or ids not in batch:
         return batch.get(name)
