@@ -6,7 +6,8 @@ Slurm, Open MPI and TPU pods are recognized by jax. Anywhere else, give every pr
 
 and with none of these a run has one process. The service has no authentication. With an address of
 this machine's loopback it listens on the loopback only; with any other it listens on all
-interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall (docs/security.md).
+interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall (docs/security.md). Between
+several processes, jax's collectives of CPUs (gloo) listen at the address of the hostname.
 """
 
 from __future__ import annotations
@@ -15,14 +16,13 @@ import ipaddress
 import itertools
 import os
 import socket
+import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import jax
-from jax._src import xla_bridge
 from jax.experimental import multihost_utils
 
 from egosim_jax.runtime.command import CommandExit, ExitCode
@@ -88,17 +88,30 @@ def launched_context() -> AbstractContextManager[None]:
 
 
 def _initialize(address: str, count: int, index: int) -> None:
-    """Join the service at an address; on the loopback, it and gloo listen on the loopback only."""
-    bind = None
-    if _is_loopback(address.rpartition(":")[0]):
-        bind = address
-        # Gloo would listen at the address of the hostname; jax has no public option for it.
-        gloo = xla_bridge._jax.make_gloo_tcp_collectives
-        xla_bridge._jax.make_gloo_tcp_collectives = partial(gloo, hostname="127.0.0.1")
-    options: dict[str, Any] = {"coordinator_bind_address": bind}
+    """Join the service at an address; on the loopback, the service listens on the loopback only."""
+    local = _is_loopback(address.rpartition(":")[0])
+    options: dict[str, Any] = {"coordinator_bind_address": address if local else None}
     if count == 1:
+        # One process sends nothing to others. Gloo, the default, would listen all the same.
+        jax.config.update("jax_cpu_collectives_implementation", None)
         options["heartbeat_timeout_seconds"] = FOREVER_S
+    elif local and index == 0:
+        _warn_of_gloo()
     jax.distributed.initialize(address, count, index, **options)
+
+
+def _warn_of_gloo() -> None:
+    """Warn if gloo will listen beyond the loopback: jax has no option for its address."""
+    name = socket.gethostname()
+    with suppress(OSError):  # of a hostname without an address, for which gloo has its own error
+        address = str(socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)[0][4][0])
+        if not _is_loopback(address):
+            warnings.warn(
+                f"Other machines may reach the collectives of these processes: gloo listens at "
+                f"{address}, the address of the hostname {name}, without authentication. Add "
+                f"'127.0.0.1 {name}' to /etc/hosts, or use a firewall.",
+                stacklevel=3,
+            )
 
 
 def _is_loopback(host: str) -> bool:

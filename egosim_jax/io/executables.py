@@ -4,7 +4,7 @@ The files are in a `PrivateCache`, because reading one runs native code in it. I
 of everything that the compiled function depends on: its name and config, the shapes of its
 arguments, the devices, the versions of the libraries, XLA's flags, the modules of this package that
 run while it is traced, and other packages whose classes are in the config. jax's own compilation
-cache is in another one (`share_with_jax`).
+cache is in another private folder (`share_with_jax`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 
 import jax
 
-from egosim_jax.io.private import PrivateCache
+from egosim_jax.io.private import PrivateCache, private_folder
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
@@ -39,7 +39,7 @@ TRACED = (
 FOLDER, MAX_FILES = "executables", 64
 """Name of the cache, and its maximum number of compiled functions."""
 JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
-"""Name of jax's own compilation cache, and its maximum number of files."""
+"""Name of jax's own compilation cache, and the number of files that a start leaves in it."""
 
 
 def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
@@ -71,33 +71,16 @@ def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
 
 
 def share_with_jax() -> None:
-    """Store jax's own compilation cache in a `PrivateCache`, unless the user chose a folder.
+    """Keep jax's own compilation cache in a private folder, unless the user chose a folder.
 
-    For entry points, since it changes jax's settings. Without it, jax's files have no checksum if
-    zstandard compresses them, and any user's are read.
+    For entry points, since it changes jax's settings.
     """
-    from jax._src import compilation_cache
-
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
-    if (cache := PrivateCache.open(JAX_FOLDER, most=JAX_MAX_FILES)) is None:
-        return
-    original = compilation_cache.get_file_cache
-
-    class Checked(compilation_cache.CacheInterface):
-        _path = cache.folder
-
-        def get(self, key: str) -> Any:
-            return cache.get(key)
-
-        def put(self, key: str, value: bytes) -> None:
-            cache.put(key, value)
-
-    def choose(path: str) -> Any:
-        return (Checked(), path) if path == str(cache.folder) else original(path)
-
-    compilation_cache.get_file_cache = choose
-    jax.config.update("jax_compilation_cache_dir", str(cache.folder))
+    # Not jax_compilation_cache_max_size: before jax 0.12, one file whose write was cut off keeps
+    # jax from storing any other (jax issue 39880).
+    if (folder := private_folder(JAX_FOLDER, most=JAX_MAX_FILES)) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
 @contextmanager

@@ -2,8 +2,9 @@
 
 A cache is a folder `~/.cache/egosim_jax/NAME` (`XDG_CACHE_HOME/egosim_jax/NAME` if that is set to
 an absolute path) that belongs to the user, that nobody else can read or write and that is no link.
-A file is opened first; owner, mode, links and checksum are then those of what was opened. Whatever
-is wrong is said in a warning, and the file is made again.
+`PrivateCache` opens a file first; owner, mode, links and checksum are then those of what was
+opened. Whatever is wrong is said in a warning, and the file is made again. `private_folder` is for
+a library that reads and writes its files itself.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pwd
 import re
 import stat
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,20 +49,8 @@ class PrivateCache:
     @classmethod
     def open(cls, name: str, *, most: int) -> PrivateCache | None:
         """Open the cache of a name; None, with a warning, if others could write to it."""
-        folder = cache_folder() / name
-        try:
-            folder.parent.parent.mkdir(parents=True, exist_ok=True)
-            for own in (folder.parent, folder):
-                own.mkdir(mode=0o700, exist_ok=True)
-            problem = _problem(folder)
-        except (OSError, RuntimeError) as error:  # RuntimeError: no home
-            problem = str(error)
-        if problem is None:
-            return cls(folder, most)
-        warnings.warn(
-            f"{folder} is not used, so programs are compiled again: {problem}", stacklevel=3
-        )
-        return None
+        folder = _open_folder(name, _problem)
+        return None if folder is None else cls(folder, most)
 
     def get(self, name: str) -> bytes | None:
         """Read a file; None if it is absent or, with a warning, not trusted."""
@@ -92,16 +82,52 @@ class PrivateCache:
                 with temporary.open("wb") as file:
                     file.write(MAGIC + hashlib.sha256(data).digest())
                     file.write(data)
-            self._forget()
+            _forget(self.folder, self.most)
         except OSError as error:
             warnings.warn(f"{path} was not kept: {error.strerror}", stacklevel=2)
 
-    def _forget(self) -> None:
-        with os.scandir(self.folder) as entries:
-            found = [(e.stat(follow_symlinks=False).st_mtime, e.name) for e in entries]
-        names = [name for _, name in sorted(found) if TEMPORARY not in name]
-        for name in names[: -self.most]:
-            (self.folder / name).unlink(missing_ok=True)
+
+def private_folder(name: str, *, most: int) -> Path | None:
+    """Return the folder of a cache that a library reads and writes, with its `most` newest files.
+
+    None, with a warning, if others could write to it or wrote a file in it. The library may give
+    its files any mode: nobody else gets past the folder's.
+    """
+    folder = _open_folder(name, lambda folder: _problem(folder) or _foreign(folder))
+    if folder is not None:
+        with suppress(OSError):  # another process removes files, too
+            _forget(folder, most)
+    return folder
+
+
+def _open_folder(name: str, check: Callable[[Path], str | None]) -> Path | None:
+    folder = cache_folder() / name
+    try:
+        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+        for own in (folder.parent, folder):
+            own.mkdir(mode=0o700, exist_ok=True)
+        problem = check(folder)
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home
+        problem = str(error)
+    if problem is None:
+        return folder
+    warnings.warn(f"{folder} is not used, so programs are compiled again: {problem}", stacklevel=4)
+    return None
+
+
+def _forget(folder: Path, most: int) -> None:
+    """Remove the files of a folder that were used longest ago."""
+    with os.scandir(folder) as entries:
+        files = [entry for entry in entries if not entry.is_dir(follow_symlinks=False)]
+        found = [(_used(entry.stat(follow_symlinks=False)), entry.name) for entry in files]
+    names = [name for _, name in sorted(found) if TEMPORARY not in name]
+    for name in names[:-most]:
+        (folder / name).unlink(missing_ok=True)
+
+
+def _used(found: os.stat_result) -> float:
+    """Return when a file was used; where reading changes no time, when it was written."""
+    return max(found.st_atime, found.st_mtime)
 
 
 def _refused(path: Path, problem: str) -> None:
@@ -110,14 +136,32 @@ def _refused(path: Path, problem: str) -> None:
 
 def _file_problem(found: os.stat_result) -> str | None:
     """Return the reason not to trust a file of native code; None if it is trusted."""
+    if (problem := _origin_problem(found)) is not None:
+        return problem
+    if found.st_mode & _OTHERS:
+        return f"others may use it (mode {stat.S_IMODE(found.st_mode):o}, not 600)"
+    return None
+
+
+def _origin_problem(found: os.stat_result) -> str | None:
+    """Return the reason to think that another user wrote a file; None if there is none."""
     if not stat.S_ISREG(found.st_mode):
         return "it is not a regular file"
     if found.st_uid != os.getuid():
         return f"it belongs to user {found.st_uid}, not to {os.getuid()}"
-    if found.st_mode & _OTHERS:
-        return f"others may use it (mode {stat.S_IMODE(found.st_mode):o}, not 600)"
     if found.st_nlink != 1:
         return f"it has {found.st_nlink} names"
+    return None
+
+
+def _foreign(folder: Path) -> str | None:
+    """Return the first file below a folder that another user may have written, and why."""
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):  # another process removed it
+            found = path.lstat()
+            own_folder = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+            if not own_folder and (problem := _origin_problem(found)) is not None:
+                return f"{problem}: {path}. Remove it."
     return None
 
 

@@ -1,9 +1,17 @@
 """Joining the processes of a run, and running alone."""
 
+import socket
+import warnings
+
 import jax
 import pytest
 
 from egosim_jax.train import distributed
+
+
+def resolve_hostname(monkeypatch, address):
+    found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 0))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
 
 
 @pytest.fixture
@@ -20,7 +28,10 @@ def initialized(monkeypatch):
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
     monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
-    return calls
+    resolve_hostname(monkeypatch, "127.0.0.1")
+    before = jax.config.values["jax_cpu_collectives_implementation"]
+    yield calls
+    jax.config.update("jax_cpu_collectives_implementation", before)
 
 
 def test_a_process_on_its_own_listens_on_loopback_and_may_be_suspended(initialized):
@@ -30,6 +41,7 @@ def test_a_process_on_its_own_listens_on_loopback_and_may_be_suspended(initializ
     assert options["coordinator_bind_address"] == address[0]
     assert address[0].startswith("127.0.0.1:")
     assert options["heartbeat_timeout_seconds"] > 3600
+    assert jax.config.values["jax_cpu_collectives_implementation"] is None  # nor does gloo listen
 
 
 @pytest.mark.parametrize(
@@ -43,3 +55,19 @@ def test_several_processes_listen_where_their_address_says(initialized, monkeypa
     ((_, options),) = initialized
     assert (options["coordinator_bind_address"] == f"{host}:1234") == bound
     assert "heartbeat_timeout_seconds" not in options
+    assert jax.config.values["jax_cpu_collectives_implementation"] == "gloo"
+
+
+@pytest.mark.parametrize(
+    ("address", "index", "warned"),
+    [("127.0.1.1", "0", False), ("192.0.2.7", "0", True), ("192.0.2.7", "1", False)],
+)
+def test_gloo_beyond_the_loopback_is_said_once(initialized, monkeypatch, address, index, warned):
+    resolve_hostname(monkeypatch, address)
+    for name, value in zip(distributed.NAMES, ("127.0.0.1:1234", "2", index), strict=True):
+        monkeypatch.setenv(name, value)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with distributed.distributed_context():
+            pass
+    assert [address in str(warning.message) for warning in said] == [True] * warned

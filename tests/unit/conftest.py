@@ -1,7 +1,9 @@
-"""Tiny clips on disk, in the layout of EgoSim's metadata."""
+"""Tiny clips on disk, in the layout of EgoSim's metadata, and a version of cuDNN."""
 
 from functools import partial
+from importlib import import_module
 
+import jax
 import pytest
 
 from egosim_jax import testing
@@ -17,3 +19,16 @@ def make_clips(tmp_path):
 def clips(make_clips):
     """Metadata of two clips of 9 frames, 48x32."""
     return make_clips()
+
+
+@pytest.fixture
+def cudnn_version(monkeypatch):
+    """Let programs with jax's cuDNN attention be traced where cuDNN is not installed.
+
+    jax asks for its version while it traces, and has no public way to name one.
+    """
+    try:
+        module = import_module("jax._src.cudnn.fused_attention_stablehlo")
+        monkeypatch.setattr(module, "check_cudnn_version", lambda: 91000)
+    except (ImportError, AttributeError) as error:
+        pytest.fail(f"jax {jax.__version__} changed: {error}, which tests/unit/conftest.py uses.")

@@ -1,7 +1,9 @@
 """Connections of clients, bounded in number and in the time that one may take for a request.
 
-uvicorn reads a request however slowly it comes. Here a connection that has no request under way is
-closed after `HEAD_S`, and one above the limit is refused before anything of it is read.
+uvicorn reads a request however slowly it comes, and has no option against it. Here a connection
+that has no request under way is closed after `HEAD_S`, and one above the limit is refused before
+anything of it is read. This is the only module that knows the inside of uvicorn: it subclasses
+`H11Protocol`, whose names `tests/unit/interactive/server/test_connections.py` checks.
 """
 
 from __future__ import annotations

@@ -235,42 +235,77 @@ def test_an_empty_or_relative_cache_home_is_not_the_working_folder(tmp_path, mon
 
 
 JAX = """
-import sys
 import jax, jax.numpy as jnp
-from egosim_jax.io.executables import share_with_jax
+from egosim_jax.io import executables
+
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-share_with_jax()
+executables.JAX_MAX_FILES = {most}
+executables.share_with_jax()
 print(float(jax.jit(lambda x: jnp.sort(jnp.sin(x) @ jnp.cos(x)).sum())(jnp.eye(8))))
+print(events.count("/jax/compilation_cache/cache_hits"))
 """
 
 
-def test_jaxs_own_cache_follows_the_same_policy(tmp_path):
-    def run() -> tuple[str, str]:
+@pytest.fixture
+def with_jax(tmp_path):
+    """Run a program that shares the cache with jax; its folder, result, hits and warnings."""
+
+    def run(most: int = 1024) -> tuple[Path, float, int, str]:
         environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION")}
         environment["XDG_CACHE_HOME"] = str(tmp_path)
         done = subprocess.run(
-            [sys.executable, "-c", JAX], env=environment, capture_output=True, text=True
+            [sys.executable, "-c", JAX.format(most=most)],
+            env=environment,
+            capture_output=True,
+            text=True,
         )
         assert done.returncode == 0, done.stderr
-        return done.stdout, done.stderr
+        value, hits = done.stdout.split()
+        return tmp_path / "egosim_jax" / "jax", float(value), int(hits), done.stderr
 
-    folder = tmp_path / "egosim_jax" / "jax"
-    want, stderr = run()
-    assert not stderr
-    files = {path: path.read_bytes() for path in folder.iterdir()}
-    assert files
-    assert all(path.stat().st_mode & 0o777 == 0o600 for path in files)
-    assert run() == (want, "")
-    for path, data in files.items():
-        path.write_bytes(data[:-40] + bytes([data[-40] ^ 1]) + data[-39:])
-    got, stderr = run()
-    assert got == want
-    assert "damaged" in stderr
-    assert run() == (want, "")
-    folder.chmod(0o777)
-    got, stderr = run()
-    assert got == want
-    assert "others may use it" in stderr
+    return run
+
+
+def test_jaxs_own_cache_is_private_and_bounded(with_jax):
+    folder, want, hits, stderr = with_jax()
+    assert (hits, stderr) == (0, "")
+    assert folder.stat().st_mode & 0o777 == 0o700
+    files = set(folder.iterdir())
+    assert with_jax() == (folder, want, len(files), "")
+    oldest = min(files, key=lambda path: path.name)
+    os.utime(oldest, (1, 1))
+    (folder / "of_xla").mkdir()  # XLA's caches for GPUs are folders in it
+    assert with_jax(most=len(files) - 1) == (folder, want, len(files) - 1, "")
+
+
+def test_jax_compiles_again_what_was_cut_off(with_jax):
+    folder, want, *_ = with_jax()
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:-40])
+    _, got, hits, stderr = with_jax()
+    assert (got, hits) == (want, 0)
+    assert "Error reading persistent compilation cache entry" in stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda folder: folder.chmod(0o777), "others may use it"),
+        (lambda folder: os.chown(next(folder.iterdir()), 12345, -1), "belongs to user 12345"),
+        (lambda folder: os.link(next(folder.iterdir()), folder.parent / "second"), "2 names"),
+        (lambda folder: (folder / "linked").symlink_to("/etc"), "not a regular file"),
+        (lambda folder: ((folder / "a").mkdir(), (folder / "a/b").symlink_to("c")), "a/b. Remove"),
+    ],
+    ids=["mode", "owner", "hard link", "symbolic link", "below"],
+)
+def test_jax_does_not_read_what_others_could_have_written(with_jax, change, why):
+    folder, want, *_ = with_jax()
+    change(folder)
+    _, got, hits, stderr = with_jax()
+    assert (got, hits) == (want, 0)
+    assert why in stderr
 
 
 def test_the_oldest_are_deleted(folder, double, monkeypatch):

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
 from egosim_jax.models import attention as module
 from egosim_jax.models import flash
@@ -131,6 +130,7 @@ def test_each_device_has_its_kernel(platform, kind, dtype, size, kernel, monkeyp
     assert module._best(jnp.zeros((1, 2, 3, size), dtype)) == kernel
 
 
+@pytest.mark.usefixtures("cudnn_version")
 @pytest.mark.parametrize(
     ("queries", "keys", "size", "dtype", "fits"),
     [
@@ -143,20 +143,19 @@ def test_each_device_has_its_kernel(platform, kind, dtype, size, kernel, monkeyp
     ],
 )
 def test_the_hopper_kernel_takes_whole_tiles_and_leaves_the_rest_to_cudnn(
-    queries, keys, size, dtype, fits, monkeypatch
+    queries, keys, size, dtype, fits
 ):
     # Traced, not run.
-    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
     q, k = (jax.ShapeDtypeStruct((1, n, 2, size), dtype) for n in (queries, keys))
     program = str(jax.make_jaxpr(partial(attention, kernel="hopper"))(q, k, k))
     assert ("hopper_attention" in program) is fits
     assert ("dot_product_attention_fwd" in program) is not fits
 
 
+@pytest.mark.usefixtures("cudnn_version")
 @pytest.mark.parametrize("kernel", ["xla", "cudnn", "splash"])
-def test_the_checkpoint_policy_keeps_output_and_log_sum_of_self_attention(kernel, monkeypatch):
-    # The kernel is traced, not run: no GPU is needed but for its version.
-    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
+def test_the_checkpoint_policy_keeps_output_and_log_sum_of_self_attention(kernel):
+    # The kernel is traced, not run.
     video = jax.ShapeDtypeStruct((2, 64, 4, 128), jnp.bfloat16)
     text = jax.ShapeDtypeStruct((2, 32, 4, 128), jnp.bfloat16)
 

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import pytest
 from flax import nnx
-from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
 from egosim_jax.models.attention import attention, keep_attention
 from egosim_jax.models.wan.dit import WanDiT, WanDiTConfig
@@ -21,12 +20,12 @@ def counted(function, *args):
     return count(jax.make_jaxpr(function)(*args))
 
 
+@pytest.mark.usefixtures("cudnn_version")
 @pytest.mark.parametrize(
     ("kernel", "tolerance"), [("xla", 1e-9), ("cudnn", 1e-3), ("hopper", 1e-3), ("splash", 3e-3)]
 )
-def test_a_forward_of_the_14b_is_that_of_the_formula(kernel, tolerance, monkeypatch):
+def test_a_forward_of_the_14b_is_that_of_the_formula(kernel, tolerance):
     """The kernels pad the image's 257 keys, cuDNN's to 264 and splash to 384, and compute those."""
-    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
     config = WanDiTConfig(dtype="bfloat16", attention=kernel)
     graph, params = nnx.split(nnx.eval_shape(lambda: WanDiT(config, rngs=nnx.Rngs(0))))
     given = shape(1, 16, 60, 104, 52), shape(1), shape(1, 512, 4096), shape(1, 257, 1280)
@@ -74,9 +73,9 @@ def test_what_is_computed_again_counts_again():
     assert again > plain
 
 
+@pytest.mark.usefixtures("cudnn_version")
 @pytest.mark.parametrize("kernel", ["cudnn", "splash"])
-def test_a_flash_kernel_computes_the_scores_twice(kernel, monkeypatch):
-    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
+def test_a_flash_kernel_computes_the_scores_twice(kernel):
     q = shape(2, 256, 4, 128, dtype=jnp.bfloat16)
     value = lambda *x: attention(*x, kernel=kernel).astype(jnp.float32).sum()  # noqa: E731
     product = 2 * 2 * 4 * 256 * 256 * 128
@@ -85,10 +84,10 @@ def test_a_flash_kernel_computes_the_scores_twice(kernel, monkeypatch):
     assert counted(jax.grad(value, (0, 1, 2)), q, q, q) == pytest.approx(7 * product, rel=1e-3)
 
 
+@pytest.mark.usefixtures("cudnn_version")
 @pytest.mark.parametrize("kernel", ["cudnn", "hopper", "splash"])
 @pytest.mark.parametrize(("policy", "products"), [(None, 9), (keep_attention, 7)])
-def test_what_a_policy_keeps_is_not_computed_again(kernel, policy, products, monkeypatch):
-    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91000)
+def test_what_a_policy_keeps_is_not_computed_again(kernel, policy, products):
     q = shape(2, 1024, 4, 128, dtype=jnp.bfloat16)
 
     @partial(jax.checkpoint, policy=policy)
