@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from egosim_jax.data.readers.colmap_model import read_model
 from egosim_jax.data.readers.lzfse import unpacked_size
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
-from egosim_jax.io.untrusted import isolated
+from egosim_jax.io.untrusted import hdf5, isolated, parquet
+from egosim_jax.io.untrusted.colmap import read_model
 from egosim_jax.types import InputError
 from tests.fuzz.target import Target
 
@@ -64,7 +64,7 @@ def make_hdf5(folder: Path) -> None:
 def read_hdf5(folder: Path) -> Any:
     """Read the arrays and texts."""
     shapes = {"camera/intrinsic": (3, 3), "transforms/camera": (None, 4, 4)}
-    found = isolated.read_hdf5(folder / "a.h5", shapes, texts=["llm_objects"])
+    found = hdf5.read_hdf5(folder / "a.h5", shapes, texts=["llm_objects"])
     return dict(found.arrays), dict(found.texts)
 
 
@@ -75,7 +75,7 @@ def make_parquet(folder: Path) -> None:
 
 def read_parquet(folder: Path) -> Any:
     """Read its columns."""
-    return isolated.read_parquet(folder / "a.parquet", list(COLUMNS))
+    return parquet.read_parquet(folder / "a.parquet", list(COLUMNS))
 
 
 def make_colmap(folder: Path) -> None:
@@ -97,7 +97,7 @@ def make_colmap(folder: Path) -> None:
 def read_colmap(folder: Path) -> Any:
     """Read both."""
     models = [read_model(folder / name) for name in ("binary", "text")]
-    return [(m.points_m, [i.world_from_camera for i in m.images]) for m in models]
+    return [(m.points, [i.camera_from_world for i in m.images]) for m in models]
 
 
 def make_lzfse(folder: Path) -> None:

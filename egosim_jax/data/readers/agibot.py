@@ -45,7 +45,7 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.segments import probe_long_video, read_segment
-from egosim_jax.io.untrusted.isolated import read_hdf5
+from egosim_jax.io.untrusted.hdf5 import read_hdf5
 from egosim_jax.io.video import VideoInfo, write_frames
 from egosim_jax.types import Cameras, InputError
 

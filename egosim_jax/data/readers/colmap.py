@@ -4,7 +4,7 @@ A folder with a sparse model (itself, or in sparse/0 or sparse/) and the images 
 images in order of their names are the frames of a video, at a rate that the user gives. The
 longest run of registered images is the recording. One camera must have taken all images;
 distorted images are remapped, and so are the pixels that observe points. The unit is arbitrary,
-so that `metric` is False. Conventions: `colmap_model`.
+so that `metric` is False. Conventions: `io/untrusted/colmap.py`.
 """
 
 from __future__ import annotations
@@ -19,20 +19,24 @@ from typing import Annotated, ClassVar
 import numpy as np
 import tyro
 
-from egosim_jax.data.readers import Entry, inside, make_id, natural_order
-from egosim_jax.data.readers.colmap_model import Image, Model, read_model
+from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
     ImageVideo,
     longest_run,
     write_images,
 )
+from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
-from egosim_jax.io.bounded import quote_path
+from egosim_jax.geometry import invert
+from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.images import read_image
+from egosim_jax.io.untrusted.colmap import Camera, Image, Model, read_model
 from egosim_jax.types import InputError
 
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+"""Camera models that are read."""
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
 
@@ -50,6 +54,7 @@ class Colmap:
 
     def find(self) -> Iterator[Entry]:
         """List the one model of the source."""
+        require("pycolmap")
         folder = next(
             (
                 path
@@ -85,7 +90,7 @@ class Colmap:
         if not images:
             raise InputError(
                 f"{quote_path(root)} has none of the model's {len(by_name)} images: their names "
-                "are relative to it. (--images)"
+                "are relative to it, and in text files have no spaces. (--images)"
             )
         cameras = {image.camera_id for image in images}
         if len(cameras) > 1:
@@ -94,7 +99,7 @@ class Colmap:
                 "Reconstruct with a single camera (--ImageReader.single_camera 1)."
             )
         paths = [inside(root, image.name, what="an image of the model") for image in images]
-        lens = model.lenses[cameras.pop()]
+        lens = make_lens(model.cameras[cameras.pop()])
         video = write_images(folder, map(read_image, paths), lens, fps)
         return Recording(
             recording_id=make_id([self.source.resolve().name]),
@@ -103,7 +108,7 @@ class Colmap:
             fps=fps,
             height=video.height,
             width=video.width,
-            world_from_camera=np.stack([image.world_from_camera for image in images]),
+            world_from_camera=invert(np.stack([image.camera_from_world for image in images])),
             intrinsics_px=video.intrinsics_px,
             points=_points(model, images, video),
             provenance={
@@ -127,27 +132,42 @@ def make_rate(fps: float) -> Fraction:
     return Fraction(fps).limit_denominator(1001)
 
 
+def make_lens(camera: Camera) -> Lens:
+    """Return the lens of a camera, with pixel centers at integers."""
+    if camera.model not in CAMERA_MODELS:
+        raise InputError(
+            f"The camera model {quote_text(camera.model)} is not read; {', '.join(CAMERA_MODELS)} "
+            "are. Undistort the images with COLMAP first."
+        )
+    one_focal = camera.model.startswith("SIMPLE") or camera.model == "RADIAL"
+    focal = camera.parameters[:1] if one_focal else ()
+    fx, fy, cx, cy, *k = *focal, *camera.parameters
+    fisheye = camera.model == "OPENCV_FISHEYE"
+    return Lens(
+        model="fisheye" if fisheye else "brown",
+        coefficients=tuple(k) if fisheye else (*k, 0.0, 0.0, 0.0, 0.0, 0.0)[:5],
+        intrinsics_px=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
+        height=camera.height,
+        width=camera.width,
+    )
+
+
 def _points(model: Model, images: list[Image], video: ImageVideo) -> ScenePoints | None:
     """Return the model's points with the pixels that observe them."""
-    if not len(model.point_ids):
+    if not len(model.points):
         return None
-    order = np.argsort(model.point_ids)
-    ids = model.point_ids[order]
     frames, indices, pixels = [], [], []
     for frame, image in enumerate(images):
-        place = np.minimum(np.searchsorted(ids, image.point_ids), len(ids) - 1)
-        seen = ids[place] == image.point_ids
-        moved = image.pixels_px[seen]
-        moved = moved if video.remap is None else video.remap.move(moved)
+        moved = image.pixels_px if video.remap is None else video.remap.move(image.pixels_px)
         good = np.isfinite(moved).all(axis=1)
         pixels.append(moved[good])
-        indices.append(place[seen][good])
+        indices.append(image.observed[good])
         frames.append(np.full(int(good.sum()), frame))
     return ScenePoints(
-        points_m=model.points_m[order].astype(np.float32),
-        colors=model.colors[order],
-        error_px=model.error_px[order].astype(np.float32),
+        points_m=model.points.astype(np.float32),
+        colors=model.colors,
+        error_px=model.error_px.astype(np.float32),
         frames=np.concatenate(frames).astype(np.int32),
-        indices=np.concatenate(indices).astype(np.int32),
+        indices=np.concatenate(indices),
         pixels_px=np.concatenate(pixels).astype(np.float32),
     )

@@ -33,7 +33,7 @@ from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted.isolated import read_hdf5
+from egosim_jax.io.untrusted.hdf5 import read_hdf5
 from egosim_jax.types import Cameras, InputError
 
 _SEGMENTS = ("Knuckle", "IntermediateBase", "IntermediateTip", "Tip")

@@ -34,7 +34,7 @@ from egosim_jax.io.bounded import (
     read_lines,
 )
 from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.untrusted.isolated import read_parquet
+from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import InputError
 

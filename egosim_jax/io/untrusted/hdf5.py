@@ -3,40 +3,83 @@
 An HDF5 file can refer to other files (external and virtual datasets, external and soft links) and
 ask for filters that are loaded as plug-ins, which run code. Only datasets inside the file, behind
 hard links, with the filters that the library itself contains are read, and only if their declared
-size is below a limit.
+sizes are below a limit together: a file of some kilobytes can declare gigabytes of one value. The
+library runs in a child process (`isolated.py`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
+from jaxtyping import Float64
 
 from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
+from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 31
 """Largest file in bytes."""
-MAX_ARRAY_BYTES = 1 << 27
-"""Largest dataset in bytes, unpacked."""
+MAX_BYTES = 1 << 27
+"""Maximum size of the datasets that are read of a file, in bytes, unpacked."""
 MAX_TEXTS = 1000
 """Largest number of texts in an attribute."""
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
 """Filters by number that are read: those that need no plug-in."""
+Shape = tuple[int | None, ...]
+"""Sizes of the axes of an array; None is any size."""
 
 
-class Hdf5:
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Hdf5Contents:
+    """Arrays and texts that were read of an HDF5 file."""
+
+    arrays: Mapping[str, Float64[np.ndarray, ...]]
+    """Arrays of the file by their path in it."""
+    texts: Mapping[str, tuple[str, ...]]
+    """Texts of attributes of the file by name; none of an attribute that is absent."""
+
+
+def read_hdf5(
+    path: Path,
+    arrays: Mapping[str, Shape],
+    *,
+    optional: Mapping[str, Shape] | None = None,
+    texts: Sequence[str] = (),
+) -> Hdf5Contents:
+    """Read arrays of numbers and attributes of text of an HDF5 file.
+
+    `arrays` gives the shapes of those that must exist. Raises `InputError` for what is missing, of
+    another shape, not in the file itself, too large or damaged.
+    """
+    return read_file(_read, path, arrays, optional or {}, texts)
+
+
+def _read(
+    path: Path, arrays: Mapping[str, Shape], optional: Mapping[str, Shape], texts: Sequence[str]
+) -> Hdf5Contents:
+    with _open(path) as file:
+        wanted = {**arrays, **{name: optional[name] for name in optional if file.has(name)}}
+        return Hdf5Contents(
+            arrays={name: file.array(name, shape) for name, shape in wanted.items()},
+            texts={name: file.texts(name) for name in texts},
+        )
+
+
+class _Hdf5:
     """An open HDF5 file."""
 
     def __init__(self, file: Any, name: str):
-        self._file, self.name = file, name
+        self._file, self.name, self._bytes = file, name, 0
 
-    def array(self, path: str, shape: tuple[int | None, ...]) -> np.ndarray:
-        """Return the numbers of a dataset of a shape, in which None is any size, as float64.
+    def array(self, path: str, shape: Shape) -> np.ndarray:
+        """Return the numbers of a dataset of a shape as float64.
 
         Raises `InputError` if it is missing, of another shape or not of numbers, too large, or not
         stored in the file itself.
@@ -49,10 +92,11 @@ class Hdf5:
             raise InputError(f"{self.name}: {path} has shape {have}; expected {wanted}.")
         if dataset.dtype.kind not in "iuf":
             raise InputError(f"{self.name}: {path} holds {dataset.dtype}; expected numbers.")
-        size = math.prod(have) * max(8, dataset.dtype.itemsize)
-        if size > MAX_ARRAY_BYTES:
+        self._bytes += math.prod(have) * max(8, dataset.dtype.itemsize)
+        if self._bytes > MAX_BYTES:
             raise InputError(
-                f"{self.name}: {path} has {size:,} bytes, more than {MAX_ARRAY_BYTES:,}, the most."
+                f"{self.name}: the arrays up to {path} have {self._bytes:,} bytes, more than "
+                f"{MAX_BYTES:,}, the maximum of a file. Split the recording."
             )
         self._check_storage(dataset, path)
         return np.asarray(dataset[()], np.float64)
@@ -99,7 +143,7 @@ class Hdf5:
 
 
 @contextmanager
-def open_hdf5(path: Path) -> Iterator[Hdf5]:
+def _open(path: Path) -> Iterator[_Hdf5]:
     """Open an HDF5 file; what the library raises about damaged contents becomes `InputError`."""
     import h5py
 
@@ -110,7 +154,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5]:
             raise InputError(f"{name} has {size:,} bytes, more than {MAX_FILE_BYTES:,}, the most.")
         try:
             with h5py.File(file, "r") as opened:
-                yield Hdf5(opened, name)
+                yield _Hdf5(opened, name)
         except InputError:
             raise
         except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:

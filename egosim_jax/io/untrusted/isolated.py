@@ -1,180 +1,187 @@
-"""Files of HDF5 and Parquet, read in a child process, of which no crash and no hang reaches us.
+"""Calls of functions in a child process that may crash, hang or run out of memory there.
 
-Their libraries are large, written in C and C++, and damaged files make them loop or abort the
-process. One child (`isolated_child.py`) reads file after file; it is ended after a time limit and
-started again for the next file. What it sends back is JSON and plain numbers, checked here.
+Libraries in C and C++ loop, abort or allocate without end on damaged files. A child runs call after
+call. After a crash or the time limit it is killed, and the next call starts another one.
+
+This is not a pool of `multiprocessing`: only private attributes end a worker that hangs, a worker
+outlives a parent that is killed, and it imports the parent's main module (if that imports OpenCV,
+pycolmap crashes). A pool's first and later calls are no faster.
 """
 
 from __future__ import annotations
 
 import atexit
-import json
 import os
-import selectors
+import pickle
+import resource
+import signal
 import subprocess
 import sys
+import tempfile
 import threading
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any, cast, no_type_check
+from queue import SimpleQueue
+from typing import IO, Any, NoReturn, TypeVar
 
-import numpy as np
-from jaxtyping import Float64
-
-from egosim_jax.io.bounded import quote_path
+from egosim_jax.io.bounded import quote_path, quote_text
+from egosim_jax.runtime.processes import THREADS
 from egosim_jax.types import InputError
 
-Shape = tuple[int | None, ...]
-"""Sizes of the axes of an array; None is any size."""
+T = TypeVar("T")
 TIMEOUT_S = 120.0
 """Time limit for a file in seconds, with the start of the child."""
-MAX_REPLY = 1 << 31
-"""Largest reply in bytes."""
-CHILD = Path(__file__).with_name("isolated_child.py")
+MAX_MEMORY = 1 << 32
+"""Maximum address space of the child that reads files, in bytes."""
+MAX_REPLY = 1 << 30
+"""Maximum size of a result in bytes."""
 
 
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Hdf5Contents:
-    """Arrays and texts that were read of an HDF5 file."""
-
-    arrays: Mapping[str, Float64[np.ndarray, ...]]
-    """Arrays of the file by their path in it."""
-    texts: Mapping[str, tuple[str, ...]]
-    """Texts of attributes of the file by name; none of an attribute that is absent."""
+class ChildError(RuntimeError):
+    """Raised when a child process ends during a call; says how, with its last message."""
 
 
-def read_hdf5(
-    path: Path,
-    arrays: Mapping[str, Shape],
-    *,
-    optional: Mapping[str, Shape] | None = None,
-    texts: Sequence[str] = (),
-) -> Hdf5Contents:
-    """Read arrays of numbers and attributes of text of an HDF5 file (`hdf5.Hdf5`).
+class Child:
+    """A child process that runs functions; the first call starts it."""
 
-    `arrays` gives the shapes of those that must exist. Raises `InputError` for what is missing, of
-    another shape, not in the file itself, too large or damaged.
-    """
-    header, data = _CHILD.ask(
-        path,
-        {
-            "kind": "hdf5",
-            "path": str(path),
-            "arrays": {name: list(shape) for name, shape in arrays.items()},
-            "optional": {name: list(shape) for name, shape in (optional or {}).items()},
-            "texts": list(texts),
-        },
-    )
-    found, start = {}, 0
-    for name, shape in header["arrays"]:
-        count = int(np.prod(shape, dtype=np.int64))
-        found[name] = np.frombuffer(data, np.float64, count=count, offset=start).reshape(shape)
-        start += 8 * count
-    return Hdf5Contents(
-        arrays={name: array.copy() for name, array in found.items()},
-        texts={name: tuple(values) for name, values in header["texts"].items()},
-    )
-
-
-def read_parquet(
-    path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()
-) -> dict[str, list[Any]]:
-    """Read columns of a Parquet file as Python values (`parquet.read_columns`)."""
-    request = {"kind": "parquet", "path": str(path), "columns": list(columns),
-               "optional": list(optional)}  # fmt: skip
-    return _CHILD.ask(path, request)[0]["columns"]
-
-
-class _Child:
-    """The child process, which is started when it is first needed."""
-
-    def __init__(self) -> None:
+    def __init__(self, *, max_memory: int | None = None) -> None:
+        self._max_memory = max_memory
         self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection
+        self._log: IO[bytes]
         self._owner = os.getpid()
         self._lock = threading.Lock()
 
-    def ask(self, path: Path, request: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
-        """Send a request; return the header and the bytes of the reply."""
-        with self._lock:
-            deadline = time.monotonic() + TIMEOUT_S
-            requests, replies = self._pipes()
-            try:
-                requests.write(json.dumps(request).encode() + b"\n")
-                requests.flush()
-                sizes = self._read(replies, 16, deadline)
-                head, body = (int.from_bytes(sizes[i : i + 8], "little") for i in (0, 8))
-                if head + body > MAX_REPLY:
-                    raise OSError(f"the reply has {head + body:,} bytes")
-                data = self._read(replies, head + body, deadline)
-            except TimeoutError:
-                self.stop()
-                raise InputError(
-                    f"{quote_path(path)} could not be read within {TIMEOUT_S:g} s: the library "
-                    "hangs on it. It is damaged; get it again."
-                ) from None
-            except OSError as error:
-                self.stop()
-                raise InputError(
-                    f"{quote_path(path)} made the library that reads it crash. It is damaged; get "
-                    "it again."
-                ) from error
-            except BaseException:  # an interrupt leaves a reply unread
-                self.stop()
-                raise
-        header = json.loads(data[:head])
-        if "error" in header:
-            raise InputError(header["error"])
-        return header, data[head:]
+    def call(self, run: Callable[..., T], *arguments: Any, timeout_s: float) -> T:
+        """Return the result of a function that the child can import.
 
-    def stop(self) -> None:
-        """End the child, if there is one."""
+        Raises `TimeoutError` after the time limit, `ChildError` after a crash, and `InputError` or
+        `MemoryError` if the function does. Its other exceptions end the child.
+        """
+        with self._lock:
+            process = self._start()
+            try:
+                self._connection.send((run, arguments))
+                if self._connection.poll(timeout_s):
+                    # A child that a file took over has the user's rights: pickle adds none.
+                    result = pickle.loads(self._connection.recv_bytes(MAX_REPLY))  # noqa: S301
+                else:
+                    self.close()
+                    result = TimeoutError()
+            except (EOFError, OSError) as error:
+                raise ChildError(self._ending(process)) from error
+            except BaseException:  # Ctrl-C leaves a reply unread
+                self.close()
+                raise
+        if isinstance(result, (InputError, MemoryError, TimeoutError)):
+            raise result
+        return result
+
+    def close(self) -> None:
+        """Kill the child, if there is one, and the processes that it started."""
         process, self._process = self._process, None
         if process is not None:
-            process.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-            for pipe in (process.stdin, process.stdout):
-                with suppress(OSError):
-                    if pipe is not None:
-                        pipe.close()
+            self._connection.close()
+            self._log.close()
 
-    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
-        """Return input and output of the child, which is started unless it runs."""
-        if self._owner != os.getpid():  # after a fork the child is that of another process
+    def _start(self) -> subprocess.Popen[bytes]:
+        """Return the child, which is started unless it runs."""
+        if self._owner != os.getpid():  # after a fork, the child belongs to another process
             self._process, self._owner = None, os.getpid()
-        if self._process is None or self._process.poll() is not None:
-            self.stop()
-            package = str(CHILD.parents[3])
-            paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+        if self._process is not None and self._process.poll() is None:
+            return self._process
+        self.close()
+        paths = [str(Path(__file__).parents[3]), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+        if self._max_memory is not None:
+            environment[THREADS] = "1"  # stacks of more threads would count as memory
+        self._connection, other = Pipe()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115
+        with other:
+            program = f"from {__name__} import serve; serve({other.fileno()}, {self._max_memory})"
             self._process = subprocess.Popen(  # noqa: S603
-                [sys.executable, "-P", str(CHILD)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+                [sys.executable, "-P", "-c", program],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._log,
+                pass_fds=[other.fileno()],
+                start_new_session=True,
+                env=environment,
             )
-        pipes = self._process.stdin, self._process.stdout
-        return cast(tuple[IO[bytes], IO[bytes]], pipes)
+        return self._process
 
-    @staticmethod
-    def _read(replies: IO[bytes], count: int, deadline: float) -> bytes:
-        """Read so many bytes before the deadline. Raises `OSError` if the child ends before."""
-        parts, left, descriptor = list[bytes](), count, replies.fileno()
-        with selectors.DefaultSelector() as selector:
-            selector.register(descriptor, selectors.EVENT_READ)
-            while left:
-                if not selector.select(max(0.0, deadline - time.monotonic())):
-                    raise TimeoutError
-                part = os.read(descriptor, min(left, 1 << 20))
-                if not part:
-                    raise OSError("the child ended")
-                parts.append(part)
-                left -= len(part)
-        return b"".join(parts)
+    def _ending(self, process: subprocess.Popen[bytes]) -> str:
+        """Close the child; return how it ended and the last message that it printed."""
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(1.0)  # a connection closes a moment before its process ends
+        self._log.seek(max(0, self._log.seek(0, os.SEEK_END) - 20_000))
+        lines = self._log.read().decode("utf-8", "replace").splitlines()
+        # Lines that begin with @ are a stack of glog's.
+        lines = [line.strip() for line in lines if line.strip() and not line.startswith("    @")]
+        self.close()
+        code = process.returncode
+        how = f"failed with exit code {code}" if code >= 0 else f"was ended by signal {-code}"
+        with suppress(ValueError):
+            how = f"was ended by {signal.Signals(-code).name}"
+        return f"{how}: {lines[-1][:300] if lines else 'no message'}"
 
 
-_CHILD = _Child()
-atexit.register(_CHILD.stop)
+def read_file(read: Callable[..., T], path: Path, *arguments: Any) -> T:
+    """Return the result of a function that reads an untrusted file, called in a child process.
+
+    Raises `InputError` if it crashes, hangs or takes more than `MAX_MEMORY`.
+    """
+    name = quote_path(path)
+    try:
+        return _READER.call(read, path, *arguments, timeout_s=TIMEOUT_S)
+    except TimeoutError:
+        raise InputError(
+            f"{name} could not be read within {TIMEOUT_S:g} s: the library hangs on it. It is "
+            "damaged; get it again."
+        ) from None
+    except MemoryError:
+        _READER.close()
+        raise InputError(
+            f"{name} needs more memory than {MAX_MEMORY:,} bytes, the maximum: it is damaged or "
+            "too large. Get it again, or split it."
+        ) from None
+    except ChildError as error:
+        raise InputError(
+            f"{name} made the library that reads it crash, which {quote_text(str(error))}. It is "
+            "damaged; get it again."
+        ) from error
+
+
+def serve(descriptor: int, max_memory: int | None) -> NoReturn:
+    """Run the calls of the parent and return their results; this runs in the child."""
+    if max_memory is not None:
+        resource.setrlimit(resource.RLIMIT_AS, (max_memory, max_memory))
+    connection, calls = Connection(descriptor), SimpleQueue[bytes]()
+    threading.Thread(target=_receive, args=(connection, calls), daemon=True).start()
+    while True:
+        run, arguments = pickle.loads(calls.get())  # noqa: S301
+        try:
+            reply = pickle.dumps(run(*arguments))
+        except InputError as error:
+            reply = pickle.dumps(error)
+        except MemoryError:
+            reply = pickle.dumps(MemoryError())
+        connection.send_bytes(reply)
+
+
+def _receive(connection: Connection, calls: SimpleQueue[bytes]) -> None:
+    """Queue calls; end the child as soon as the parent ends, even during a call."""
+    with suppress(EOFError, OSError):
+        while True:
+            calls.put(connection.recv_bytes())
+    os._exit(1)
+
+
+_READER = Child(max_memory=MAX_MEMORY)
+atexit.register(_READER.close)

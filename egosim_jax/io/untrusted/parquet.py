@@ -1,4 +1,4 @@
-"""Columns of Parquet files, with sizes checked before they are read."""
+"""Columns of Parquet files, with sizes checked before they are read in a child process."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.bounded import open_regular, quote_path, quote_text
+from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 32
 """Largest file in bytes."""
 MAX_COLUMN_BYTES = 1 << 26
 """Largest size of the columns that are read, in bytes, unpacked."""
-MAX_ROWS = 1 << 24
-"""Largest number of rows."""
+MAX_VALUES = 1 << 23
+"""Maximum number of values of the columns that are read, each 32 bytes or more in Python."""
 
 
-def read_columns(
+def read_parquet(
     path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()
 ) -> dict[str, list[Any]]:
     """Return the values of columns, as Python values, by name; only these columns are read.
@@ -25,6 +26,10 @@ def read_columns(
     Raises `InputError` if a column that is not optional is missing, or if the file is damaged or
     declares more than is read.
     """
+    return read_file(_read, path, columns, optional)
+
+
+def _read(path: Path, columns: Sequence[str], optional: Sequence[str]) -> dict[str, list[Any]]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -46,7 +51,7 @@ def read_columns(
             table = opened.read(columns=wanted, use_threads=False)
             return {column: table.column(column).to_pylist() for column in wanted}
         except (pa.ArrowException, OSError, ValueError) as error:
-            if isinstance(error, InputError):
+            if isinstance(error, (InputError, MemoryError)):
                 raise
             raise InputError(
                 f"{name} is not a readable Parquet file: {quote_text(str(error))}."
@@ -54,16 +59,17 @@ def read_columns(
 
 
 def _check_sizes(metadata: Any, wanted: Sequence[str], name: str) -> None:
-    size = 0
+    size = values = 0
     for number in range(metadata.num_row_groups):
         group = metadata.row_group(number)
         for index in range(group.num_columns):
             chunk = group.column(index)
-            path = chunk.path_in_schema  # of a list column, `name.list.element`
-            if any(path == column or path.startswith(f"{column}.") for column in wanted):
+            # The values of a list column are at `column.list.element`.
+            if any(f"{chunk.path_in_schema}.".startswith(f"{column}.") for column in wanted):
                 size += max(0, chunk.total_uncompressed_size)
-    if metadata.num_rows > MAX_ROWS or size > MAX_COLUMN_BYTES:
+                values += max(0, chunk.num_values)
+    if values > MAX_VALUES or size > MAX_COLUMN_BYTES:
         raise InputError(
-            f"{name} declares {metadata.num_rows:,} rows and {size:,} bytes to read: at most "
-            f"{MAX_ROWS:,} rows and {MAX_COLUMN_BYTES:,} bytes are read."
+            f"{name} declares {values:,} values and {size:,} bytes to read: at most "
+            f"{MAX_VALUES:,} values and {MAX_COLUMN_BYTES:,} bytes are read. Split the file."
         )

@@ -1,39 +1,30 @@
-"""Structure from motion in child processes: COLMAP by pycolmap, of which no crash reaches us.
+"""Structure from motion by pycolmap in a child process.
 
 pycolmap and OpenCV crash in one process. So the images are written to a temporary folder here,
-each step runs in a process that never imports OpenCV (`colmap_child.py`), with a time limit, and
-its result is an npz file. COLMAP has the center of the first pixel at (0.5, 0.5); what is read
-back has it at (0, 0), and pixels of the size that the video was given in.
+and each step runs in a child with a time limit (`io/untrusted/isolated.py`). The child
+imports this module, which therefore must not import OpenCV by itself.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.untrusted.colmap import Model, to_arrays
+from egosim_jax.io.untrusted.isolated import Child, ChildError
 from egosim_jax.perception.cameras.flow import Background
 from egosim_jax.perception.cameras.gate import Reconstruction
 from egosim_jax.types import InputError, check_counts, check_seed
 
-CHILD = Path(__file__).with_name("colmap_child.py")
+T = TypeVar("T")
 Mapper = Literal["incremental", "global"]
-_RESULT = {
-    "frames": "int32", "camera_from_world": "float64", "camera": "float64", "points": "float64",
-    "error_px": "float64", "observations": "float64",
-}  # fmt: skip
 
 
 class ColmapError(RuntimeError):
@@ -91,74 +82,65 @@ class Scene:
     folder: Path
     frames: tuple[int, ...]
     reduction: float
-    height: int
-    width: int
     config: ColmapConfig
+    child: Child
+
+    def match(self) -> None:
+        """Extract and match features. Raises `ColmapError` if the child process fails."""
+        self._run("features", match_features)
 
     def reconstruct(self, mapper: Mapper, *, focal_px: float | None = None) -> Reconstruction:
         """Return cameras and points; self-calibrated if no focal length is given.
 
         Raises `ColmapError` if the child process fails.
         """
-        job = self._job(mapper)
-        job["focal_px"] = None if focal_px is None else focal_px / self.reduction
-        result = self.folder / f"result_{mapper}_{focal_px is not None}.npz"
-        _run(job | {"result": str(result)}, self.config)
-        try:
-            return self._read(read_arrays(result, _RESULT))
-        except InputError as error:
-            raise ColmapError(f"COLMAP's result cannot be read: {error}") from error
-
-    def match(self) -> None:
-        """Extract and match features. Raises `ColmapError` if the child process fails."""
-        _run(self._job("features"), self.config)
-
-    def _job(self, step: str) -> dict[str, Any]:
-        names = ("features", "peak_threshold", "overlap", "init_angle_deg", "init_inliers",
-                 "threads", "seed")  # fmt: skip
-        (output := self.folder / f"model_{step}").mkdir(exist_ok=True)
-        return {
-            "step": step,
-            "database": str(self.folder / "database.db"),
-            "images": str(self.folder / "images"),
-            "masks": str(self.folder / "masks"),
-            "output": str(output),
-            "focal_factor": self.config.focal_guess,
-            **{name: getattr(self.config, name) for name in names},
-        }
-
-    def _read(self, arrays: dict[str, np.ndarray]) -> Reconstruction:
-        """Return a result with frames of the video, and its pixels: centers at integers."""
-        focal, _, _, radial = arrays["camera"]
-        seen = arrays["observations"]
-        numbers = arrays["frames"]
+        focal = None if focal_px is None else focal_px / self.reduction
+        model = self._run(mapper, reconstruct, mapper, focal)
+        images, camera = model.images, next(iter(model.cameras.values()), None)
+        focal, _, _, radial = camera.parameters if camera else (0.0,) * 4
+        pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels_px for image in images)])
         return Reconstruction(
-            frames=np.asarray(self.frames, np.int32)[numbers],
-            camera_from_world=arrays["camera_from_world"],
-            focal_px=float(focal) * self.reduction,
-            radial=float(radial),
-            points=arrays["points"],
-            error_px=arrays["error_px"] * self.reduction,
-            observed_in=np.searchsorted(numbers, seen[:, 0]).astype(np.int32),
-            observed=seen[:, 1].astype(np.int32),
-            pixels_px=seen[:, 2:] * self.reduction - 0.5,
+            frames=np.array([self.frames[int(Path(i.name).stem)] for i in images], np.int32),
+            camera_from_world=np.array([i.camera_from_world[:3] for i in images]).reshape(-1, 3, 4),
+            focal_px=focal * self.reduction,
+            radial=radial,
+            points=model.points,
+            error_px=model.error_px * self.reduction,
+            observed_in=np.repeat(
+                np.arange(len(images), dtype=np.int32), [len(i.observed) for i in images]
+            ),
+            observed=np.concatenate([np.zeros(0, np.int32), *(i.observed for i in images)]),
+            pixels_px=(pixels + 0.5) * self.reduction - 0.5,
         )
+
+    def _run(self, name: str, step: Callable[..., T], *arguments: Any) -> T:
+        """Return the result of a step in the child process."""
+        limit = self.config.timeout_s
+        try:
+            return self.child.call(step, self.folder, self.config, *arguments, timeout_s=limit)
+        except TimeoutError:
+            raise ColmapError(
+                f"COLMAP's step {name} took longer than {limit:g} s and was ended. Give it more "
+                "time, or a shorter or smaller video. (timeout_s)"
+            ) from None
+        except MemoryError:
+            raise ColmapError(f"COLMAP's step {name} ran out of memory.") from None
+        except ChildError as error:
+            raise ColmapError(f"COLMAP's step {name} {error}") from error
 
 
 @contextmanager
 def open_scene(
-    video: Background,
-    frames: tuple[int, ...],
-    *,
-    height: int,
-    width: int,
-    config: ColmapConfig,
+    video: Background, frames: tuple[int, ...], *, config: ColmapConfig
 ) -> Iterator[Scene]:
     """Write some frames of a video to a temporary folder, which is removed at the end."""
     import cv2
 
     require_pycolmap()
-    with tempfile.TemporaryDirectory(prefix="egosim_cameras_") as name:
+    with (
+        tempfile.TemporaryDirectory(prefix="egosim_cameras_") as name,
+        closing(Child()) as child,
+    ):
         folder = Path(name)
         for part in ("images", "masks"):
             (folder / part).mkdir()
@@ -167,50 +149,78 @@ def open_scene(
             done = cv2.imwrite(str(folder / image), video.gray[frame])
             if not (done and cv2.imwrite(str(folder / mask), video.still[frame])):
                 raise OSError(f"The image {folder / image} could not be written.")
-        yield Scene(folder, frames, video.reduction, height, width, config)
+        yield Scene(folder, frames, video.reduction, config, child)
 
 
-def _run(job: dict[str, Any], config: ColmapConfig) -> None:
-    """Run a step in a child process and its process group; end all of it after the time limit."""
-    path = Path(job["output"]).with_suffix(".json")
-    path.write_text(json.dumps(job))
-    log = path.with_suffix(".log")
-    with log.open("wb") as errors:
-        child = subprocess.Popen(  # noqa: S603
-            [sys.executable, "-P", str(CHILD), str(path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-            start_new_session=True,
+def match_features(folder: Path, config: ColmapConfig) -> None:
+    """Extract SIFT features of all images and match those that are near in time.
+
+    This runs in the child.
+    """
+    pycolmap = _pycolmap(config)
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", mask_path=folder / "masks")
+    reader.default_focal_length_factor = config.focal_guess
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=config.threads, use_gpu=False)
+    extraction.sift.max_num_features = config.features
+    extraction.sift.peak_threshold = config.peak_threshold
+    pycolmap.extract_features(
+        folder / "database.db", folder / "images", camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+    matching = pycolmap.FeatureMatchingOptions(num_threads=config.threads, use_gpu=False)
+    pairing = pycolmap.SequentialPairingOptions(overlap=config.overlap, num_threads=config.threads)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
+    pycolmap.match_sequential(
+        folder / "database.db", matching_options=matching, pairing_options=pairing,
+        verification_options=verification, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+
+
+def reconstruct(
+    folder: Path, config: ColmapConfig, mapper: Mapper, focal_px: float | None
+) -> Model:
+    """Return the reconstruction that registers most images, an empty one if there is none.
+
+    This runs in the child.
+    """
+    pycolmap = _pycolmap(config)
+    database, output = folder / "database.db", folder / f"model_{mapper}"
+    output.mkdir(exist_ok=True)
+    if focal_px is not None:
+        _set_focal(pycolmap, database, focal_px)
+    if mapper == "incremental":
+        options = pycolmap.IncrementalPipelineOptions(
+            num_threads=config.threads, random_seed=config.seed, extract_colors=False,
+            ba_refine_focal_length=focal_px is None,
+        )  # fmt: skip
+        options.mapper.init_min_tri_angle = config.init_angle_deg
+        options.mapper.init_min_num_inliers = config.init_inliers
+        options.mapper.abs_pose_refine_focal_length = focal_px is None
+        run = pycolmap.incremental_mapping
+    else:
+        options = pycolmap.GlobalPipelineOptions(
+            num_threads=config.threads, random_seed=config.seed
         )
-    try:
-        code = child.wait(timeout=config.timeout_s)
-    except subprocess.TimeoutExpired:
-        raise ColmapError(
-            f"COLMAP's step {job['step']} took longer than {config.timeout_s:g} s and was ended. "
-            "Give it more time, or a shorter or smaller video. (timeout_s)"
-        ) from None
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait()
-        if child.stdin is not None:
-            child.stdin.close()
-    if code:
-        raise ColmapError(f"COLMAP's step {job['step']} {_ending(code)}: {_last_line(log)}")
+        options.mapper.bundle_adjustment.refine_focal_length = focal_px is None
+        run = pycolmap.global_mapping
+    models = run(database, folder / "images", output, options=options)
+    empty = pycolmap.Reconstruction()
+    return to_arrays(max(models.values(), key=lambda m: m.num_reg_images(), default=empty))
 
 
-def _ending(code: int) -> str:
-    """Return how a process ended, in words."""
-    if code > 0:
-        return f"failed with exit code {code}"
-    with suppress(ValueError):
-        return f"was ended by {signal.Signals(-code).name}"
-    return f"was ended by signal {-code}"
+def _pycolmap(config: ColmapConfig) -> Any:
+    """Return pycolmap with the seed of the config; it logs warnings."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
+    pycolmap.set_random_seed(config.seed)
+    return pycolmap
 
 
-def _last_line(log: Path) -> str:
-    """Return the last line of a log that says something, of at most 300 characters."""
-    lines = log.read_bytes()[-20_000:].decode("utf-8", "replace").splitlines()
-    lines = [line.strip() for line in lines if line.strip() and not line.startswith("    @")]
-    return lines[-1][:300] if lines else "no message"
+def _set_focal(pycolmap: Any, database: Path, focal_px: float) -> None:
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            camera.params = [focal_px, *list(camera.params)[1:3], 0.0]
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)

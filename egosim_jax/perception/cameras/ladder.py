@@ -183,9 +183,8 @@ class _Climb:
     @cached_property
     def scene(self) -> Scene:
         """Images with matched features; raises `ColmapError`."""
-        size = {"height": self.frames.shape[1], "width": self.frames.shape[2]}
         scene = self.stack.enter_context(
-            open_scene(self.video, self._images(), config=self.config.colmap, **size)
+            open_scene(self.video, self._images(), config=self.config.colmap)
         )
         scene.match()
         return scene

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egosim_jax.data.readers.colmap import Colmap
-from egosim_jax.data.readers.colmap_model import read_model
+from egosim_jax.data.readers.colmap import Colmap, make_lens
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.io.untrusted.colmap import read_model
 from egosim_jax.types import InputError
 from tests.captures import quaternions
 
@@ -133,11 +133,22 @@ def test_several_cameras_and_unknown_models_are_refused(world, tmp_path, importe
     assert "FOV is not read" in imported(Colmap(source=tmp_path / "fov", fps=10.0))[1]["fov"]
 
 
+def test_lines_of_windows_and_an_image_without_keypoints_are_read(world, tmp_path, imported):
+    folder = write_model(tmp_path / "room", world, binary=False)
+    lines = (folder / "images.txt").read_text().splitlines()[:-1]
+    (folder / "images.txt").write_text("\n".join(lines), newline="\r\n")
+    for name in ("cameras.txt", "points3D.txt"):
+        (folder / name).write_text((folder / name).read_text(), newline="\r\n")
+    recording = imported(Colmap(source=tmp_path / "room", fps=10.0))[0]["room"]
+    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
+    assert len(recording.points.frames) == (world.frames - 1) * len(POINTS)
+
+
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_a_truncated_file_or_a_false_count_is_refused(world, tmp_path, name):
     folder = write_model(tmp_path / "room", world, binary=True)
     data = (folder / name).read_bytes()
-    for damaged in (data[: len(data) // 2], b"", struct.pack("<Q", 1 << 60) + data[8:]):
+    for damaged in (data[: len(data) // 2], data[:-1], b"", struct.pack("<Q", 1 << 60) + data[8:]):
         (folder / name).write_bytes(damaged)
         with pytest.raises(InputError, match="is damaged"):
             read_model(folder)
@@ -190,9 +201,10 @@ def test_models_of_colmap_itself_are_read_as_it_reads_them(tmp_path):
         model = read_model(folder)
         assert {image.name for image in model.images} == images.keys()
         for image in model.images:
-            np.testing.assert_allclose(image.world_from_camera[:3], images[image.name], atol=1e-9)
-        found = np.column_stack([model.points_m, model.error_px])
-        expected = [points[str(number)] for number in model.point_ids.tolist()]
+            pose = invert(image.camera_from_world)[:3]
+            np.testing.assert_allclose(pose, images[image.name], atol=1e-9)
+        found = np.column_stack([model.points, model.error_px])
+        expected = [points[number] for number in sorted(points, key=int)]
         np.testing.assert_allclose(found, expected, atol=1e-9)
-        pixels = model.lenses[1].project(np.array([[*ray, 1.0] for ray in rays]))
+        pixels = make_lens(model.cameras[1]).project(np.array([[*ray, 1.0] for ray in rays]))
         np.testing.assert_allclose(pixels + 0.5, seen, atol=1e-9)

@@ -14,7 +14,7 @@ from egosim_jax.cli.export import Export
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.interactive.server import dataset_export
 from egosim_jax.interactive.server.store import Limits, Store
-from egosim_jax.io.untrusted.parquet import read_columns
+from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import WAN_GRID, InputError
 from tests.painted import VIDEO, painted
@@ -68,7 +68,7 @@ def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
     per_clip = VIDEO.frames - 1
     assert (info["total_episodes"], info["total_frames"]) == (2, len(frames))
     tables = [
-        read_columns(path, ["action", "observation.images.ego", "index"])
+        read_parquet(path, ["action", "observation.images.ego", "index"])
         for path in sorted((tmp_path / "set" / "data").rglob("*.parquet"))
     ]
     assert [len(table["index"]) for table in tables] == [2 * per_clip + 1, per_clip + 1]

@@ -2,7 +2,10 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -11,7 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from egosim_jax.io.untrusted import isolated
-from egosim_jax.io.untrusted.isolated import read_hdf5, read_parquet
+from egosim_jax.io.untrusted.hdf5 import read_hdf5
+from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.types import InputError
 
 
@@ -44,16 +48,16 @@ def test_columns_come_back_as_they_are(tmp_path):
 def test_an_error_names_the_file_and_the_child_lives_on(path):
     with pytest.raises(InputError, match=r"a\.h5: x has shape"):
         read_hdf5(path, {"x": (4, 4)})
-    process = isolated._CHILD._process
+    process = isolated._READER._process
     read_hdf5(path, {"y": (1,)})
-    assert isolated._CHILD._process is process
+    assert isolated._READER._process is process
 
 
 def test_a_crash_is_reported_and_the_next_file_is_read(path):
     read_hdf5(path, {"y": (1,)})
-    os.kill(isolated._CHILD._process.pid, signal.SIGSTOP)
-    os.kill(isolated._CHILD._process.pid, signal.SIGKILL)
-    isolated._CHILD._process.poll = lambda: None  # as if it ended while it reads
+    os.kill(isolated._READER._process.pid, signal.SIGSTOP)
+    os.kill(isolated._READER._process.pid, signal.SIGKILL)
+    isolated._READER._process.poll = lambda: None  # as if it ended while it reads
     with pytest.raises(InputError, match="crash"):
         read_hdf5(path, {"y": (1,)})
     assert read_hdf5(path, {"y": (1,)}).arrays["y"].tolist() == [0.5]
@@ -61,7 +65,7 @@ def test_a_crash_is_reported_and_the_next_file_is_read(path):
 
 def test_a_hang_is_ended_after_the_time_limit(path, monkeypatch):
     read_hdf5(path, {"y": (1,)})
-    os.kill(isolated._CHILD._process.pid, signal.SIGSTOP)
+    os.kill(isolated._READER._process.pid, signal.SIGSTOP)
     monkeypatch.setattr(isolated, "TIMEOUT_S", 0.2)
     then = time.monotonic()
     with pytest.raises(InputError, match="hangs on it"):
@@ -69,3 +73,47 @@ def test_a_hang_is_ended_after_the_time_limit(path, monkeypatch):
     assert time.monotonic() - then < 5
     monkeypatch.undo()
     assert read_hdf5(path, {"y": (1,)}).arrays["y"].tolist() == [0.5]
+
+
+def test_many_arrays_of_one_value_are_refused_before_they_are_read(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in "xyz":
+            file.create_dataset(name, (1 << 19, 4, 4), "f4", chunks=(1 << 12, 4, 4), fillvalue=1)
+    assert (tmp_path / "a.h5").stat().st_size < 20_000
+    shape = (None, 4, 4)
+    with pytest.raises(InputError, match="up to z have 201,326,592 bytes, more than 134,217,728"):
+        read_hdf5(tmp_path / "a.h5", {"x": shape, "y": shape}, optional={"z": shape})
+
+
+def test_many_equal_rows_are_refused_before_they_are_read(tmp_path):
+    pq.write_table(pa.table({"a": np.full((1 << 23) + 1, 7)}), tmp_path / "a.parquet")
+    assert (tmp_path / "a.parquet").stat().st_size < 50_000
+    with pytest.raises(InputError, match="declares 8,388,609 values"):
+        read_parquet(tmp_path / "a.parquet", ["a"])
+
+
+def test_a_text_that_fills_the_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(isolated, "_READER", isolated.Child(max_memory=1 << 31))
+    rows = pa.DictionaryArray.from_arrays(np.zeros(1 << 20, np.int32), ["x" * (1 << 20)])
+    pq.write_table(pa.table({"a": rows, "b": np.arange(1 << 20)}), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match=r"a\.parquet needs more memory"):
+        read_parquet(tmp_path / "a.parquet", ["a"])
+    assert len(read_parquet(tmp_path / "a.parquet", ["b"])["b"]) == 1 << 20
+    isolated._READER.close()
+
+
+def test_a_child_ends_with_a_parent_that_is_killed():
+    program = (
+        "import os, time\n"
+        "from egosim_jax.io.untrusted.isolated import Child\n"
+        "child = Child()\n"
+        "print(child.call(os.getpid, timeout_s=60.0), flush=True)\n"
+        "child.call(time.sleep, 600, timeout_s=600.0)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as parent:
+        status = Path(f"/proc/{int(parent.stdout.readline())}/status")
+        parent.kill()
+    until = time.monotonic() + 20
+    while status.exists() and "State:\tZ" not in status.read_text():
+        assert time.monotonic() < until
+        time.sleep(0.05)

@@ -1,55 +1,51 @@
 """Child processes that crash, hang or are missing."""
 
-import os
 import sys
 import tempfile
 import time
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from egosim_jax.io.untrusted.isolated import Child
 from egosim_jax.perception.cameras import CameraLadder, ColmapConfig, ColmapError, colmap
 from egosim_jax.perception.cameras.flow import background
 from egosim_jax.types import InputError
+from tests.unit.perception.cameras import steps
 from tests.unit.perception.cameras.room import path, render
-
-HANGS = """
-import subprocess, sys, time, pathlib
-child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-pathlib.Path(r"{}").write_text(str(child.pid))
-time.sleep(600)
-"""
 
 
 def match(config: ColmapConfig) -> None:
     frames = render(path(2))
     video = background(frames, np.zeros(frames.shape[:3], bool))
-    with colmap.open_scene(video, (0, 1), height=240, width=320, config=config) as scene:
+    with colmap.open_scene(video, (0, 1), config=config) as scene:
+        scene.child.call(repr, config, timeout_s=60.0)  # its imports are not part of the time limit
         scene.match()
 
 
-def use(program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "child.py").write_text(program)
-    monkeypatch.setattr(colmap, "CHILD", tmp_path / "child.py")
+    return tmp_path / "temporary"
 
 
 def test_a_crash_is_reported_with_its_last_message(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    use("import os, sys; print('no memory', file=sys.stderr, flush=True); os.abort()", tmp_path,
-        monkeypatch)  # fmt: skip
+    monkeypatch.setattr(colmap, "match_features", steps.crash)
     with pytest.raises(ColmapError, match="features was ended by SIGABRT: no memory"):
         match(ColmapConfig())
-    assert not list((tmp_path / "temporary").iterdir())
+    assert not list(temporary.iterdir())
 
 
 def test_a_hang_is_ended_with_all_its_processes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    use(HANGS.format(tmp_path / "pid"), tmp_path, monkeypatch)
+    monkeypatch.setattr(colmap, "match_features", partial(steps.hang, tmp_path / "pid"))
     with pytest.raises(ColmapError, match="took longer than 2 s"):
         match(ColmapConfig(timeout_s=2.0))
     grandchild = int((tmp_path / "pid").read_text())
@@ -58,7 +54,7 @@ def test_a_hang_is_ended_with_all_its_processes(
             break
         time.sleep(0.05)
     assert not _alive(grandchild)
-    assert not list((tmp_path / "temporary").iterdir())
+    assert not list(temporary.iterdir())
 
 
 def _alive(pid: int) -> bool:
@@ -68,8 +64,8 @@ def _alive(pid: int) -> bool:
         return False
 
 
-def test_a_crash_is_a_reason_and_no_rung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use("raise SystemExit(3)", tmp_path, monkeypatch)
+def test_a_crash_is_a_reason_and_no_rung(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(colmap, "match_features", steps.leave)
     frames = render(path(6, move=np.array([0.5, 0.0, 0.0])))
     found = CameraLadder()(frames, np.zeros(frames.shape[:3], bool))
     assert found.verdict.rung == "refused"
@@ -83,8 +79,8 @@ def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> 
         match(ColmapConfig())
 
 
-def test_the_child_never_imports_opencv_or_the_package() -> None:
-    text = colmap.CHILD.read_text()
-    assert "cv2" not in text
-    assert "egosim_jax" not in text
-    assert os.path.samefile(colmap.CHILD, Path(colmap.__file__).with_name("colmap_child.py"))
+def test_the_child_never_imports_opencv() -> None:
+    with closing(Child()) as child:
+        modules = child.call(steps.modules, colmap.match_features, ColmapConfig(), timeout_s=60.0)
+    assert colmap.__name__ in modules
+    assert "cv2" not in modules
