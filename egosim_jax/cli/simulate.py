@@ -75,8 +75,8 @@ class Simulate:
         from egosim_jax import configs, rendering
         from egosim_jax.evaluation.metrics.loop import DEFINITIONS
         from egosim_jax.generation.generator import Generator
+        from egosim_jax.io.digest import fingerprint
         from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.io.fingerprint import fingerprint
         from egosim_jax.io.journal import Journal
         from egosim_jax.io.run import open_folder, write_json
         from egosim_jax.io.weights import hashes

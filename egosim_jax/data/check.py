@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader
 
-from egosim_jax.data.ids import is_safe_id
+from egosim_jax.data.clip_files import is_safe_id
 from egosim_jax.data.manifest import ArrayInfo, Manifest, ShardInfo, file_problems, read_manifest
 from egosim_jax.data.records import Record, RecordError, from_bytes
 from egosim_jax.io.bounded import quote

@@ -1,7 +1,8 @@
-"""Files of clips, as a metadata file or a list of DWM names them, and the problems found there."""
+"""Clips as rows of a metadata file or a list of DWM: their ids, their files and the row problems."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,20 @@ from typing import Literal
 from egosim_jax.types import InputError
 
 Prompts = Literal["prompts_rewrite", "prompts"]
-"""Captions of a list of DWM: rewritten ones, with original ones in their absence, or original ones.
-"""
+"""Captions to read from DWM's folders: rewritten (original where there is none), or original."""
 MAX_CLIPS = 400_000
 """Maximum number of clips in a metadata file or list."""
+SAFE_IDS = "letters, digits, '.', '_' and '-', and '/' between folders without dots"
+"""Rule of a safe id, for messages."""
+_SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
+
+
+def is_safe_id(text: str) -> bool:
+    """Return True if the id of a clip or recording is a valid file name; a `/` makes a subfolder.
+
+    Folder names have no dots, so that an id cannot collide with another id's file.
+    """
+    return len(text) <= 200 and _SAFE_ID.fullmatch(text) is not None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,35 +38,38 @@ class ClipFiles:
     prior: Path
     """Video of the rendered scene."""
     mask: Path | None
-    """Video of the mask: white where the prior shows nothing; None: it shows everything."""
+    """Video of the mask, white where the prior has no pixels; None if the prior has all pixels."""
     hands: Path
     """Video of the hand skeletons."""
     first_frame: Path
-    """Path of the image for CLIP."""
+    """Image for CLIP, or a video whose first frame is used."""
     target: Path | None
     """Recorded video, if the metadata names one."""
     extra: Mapping[str, str]
-    """Cells of further columns by column."""
+    """Cells of further columns, by column."""
     row: str
     """File and line of the row, for messages."""
 
 
 class Problems:
-    """First problems of a possibly long list, and their number."""
+    """The first problems of a possibly long list, and the number of all."""
 
-    def __init__(self, most: int = 10):
-        self._most, self._shown, self._count = most, list[str](), 0
+    MAX_SHOWN = 10
+    """Maximum number of problems in a message."""
+
+    def __init__(self) -> None:
+        self._shown, self._count = list[str](), 0
 
     def add(self, problems: Iterable[str]) -> None:
-        """Count problems, and keep them if they are among the first."""
+        """Count problems; keep the first `MAX_SHOWN`."""
         for problem in problems:
             self._count += 1
-            if self._count <= self._most:
+            if self._count <= self.MAX_SHOWN:
                 self._shown.append(problem)
 
-    def refuse(self, what: str) -> None:
-        """Raise `InputError` if there is any problem."""
-        if self._count > self._most:
-            self._shown.append(f"and {self._count - self._most:,} more")
+    def refuse(self, message: str) -> None:
+        """Raise `InputError` if there are problems; the message lists them."""
+        if self._count > self.MAX_SHOWN:
+            self._shown.append(f"and {self._count - self.MAX_SHOWN:,} more")
         if self._count:
-            raise InputError(f"{what}: {'; '.join(self._shown)}.")
+            raise InputError(f"{message}: {'; '.join(self._shown)}.")

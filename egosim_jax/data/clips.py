@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from egosim_jax.data.clip_files import ClipFiles
-from egosim_jax.data.ids import SAFE_IDS, is_safe_id
+from egosim_jax.data.clip_files import SAFE_IDS, ClipFiles, is_safe_id
 from egosim_jax.data.metadata import MASK_NAME, csv_rows
 from egosim_jax.data.transforms import (
     Resampling,

@@ -22,8 +22,7 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
-from egosim_jax.data.clip_files import MAX_CLIPS, ClipFiles, Problems, Prompts
-from egosim_jax.data.ids import SAFE_IDS, is_safe_id
+from egosim_jax.data.clip_files import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, Prompts, is_safe_id
 from egosim_jax.data.readers import inside, make_id
 from egosim_jax.data.static import check_observed
 from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes

@@ -23,9 +23,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.data.clip_files import MAX_CLIPS, ClipFiles, Problems, Prompts
+from egosim_jax.data.clip_files import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, Prompts, is_safe_id
 from egosim_jax.data.dwm import read_list
-from egosim_jax.data.ids import SAFE_IDS, is_safe_id
 from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes, read_lines
 from egosim_jax.types import InputError, check_counts
 

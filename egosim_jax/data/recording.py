@@ -26,7 +26,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32
 
-from egosim_jax.data.ids import SAFE_IDS, is_safe_id
+from egosim_jax.data.clip_files import SAFE_IDS, is_safe_id
 from egosim_jax.data.recorded_files import (
     DESCRIPTION,
     DepthFiles,
@@ -37,8 +37,8 @@ from egosim_jax.data.recorded_files import (
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import check_version, quote, quote_path, read_json
-from egosim_jax.io.depth_images import read_depth_image
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.images import read_depth_image
 from egosim_jax.io.run import write_json
 from egosim_jax.io.segments import read_segment
 from egosim_jax.io.untrusted.npz import read_arrays

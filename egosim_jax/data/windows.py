@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egosim_jax.data.clip_files import ClipFiles
-from egosim_jax.data.ids import is_safe_id
+from egosim_jax.data.clip_files import ClipFiles, is_safe_id
 from egosim_jax.io.bounded import quote_path, read_lines
 from egosim_jax.io.digest import sha256
 from egosim_jax.types import InputError

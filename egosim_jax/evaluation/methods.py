@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.data.ids import is_safe_id
+from egosim_jax.data.clip_files import is_safe_id
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.metrics.image import fit_colors

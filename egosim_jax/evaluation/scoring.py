@@ -23,8 +23,7 @@ from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.bounded import read_lines
-from egosim_jax.io.digest import sha256
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import probe_video
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError

@@ -39,7 +39,7 @@ from egosim_jax.generation.encoding import (
     last_32_bits,
     pack,
 )
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import Denoiser
 from egosim_jax.rendering import Renderer, jitted

@@ -46,3 +46,48 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
                 gray = (np.asarray(image) >> 8).astype(np.uint8)
                 return np.stack([gray] * 3, axis=-1)
             return np.asarray(image.convert("RGB"))
+
+
+MAX_BYTES = 1 << 28
+"""Largest file in bytes."""
+
+
+def read_depth_image(path: Path) -> Float32[np.ndarray, "h w"]:
+    """Read the values of a depth map, in the unit of the file.
+
+    Raises `InputError` unless it is a PNG of one channel with 16 bits, or an npy of numbers `h w`.
+    """
+    name, data = quote_path(path), read_bytes(path, limit=MAX_BYTES)
+    try:
+        if path.suffix.lower() == ".png":
+            with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+                if image.width * image.height > MAX_IMAGE_PIXELS:
+                    raise ValueError(f"{image.width}x{image.height} pixels")
+                if not image.mode.startswith("I"):
+                    raise ValueError(f"channels {image.mode}")
+                return np.asarray(image).astype(np.float32)
+        return read_npy(data, name).astype(np.float32)
+    except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"{name} is not a depth map: {quote_text(str(error))}. It must be a PNG of one channel "
+            f"with 16 bits, or an npy of numbers, at most {MAX_IMAGE_PIXELS:,} pixels."
+        ) from error
+
+
+def read_npy(data: bytes, name: str) -> np.ndarray:
+    """Parse the bytes of an npy file of numbers, without pickle; raise `ValueError`."""
+    file = io.BytesIO(data)
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    version = np.lib.format.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"{name} is of another version of npy")
+    shape, fortran, dtype = readers[version](file, max_header_size=10_000)
+    if dtype.hasobject or dtype.kind not in "biuf":
+        raise ValueError(f"{name} holds {dtype}")
+    if len(data) - file.tell() != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"{name} does not have the size that its header says")
+    values = np.frombuffer(data, dtype, offset=file.tell())
+    return values.reshape(shape, order="F" if fortran else "C").copy(order="C")

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.io.atomic import atomic_write, lock_folder
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import archive

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import ClassVar, Protocol, runtime_checkable
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import registry
 from egosim_jax.simulation.simulator import Simulator, VideoGenerator
 from egosim_jax.simulation.start import Start

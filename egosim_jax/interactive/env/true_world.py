@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import tabletop_start
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering import jitted
 from egosim_jax.simulation.actions import places_of

@@ -32,7 +32,7 @@ from egosim_jax.interactive.env.batching import announced
 from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, validity, view_of
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.io.bounded import quote, quote_path, read_json
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import write_json
 from egosim_jax.simulation.actions import check_action, load_action, save_action
 from egosim_jax.simulation.rollout import Rollout, load_clip

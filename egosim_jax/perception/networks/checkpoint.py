@@ -16,8 +16,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from egosim_jax.io.bounded import quote, quote_path, read_json
-from egosim_jax.io.digest import sha256
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.perception.networks.worker import worker_of
 from egosim_jax.types import InputError
 

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Bool, Int32, UInt8
 
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception.estimates import HandTracks
 from egosim_jax.perception.networks.checkpoint import DType
 from egosim_jax.perception.networks.grounding_dino import Detection, GroundingDino, box_iou

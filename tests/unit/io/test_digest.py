@@ -1,6 +1,12 @@
-"""Hashes of folders."""
+"""Equal content has equal hashes, other content has others."""
 
-from egosim_jax.io.digest import sha256, sha256_within
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from egosim_jax.io.digest import fingerprint, sha256, sha256_within
 
 
 def test_the_hash_of_a_folder_is_of_the_names_and_bytes_of_its_files(tmp_path):
@@ -18,3 +24,64 @@ def test_the_hash_of_a_folder_is_of_the_names_and_bytes_of_its_files(tmp_path):
 def test_the_hash_of_a_file_is_that_of_its_bytes(tmp_path):
     (tmp_path / "a").write_text("1")
     assert sha256_within(tmp_path / "a") == sha256(tmp_path / "a")
+
+
+
+@dataclass(frozen=True)
+class Config:
+    rate: float
+    name: str = "a"
+
+
+class Scaled:
+    def __init__(self, scale):
+        self.scale = scale
+
+    def __call__(self, x):
+        return self.scale * x
+
+
+def maker(scale):
+    def scaled(x):
+        return scale * x
+
+    return scaled
+
+
+def test_equal_content_has_one_fingerprint():
+    pairs = [
+        (Config(1.0), Config(1.0)),
+        ({"a": 1, "b": [2, None]}, {"b": [2, None], "a": 1}),
+        (np.arange(6).reshape(2, 3), np.arange(6).reshape(2, 3)),
+        (maker(2), maker(2)),
+        (Scaled(2), Scaled(2)),
+        (functools.partial(maker, 2), functools.partial(maker, 2)),
+    ]
+    for a, b in pairs:
+        assert fingerprint(a) == fingerprint(b)
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (Config(1.0), Config(2.0)),
+        (0, 0.0),
+        (0, False),
+        ("ab", ["a", "b"]),
+        ([["a"], "b"], [["a", "b"]]),
+        (np.zeros(4), np.zeros((2, 2))),
+        (np.zeros(4), np.zeros(4, np.float32)),
+        (maker(2), maker(3)),
+        (Scaled(2), Scaled(3)),
+        (len, sum),
+        (lambda x: x, lambda x: -x),
+    ],
+)
+def test_other_content_has_another(a, b):
+    assert fingerprint(a) != fingerprint(b)
+
+
+def test_what_contains_itself_ends():
+    loop: list = []
+    loop.append(loop)
+    assert fingerprint(loop) == fingerprint(loop)

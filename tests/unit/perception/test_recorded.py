@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 
 from egosim_jax.geometry import look_at, transform
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import recorded
 from egosim_jax.perception.recorded import IDS_PER_STEP, RecordedConfig
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState

@@ -5,7 +5,7 @@ from dataclasses import FrozenInstanceError, dataclass
 
 import pytest
 
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import Observation, Pipeline, registry
 from egosim_jax.types import InputError
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.simulation.actions import ORDERS, SHORTER, _bone_length
 from egosim_jax.simulation.episode import Episode, _read_ground_truth
 from egosim_jax.state.snapshot import save

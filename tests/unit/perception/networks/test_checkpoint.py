@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception.networks import checkpoint
 from egosim_jax.perception.networks.depth_anything import DepthAnything
 from egosim_jax.types import InputError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch  # noqa: F401
 
-from egosim_jax.io.fingerprint import fingerprint
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import registry
 from egosim_jax.perception.networks.worker import close_workers
 from egosim_jax.types import InputError, VideoSpec
