@@ -22,7 +22,7 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.clips import load_triplet
 from egosim_jax.data.moments import (
-    MAX_DIFFERENT_STD,
+    MAX_STD_ERROR,
     cache_of,
     check_alike,
     read_moments,
@@ -78,7 +78,7 @@ def shard_caches(
                     check_alike(_cache(files, name), arrays[name], first[name])
                 for name in VIDEOS:
                     deviations = (given[f"{name}{STD}"] for given in (arrays, first))
-                    check_alike(_cache(files, name), *deviations, most=MAX_DIFFERENT_STD)
+                    check_alike(_cache(files, name), *deviations, limit=MAX_STD_ERROR)
             writer.add(arrays, {**clip_metadata(files), "start": 0})
             yield files.video_id
 

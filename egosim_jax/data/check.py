@@ -1,4 +1,4 @@
-"""Verification of shards: every hash, count, shape and video, and every problem with its file."""
+"""Verification of shards: hashes, counts, shapes and videos."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egosim_jax.types import InputError, VideoGrid
 
 
 def check(folder: Path) -> Iterator[tuple[ShardInfo, list[str]]]:
-    """Yield each shard of a folder with a list of its problems; every problem names the file.
+    """Yield each shard of a folder with its problems; every problem names the file.
 
     Compares size and SHA-256 with the manifest, reads every record, compares its arrays with the
     manifest, decodes all videos and images and searches for non-finite numbers. Raises `InputError`
@@ -75,16 +75,18 @@ def _record_problems(record: Record, manifest: Manifest) -> list[str]:
     return problems
 
 
-def _shape_problems(arrays: Mapping[str, np.ndarray], wanted: Mapping[str, ArrayInfo]) -> list[str]:
+def _shape_problems(
+    arrays: Mapping[str, np.ndarray], expected: Mapping[str, ArrayInfo]
+) -> list[str]:
     problems = []
-    for name in sorted(arrays.keys() | wanted.keys()):
-        if name not in arrays or name not in wanted:
+    for name in sorted(arrays.keys() | expected.keys()):
+        if name not in arrays or name not in expected:
             where = "the manifest" if name in arrays else "the record"
             problems.append(f"{name} is missing in {where}")
             continue
-        array, info = arrays[name], wanted[name]
+        array, info = arrays[name], expected[name]
         fits = len(array.shape) == len(info.shape) and all(
-            want in (None, have) for have, want in zip(array.shape, info.shape, strict=True)
+            axis in (None, size) for size, axis in zip(array.shape, info.shape, strict=True)
         )
         if not fits or array.dtype.name != info.dtype:
             problems.append(

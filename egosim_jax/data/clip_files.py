@@ -1,4 +1,4 @@
-"""Clips as rows of a metadata file or a list of DWM: their ids, their files and the row problems."""
+"""Clips as rows of a metadata file or of a DWM list: ids, files and the problems of rows."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Reading and writing of clips as files, checked and at a model's length and size.
+"""Read and write clips as files, checked and at a model's length and size.
 
-The strict policy, the default, rejects what would otherwise be repaired silently: a missing mask,
-videos whose frame counts disagree or are not 4k+1, sizes that disagree or are not multiples of 16,
-clips shorter than the model's. The lenient policy does what the EgoSim release does: it repeats the
+The strict policy, the default, rejects clips that the lenient one repairs: a missing mask, videos
+whose frame counts disagree or are not 4k+1, sizes that disagree or are not multiples of 16, and
+clips shorter than the model's. The lenient policy does what the EgoSim release does. It repeats the
 last frame or cuts the video, resizes every video, and treats every pixel as observed if there is no
-mask; a warning reports the number of missing frames. In both, a longer clip yields the window that
-starts at `start`.
+mask. A warning reports the number of missing frames. With both, a longer clip yields the window
+that starts at `start`.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 logger = logging.getLogger(__name__)
 
 Policy = Literal["strict", "lenient"]
-SAME_RATE = 1.01
-"""Largest ratio of the frame rates of a clip's videos that are taken as equal, as 24 and 23.976."""
+MAX_RATE_RATIO = 1.01
+"""Maximum ratio of frame rates that count as equal, such as 24 and 23.976."""
 DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
 LENIENT = "egosim generate --lenient"
-"""Option with the lenient policy, of the one command that has it."""
+"""The one command with the lenient policy, and its option."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
@@ -57,9 +57,9 @@ def write_clips(
     """Write triplets as files in EgoSim's layout; return the path of their metadata.csv.
 
     Each clip has a folder; the entries of `extra` become columns. All clips must have the same
-    columns, and either all or none a target video. `append` keeps the rows of other clips in an
-    existing metadata.csv, also of those that other processes append meanwhile. Raises `InputError`
-    for an id that is not a valid file name.
+    columns, and either all or none must have a target video. `append` keeps the other clips' rows
+    in an existing metadata.csv, including rows that other processes append meanwhile. Raises
+    `InputError` for an id that is not a valid file name.
     """
     path = folder / "metadata.csv"
     rows = {triplet.video_id: write_clip(folder, triplet, fps=fps) for triplet in triplets}
@@ -132,8 +132,8 @@ def check_clip(
 ) -> list[str]:
     """List the problems that would make `load_triplet` fail, without decoding the videos.
 
-    Each problem names the metadata row and the file. Without a `spec` every length is accepted; if
-    frames are taken at intervals, every one that has enough.
+    Each problem names the metadata row and the file. Without a `spec`, every length is accepted.
+    With frames taken at intervals, every sufficient length is accepted.
     """
     problems = []
     probed: dict[str, VideoInfo] = {}
@@ -169,14 +169,13 @@ def load_triplet(
 ) -> Triplet:
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
-    Another `resampling` takes them from all frames, the same ones of every video, and has no
-    `start`. The CLIP image is that of
-    the clip for every window. Raises `InputError` with the problems of `check_clip`, or naming a
-    damaged video.
+    Another `resampling` takes the same frames of every video, out of all its frames, and has no
+    `start`. The CLIP image is the clip's, whatever the window. Raises `InputError` with the problems
+    of `check_clip`, or naming a damaged video.
     """
     if start and resampling != "first":
         raise InputError(
-            f"Frames taken by the rule {resampling} are of the whole clip: it must start at 0, not "
+            f"The rule {resampling} takes frames of the complete clip: it must start at 0, not "
             f"{start}. (--resampling)"
         )
     problems = check_clip(files, spec, start=start, policy=policy, grid=grid, resampling=resampling)
@@ -256,18 +255,18 @@ def _taken(
 
 
 def _step(probed: dict[str, VideoInfo], spec: VideoSpec) -> int:
-    """Return the step of the rule `rate` for all videos: of the recorded one or else the prior."""
+    """Return the step of the rule `rate` for all videos, by the rate of the target or the prior."""
     timed = probed.get("target") or probed.get("prior")
     return int(timed.fps / spec.fps) if timed else 1
 
 
 def _rate_problems(probed: dict[str, VideoInfo]) -> list[str]:
     rates = {name: info.fps for name, info in probed.items()}
-    if not rates or max(rates.values()) <= SAME_RATE * min(rates.values()):
+    if not rates or max(rates.values()) <= MAX_RATE_RATIO * min(rates.values()):
         return []
     return [
         f"the frame rates disagree: {_table({n: f'{float(r):g}' for n, r in rates.items()})}. "
-        "Frames taken by rate need one rate: write the videos at it, or take them by another rule. "
+        "Frames taken by rate need one rate: write all videos at one, or use another rule. "
         "(--resampling)"
     ]
 

@@ -1,4 +1,4 @@
-"""DWM's folders of triplets and lists of their clips.
+"""DWM's folders of triplets, and lists of their clips.
 
     DATASET/SCENE/ACTION/videos/NAME.mp4            recorded video (ground truth)
                          videos_static/NAME.mp4     static scene along the same cameras
@@ -6,14 +6,14 @@
                          prompts_rewrite/NAME.txt   rewritten caption, of the released models
                          prompts/NAME.txt           original caption, of the paper's evaluation
 
-A list is a text file with the path of a recorded video in each line, relative to a root folder: the
+A list is a text file. Each line is the path of a recorded video, relative to a root folder: the
 folder of the list or the one above it, whichever has the first video. DWM's lists are in
-`dataset_files` of the root. The number of folders above `videos` is free.
+`dataset_files` of the root. Any number of folders may be above `videos`.
 
-A static video has no mask, since it shows the scene everywhere; its first frame is the image for
-CLIP. The caption is all text of the file: DWM generates from it, but trained on its first line. A
-clip without a rewritten caption has the original one; the original ones may also be chosen, and are
-then required.
+A static video has no mask, because it shows the scene everywhere. Its first frame is the image for
+CLIP. The caption is the complete text of the file: DWM generates from it, but trained on its first
+line. A clip without a rewritten caption gets the original one. If original captions are chosen,
+each clip must have one.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ PROMPTS: dict[Prompts, tuple[Prompts, ...]] = {
     "prompts_rewrite": ("prompts_rewrite", "prompts"),
     "prompts": ("prompts",),
 }
-"""Folders in which captions are searched, the preferred one first, by the one chosen."""
+"""Caption folders to search, the preferred one first, for each choice of captions."""
 LISTS = "dataset_files"
-"""Folder of lists in a root."""
+"""Folder of lists, in the root."""
 MAX_LIST_BYTES, MAX_PROMPT_BYTES = 1 << 26, 1 << 16
-"""Largest list and caption in bytes."""
+"""Maximum size of a list and of a caption, in bytes."""
 
 
 def read_list(
     path: Path, *, prompts: Prompts = "prompts_rewrite", first_line: bool = False
 ) -> list[ClipFiles]:
-    """Return the clips of a list, whose ids are their paths with underscores.
+    """Return the clips of a list; their ids are their paths with underscores.
 
-    `prompts` are the captions to take, or the `first_line` of each, of which DWM's caches are.
-    Raises one `InputError` that lists the problems: no root, paths outside of it or not in a folder
-    `videos`, absent and empty captions, duplicates.
+    `prompts` chooses the captions; `first_line` takes only the first line of each, as DWM's caches
+    of embeddings do. Raises one `InputError` that lists the problems: no root, paths outside of it
+    or not in a folder `videos`, missing and empty captions, duplicates.
     """
     entries = list(_entries(path))
     name = quote_path(path)
@@ -64,7 +64,7 @@ def read_list(
             row = f"{path.name} line {line}"
             files = _files(root, entry, row, prompts, first_line=first_line)
             if files.video_id in clips:
-                raise InputError(f"its id {files.video_id} is also that of another line")
+                raise InputError(f"another line has the same id {files.video_id}")
             clips[files.video_id] = files
         except InputError as error:
             problems.add([f"line {line}: {error}".removesuffix(".")])
@@ -90,7 +90,7 @@ def _text(path: Path, limit: int) -> str:
 
 
 def _root_of(path: Path, entry: str) -> Path:
-    """Return the root that the paths of a list are relative to."""
+    """Return the root of the paths in a list."""
     roots = path.parent, path.parent / ".."
     for root in roots:
         if inside(root, entry, what=f"the first clip of {quote_path(path)}").is_file():
@@ -106,8 +106,8 @@ def _files(root: Path, entry: str, row: str, prompts: Prompts, *, first_line: bo
     video = inside(root, entry, what="the path")
     if video.parent.name != VIDEOS or video.suffix != ".mp4":
         raise InputError(
-            f"the path {quote(entry)} must be that of an .mp4 in a folder {VIDEOS}: its static "
-            f"scene is searched in {STATIC} next to it"
+            f"the path {quote(entry)} must name an .mp4 in a folder {VIDEOS}: its static scene is "
+            f"searched in {STATIC} next to that"
         )
     folder = video.parent.parent
     texts = [folder / name / f"{video.stem}.txt" for name in PROMPTS[prompts]]
@@ -134,16 +134,16 @@ def _files(root: Path, entry: str, row: str, prompts: Prompts, *, first_line: bo
 def write_folders(
     root: Path, triplets: Iterable[Triplet], *, name: str, fps: int | float | Fraction
 ) -> Path:
-    """Write triplets in DWM's folders below a root, and their list; return its path.
+    """Write triplets in DWM's folders below a root, and their list; return the list's path.
 
-    The id A/B/CLIP gives NAME/A/B/videos/CLIP.mp4; `name` is also that of the list, without its
-    suffix. Raises `InputError` for a name or id that is not a valid file name, without a target
-    video, and for a mask with holes, which the folders cannot hold.
+    The id A/B/CLIP gives NAME/A/B/videos/CLIP.mp4, and the list is NAME.txt. Raises `InputError`
+    for a name or id that is not a valid file name, for a triplet without a target video, and for a
+    mask with holes, because the folders have no masks.
     """
     if "/" in name or not is_safe_id(f"{name}/0"):
         raise InputError(
-            f"The name {quote(name)} of a dataset must be that of a folder: use letters, digits, "
-            "'_' and '-'. (--name)"
+            f"The name {quote(name)} of a dataset must be a valid folder name: use letters, "
+            "digits, '_' and '-'. (--name)"
         )
     lines = []
     for triplet in triplets:
@@ -153,8 +153,8 @@ def write_folders(
             )
         if triplet.target is None:
             raise InputError(
-                f"{triplet.video_id} has no recorded video, which DWM's lists name: it must have "
-                "a target."
+                f"{triplet.video_id} has no recorded video: it must have a target, because DWM's "
+                "lists name recorded videos."
             )
         try:
             check_observed(triplet.mask)

@@ -1,9 +1,9 @@
-"""Import of recordings: what a reader finds is written as folders that annotation reads.
+"""Import recordings: write what a reader finds as folders for annotation.
 
     DIR/<recording_id>/recording.json, arrays.npz, and for images also video.mp4 and depth/
 
-A recording is done when its recording.json exists, so that an interrupted import resumes; it is
-made again if it is damaged. What another source or other options made is refused.
+A recording is complete when its recording.json exists, so an interrupted import resumes. A damaged
+recording is imported again; one that another source or other options made is refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Outcome:
     problem: str | None = None
     """Reason why it was skipped; None if it was imported."""
     resumed: bool = False
-    """True if an earlier import had written it."""
+    """True if an earlier import wrote it."""
 
 
 def import_recordings(
@@ -37,8 +37,8 @@ def import_recordings(
 ) -> tuple[int, Iterator[Outcome]]:
     """Return the number of recordings to import and an iterator that imports them one by one.
 
-    An entry that cannot be read is an outcome with its problem; the others are imported. Raises
-    `InputError` if the source is not of the reader's dataset.
+    The outcome of an entry that cannot be read holds its problem; the other entries are imported.
+    Raises `InputError` if the source is not of the reader's dataset.
     """
     check_counts({"--limit": limit})
     entries = list(islice(reader.find(), limit))
@@ -53,8 +53,8 @@ def _import(dataset: str, entries: Iterable[Entry], out: Path) -> Iterator[Outco
             try:
                 if name in seen:
                     raise InputError(
-                        f"its id is also that of {seen[name]}: ids must be unique. Import the two "
-                        "folders separately."
+                        f"{seen[name]} has the same id: ids must be unique. Import the two folders "
+                        "separately."
                     )
                 seen[name] = entry.source
                 yield Outcome(recording_id=name, resumed=_import_one(dataset, entry, out / name))
@@ -63,7 +63,7 @@ def _import(dataset: str, entries: Iterable[Entry], out: Path) -> Iterator[Outco
 
 
 def _import_one(dataset: str, entry: Entry, folder: Path) -> bool:
-    """Read and write a recording unless that was done; return True if it was."""
+    """Read and write a recording; return True if an earlier import wrote it."""
     made_of = {"dataset": dataset, "source": str(entry.source.resolve()), **entry.options}
     if (folder / DESCRIPTION).exists():
         try:
@@ -74,7 +74,7 @@ def _import_one(dataset: str, entry: Entry, folder: Path) -> bool:
             differing = [n for n, value in made_of.items() if written.get(n) != value]
             if differing:
                 raise InputError(
-                    f"{folder} holds a recording of another {', '.join(differing)}: choose another "
+                    f"{folder} holds a recording with another {', '.join(differing)}: choose another "
                     "folder, or remove it. (--out)"
                 )
             return True

@@ -31,11 +31,11 @@ class SplitStatistics:
 def choose_clips(
     reader: ShardReader, *, by: Sequence[str], streams: Collection[str], limit: int, moments: int
 ) -> list[SheetClip]:
-    """Decode some videos of the first clip of each combination of values of the columns `by`.
+    """Decode videos of one clip per combination of values in the columns `by`.
 
-    Without columns, decode those of the first `limit` clips, in their order. Of each, `moments`
-    frames are kept, from the first to the last, at the clip's own size. Raises `InputError` for
-    latents and for unknown columns.
+    Without columns, decode videos of the first `limit` clips, in order. Keep `moments` frames of
+    each video, evenly spaced from the first to the last, at the clip's own size. Raises `InputError`
+    for latents and for unknown columns.
     """
     if reader.manifest.kind == "latents":
         raise InputError(f"{reader.folder} holds latents, not videos or frames. (--shards)")
@@ -50,9 +50,9 @@ def choose_clips(
         if key not in clips:
             frames, height, width = video_shape(record.arrays)
             spec = VideoSpec(frames=frames, height=height, width=width)
-            places = np.linspace(0, frames - 1, moments).round().astype(int)
+            kept = np.linspace(0, frames - 1, moments).round().astype(int)
             videos = decode_record(record.arrays, spec)
-            shown = [videos[name][places] for name in streams if name in videos]
+            shown = [videos[name][kept] for name in streams if name in videos]
             clips[key] = SheetClip(str(record.metadata.get("prompt", "")), shown)
         if len(clips) == limit:
             break
@@ -60,7 +60,7 @@ def choose_clips(
 
 
 def split_statistics(reader: ShardReader) -> dict[str, SplitStatistics]:
-    """Return the statistics of every split, in the order of their names."""
+    """Return the statistics of every split, sorted by name."""
     splits: dict[str, SplitStatistics] = {}
     for record in track(reader, "reading", total=len(reader)):
         name = str(record.metadata.get("extra", {}).get("split", "all"))

@@ -1,16 +1,15 @@
-"""LeRobot datasets, version 3.0, of episodes that were simulated.
+"""Write simulated episodes as a LeRobot dataset, version 3.0.
 
     meta/info.json meta/stats.json meta/tasks.parquet
-    meta/episodes/chunk-000/file-000.parquet   length, tasks and place of each episode
-    meta/egosim/episode_000000/                scene in which the episode begins
+    meta/episodes/chunk-000/file-000.parquet   length, tasks and file of each episode
+    meta/egosim/episode_000000/                initial scene of the episode
     data/chunk-000/file-000.parquet            rows of episode 0; the next one is file-001
 
-A row has the frame as a PNG, which loses nothing (feature of dtype image), `observation.state`, the
-row of hands and camera at that frame, and `action`, that of the next frame; both are float32. The
-joints of the hands, the pose of the camera and its intrinsics are there as float64, too, in the
-names `HANDS`, `POSES` and `INTRINSICS`. The clips of an episode follow each other: the first frame
-of a clip takes the place of the last one of the clip before. Followed: `lerobot` 0.4.4,
-`datasets/lerobot_dataset.py`, `datasets/utils.py`.
+A row has the frame as a lossless PNG (feature of dtype image), and two float32 vectors of hands and
+camera: `observation.state` at that frame and `action` at the next frame. The joints of the hands,
+the pose of the camera and its intrinsics are also stored as float64, in the columns `HANDS`,
+`POSES` and `INTRINSICS`. The first frame of a clip replaces the last frame of the clip before.
+Followed: `lerobot` 0.4.4, `datasets/lerobot_dataset.py`, `datasets/utils.py`.
 """
 
 from __future__ import annotations
@@ -39,9 +38,9 @@ POSES = "observation.camera.world_from_camera"
 INTRINSICS = "observation.camera.intrinsics_px"
 """Rows of the camera's 3x3 matrix in pixels."""
 SCENE = "meta/egosim/episode_{:06d}"
-"""Folder of the scene in which an episode begins."""
+"""Folder of the initial scene of an episode."""
 CHUNK = 1000
-"""Files in a folder."""
+"""Number of files in a folder."""
 PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
@@ -62,12 +61,12 @@ class ClipRecord:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class EpisodeRecord:
-    """Clips that follow each other, from a scene."""
+    """Consecutive clips that start from a scene."""
 
     clips: Iterable[ClipRecord]
-    """Clips of the episode, which are read one by one."""
+    """Clips of the episode, consumed one by one."""
     save_scene: Callable[[Path], None]
-    """Write the scene in which the episode begins to a folder."""
+    """Function that writes the initial scene of the episode to a folder."""
 
 
 @dataclass
@@ -106,7 +105,7 @@ class _Totals:
 
 
 def check_new(folder: Path) -> None:
-    """Raise `InputError` unless nothing exists at a path, or an empty folder."""
+    """Raise `InputError` unless a path is free or an empty folder."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise InputError(
             f"{quote_path(folder)} exists and is not empty: a dataset needs a new or an empty "
@@ -122,11 +121,10 @@ def write_lerobot(
     fps: int,
     robot_type: str,
 ) -> None:
-    """Write a dataset, complete or absent; `names` are those of the numbers of a row.
+    """Write a dataset, complete or absent; `names` are the names of the numbers in a row.
 
-    One clip after the other is taken from `episodes` and written.
-    Raises `InputError` if there is nothing to write, if clips differ in size, if the folder holds
-    files, or without pyarrow.
+    Clips are read from `episodes` and written one by one. Raises `InputError` if there is nothing to
+    write, if clips differ in size, if the folder holds files, or without pyarrow.
     """
     check_new(folder)
     if find_spec("pyarrow") is None:
@@ -149,7 +147,7 @@ def write_lerobot(
 def _steps(
     clips: Iterable[ClipRecord], totals: _Totals
 ) -> Iterator[tuple[np.ndarray, str, dict[str, np.ndarray]]]:
-    """Yield frame, prompt and numbers of each step; the last frame of all holds its row."""
+    """Yield frame, prompt and vectors of each step; the action of the last step is its own row."""
     last = None
     for last in clips:
         totals.sizes.add(last.frames.shape[1:3])
@@ -253,7 +251,7 @@ def _write_meta(
     robot_type: str,
     names: Sequence[str],
 ) -> None:
-    """Write description, statistics, tasks and places of the episodes."""
+    """Write description, statistics, tasks and files of the episodes."""
     rows = {key: [episode[key] for episode in totals.episodes] for key in totals.episodes[0]}
     _write_table(folder / "meta/episodes/chunk-000/file-000.parquet", rows)
     _write_tasks(folder / "meta/tasks.parquet", totals.tasks)

@@ -6,13 +6,13 @@ Process p of n takes positions p, p + n, p + 2n, ..., so that global batch b hol
 positions for any number of processes. Worker processes share the positions in the same order.
 
 A record that cannot be read is skipped, counted in `Loader.skipped` under its file and position,
-and replaced by the next one; more than `Loader.MAX_BAD` different ones stop the run.
+and replaced by the next one. More than `Loader.MAX_BAD` different bad records stop the run.
 
-To validate, `one_pass` takes every record once, in order, and gives it a weight: 1, or 0 for what
-only fills a batch, so that all processes get as many batches.
+For validation, `one_pass` yields every record once, in order, with weight 1. Fillers of weight 0
+complete the batches, so that all processes get the same number of batches.
 
-Of a mixture, position k is of the part whose share is furthest behind its weight, so that any long
-stretch of the sequence has the proportions of the weights.
+Position k of a mixture is a record of the part whose share is furthest behind its weight. Any long
+stretch of the sequence therefore has the proportions of the weights.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def one_pass(
 ) -> Iterator[dict[str, np.ndarray]]:
     """Yield this process's examples of each batch of one pass, in order, with their `weight`.
 
-    Every readable record is there once with weight 1. Others, and what the last batch lacks, are
-    replaced by a copy of a readable one with weight 0, the same one on all processes. Raises
+    Every readable record occurs once with weight 1. A copy of one readable record, with weight 0
+    and the same on all processes, replaces bad records and completes the last batch. Raises
     `InputError` if none of the first records can be read.
     """
     examples = _positions(source, 0, shuffle=False).random_map(_Read(source, transform))
@@ -209,10 +209,10 @@ def _check(arrays: Example, manifest: Manifest) -> None:
         if floating and not np.isfinite(array).all():
             raise InputError(f"{name} has values that are not finite (NaN or infinity).")
         if manifest.kind == "latents" and manifest.spec is not None and name in LATENTS:
-            have, want = array.shape[:-1], manifest.grid.latent_shape(manifest.spec)
-            if have != want:
+            shape, expected = array.shape[:-1], manifest.grid.latent_shape(manifest.spec)
+            if shape != expected:
                 raise InputError(
-                    f"{name} has {have} latent frames, rows and columns; expected {want}."
+                    f"{name} has {shape} latent frames, rows and columns; expected {expected}."
                 )
 
 

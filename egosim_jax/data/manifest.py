@@ -1,7 +1,7 @@
 """The manifest of a folder of shards: kind, arrays, files with their hashes, and provenance.
 
-Reading trusts nothing: the manifest carries its own SHA-256, every field is checked for its type,
-and file names must match a pattern.
+Reading trusts nothing. The manifest holds its own SHA-256, the type of every field is checked, and
+file names must match a pattern.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SHARD_NAME = re.compile(r"shard-\d{5}\.array_record")
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayInfo:
-    """Dtype and shape of one array over all records."""
+    """Dtype and shape of one array in all records."""
 
     dtype: str
     """Name of the dtype."""
@@ -62,13 +62,13 @@ class Manifest:
     kind: RecordKind
     """Kind of the records."""
     spec: VideoSpec | None
-    """Length and size of the decoded frames, or of the videos behind latents; None for videos."""
+    """Length and size of frames, or of the videos that latents encode; None for videos."""
     grid: VideoGrid
     """Latent grid of the videos."""
     arrays: Mapping[str, ArrayInfo]
     """Arrays of every record, by name."""
     shards: tuple[ShardInfo, ...]
-    """Files in the order of their records."""
+    """Files, in the order of their records."""
     provenance: Mapping[str, Any]
     """Source of the records: config, hashes of the encoder weights, ..."""
 
@@ -153,7 +153,7 @@ def _manifest(fields: Any, name: str) -> Manifest:
 
 
 def file_problems(folder: Path, shard: ShardInfo) -> list[str]:
-    """List the differences of a shard's file from the manifest, without reading the file."""
+    """List how a shard's file differs from the manifest, without reading the file."""
     path = folder / shard.file
     if not path.is_file() or path.is_symlink():
         return [f"{path}: missing"]

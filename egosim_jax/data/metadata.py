@@ -1,4 +1,4 @@
-"""Metadata of clips: a table in EgoSim's columns, as CSV or as JSON lines, or a list of DWM.
+"""Metadata of clips: a table with EgoSim's columns, as CSV or JSON lines, or a DWM list.
 
     column               holds                                          default without the column
     video                the recorded video (ground truth)              no ground truth
@@ -8,10 +8,10 @@
     prompt               the caption                                    required
     video_id             names the outputs                              video, with _ for /
 
-Paths are relative to the folder of the metadata file; the defaults, EgoSim's own, are in the folder
-of the prior, and so is the mask, `pc_mask_video.mp4`, which has no column. Ids consist of letters,
-digits, `.`, `_` and `-`; a `/` in an id makes a folder of the outputs. Further columns are copied
-to the results. No cell of these columns may be empty.
+Paths are relative to the folder of the metadata file. The default files have EgoSim's names and are
+in the folder of the prior. So is the mask, `pc_mask_video.mp4`, which has no column. Ids consist of
+letters, digits, `.`, `_` and `-`; a `/` in an id makes a subfolder of the outputs. No cell of the
+columns above may be empty. Further columns are copied to the results.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MAX_COLUMNS = 256
 def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
     """Read every row of a metadata file (`.csv`, or `.jsonl` with one object per line).
 
-    A `.txt` is a list of DWM (`data/dwm.py`), of which `prompts` chooses the captions. Raises one
+    A `.txt` is a DWM list (`data/dwm.py`), for which `prompts` chooses the captions. Raises one
     `InputError` that lists the problems: missing columns, empty cells (which the official loader
     reads as the text "nan"), cells beyond the header, unsafe and duplicate ids.
     """
@@ -51,8 +51,8 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
         return read_list(path, prompts=prompts)
     if prompts != "prompts_rewrite":
         raise InputError(
-            f"{quote_path(path)} has its captions in the column prompt: those of {prompts} can be "
-            "chosen for a list of DWM, .txt. Give one, or leave this out. (--prompts, --metadata)"
+            f"{quote_path(path)} has its captions in the column prompt: {prompts} can be chosen "
+            "only for a DWM list, .txt. Give a list, or omit the option. (--prompts, --metadata)"
         )
     clips: list[ClipFiles] = []
     problems = Problems()
@@ -72,7 +72,7 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
 
 
 def check_presence(items: Sequence[ClipFiles]) -> None:
-    """Raise `InputError` if no clip has its prior, as with metadata in a wrong folder."""
+    """Raise `InputError` if no clip has its prior, as when the metadata is in a wrong folder."""
     if not any(item.prior.exists() for item in items):
         shown = ", ".join(quote_path(item.prior) for item in items[:3])
         raise InputError(
@@ -160,12 +160,12 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
             raise InputError(f"{name} has no column {', '.join(absent)}.")
         repeated = sorted({quote_text(cell) for cell in header if header.count(cell) > 1})
         if repeated or len(header) > MAX_COLUMNS:
-            what = (
+            problem = (
                 f"more than one column {', '.join(repeated)[:200]}"
                 if repeated
                 else (f"{len(header)} columns, more than {MAX_COLUMNS}")
             )
-            raise InputError(f"{name} has {what}.")
+            raise InputError(f"{name} has {problem}.")
         line = reader.line_num + 1
         for cells in reader:
             if len(cells) > len(header):
@@ -182,7 +182,7 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def _json_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield line number and values of each line; null is read as an empty cell."""
+    """Yield line number and values of each line; null becomes an empty cell."""
     for line, row in read_lines(path, limit=MAX_BYTES, last="read"):
         where = f"{quote_path(path)}, line {line}"
         if not isinstance(row, dict):

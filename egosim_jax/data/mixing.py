@@ -1,9 +1,9 @@
-"""Mixtures of shards by weight, as DWM's hybrid of rendered and recorded data.
+"""Weighted mixtures of shards, such as DWM's hybrid of rendered and recorded data.
 
 A mixture is a folder whose `mixture.json` names other folders of shards, relative to itself, and
-their weights. It is read as one source, of all records one part after the other; training draws
-from the parts in proportion to their weights, each in its own order, which is new in every pass
-over the part. The sequence depends on the seed alone, as that of one folder (`data/loader.py`).
+their weights. It is read as one source: the parts' records, part after part. Training draws from
+the parts in proportion to their weights and reshuffles a part after every pass over it. The
+sequence depends on the seed alone (`data/loader.py`).
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def read_mixture(folder: Path) -> dict[Path, float]:
 
 
 class Mixture:
-    """A sequence of the records of several folders, one after the other, and their weights.
+    """The concatenated records of several folders, and the folders' weights.
 
     Raises `InputError` for a weight that is not positive and for folders whose records differ in
     kind, size, grid or arrays.
@@ -90,7 +90,7 @@ class Mixture:
             if not (weight > 0 and math.isfinite(weight)):
                 raise InputError(
                     f"The weight of {quote_path(part.folder)} is {weight}: it must be a positive "
-                    "number. Omit a part that is not to be used. (--weights)"
+                    "number. Omit parts that you do not use. (--weights)"
                 )
         first = self.parts[0].manifest
         for part in self.parts[1:]:

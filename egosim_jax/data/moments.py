@@ -1,9 +1,8 @@
-"""DWM's caches of latents: means and log variances of the VAE, one `.pt` tensor for each video.
+"""DWM's caches of latents: means and log variances of the VAE, one `.pt` tensor per video.
 
-The folders are next to that of the recorded videos. A tensor is [2 z, f, h, w] in bfloat16, first
-the z means, then the log variances, before the VAE's scaling; a caption's embeddings are [n, d].
-The files do not name the VAE that made them: `check_alike` compares with latents that are encoded
-again.
+The cache folders are next to the folder of recorded videos. A tensor is [2 z, f, h, w] in bfloat16:
+the z means, then the log variances, before the VAE's scaling. A caption's embeddings are [n, d].
+The files do not name the VAE that made them, so `check_alike` compares them with new encodings.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ FOLDERS = {
     "hands": "hand_video_latents",
     "text": "prompt_embeds_rewrite",
 }
-"""Folder of the caches of each array of a record."""
-MAX_DIFFERENT = 0.05
-"""Largest relative difference of cached latents, RMS: bfloat16 rounds by up to 0.004."""
-MAX_DIFFERENT_STD = 0.25
-"""The same of their deviations, as exp(logvar / 2) multiplies the errors of a network."""
+"""Cache folder of each array of a record."""
+MAX_ERROR = 0.05
+"""Maximum relative RMS error of cached latents; bfloat16 alone rounds by up to 0.004."""
+MAX_STD_ERROR = 0.25
+"""The same for standard deviations: exp(logvar / 2) amplifies the errors of a network."""
 
 
 def cache_of(video: Path, array: str) -> Path:
-    """Return the cache of an array of the clip with a recorded video."""
+    """Return the cache path of an array, for the clip of a recorded video."""
     return video.parent.parent / FOLDERS[array] / f"{video.stem}.pt"
 
 
@@ -50,10 +49,10 @@ def read_moments(
 def read_tensor(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     """Return the one tensor of a `.pt` file in float32; raise `InputError` for other shapes."""
     tensors = [*read_pth(path).values()]
-    have = [tensor.shape for tensor in tensors]
-    if have != [shape]:
+    shapes = [tensor.shape for tensor in tensors]
+    if shapes != [shape]:
         raise InputError(
-            f"{quote_path(path)} holds {have[:3]}: it must be one tensor of {shape}, the latents "
+            f"{quote_path(path)} holds {shapes[:3]}: it must be one tensor of {shape}, the latents "
             "of this model at its length and size. They are not resized; encode the videos again."
         )
     values = tensors[0].array().astype(np.float32)
@@ -71,14 +70,13 @@ def write_moments(
 
 
 def check_alike(
-    path: Path, cached: np.ndarray, encoded: np.ndarray, *, most: float = MAX_DIFFERENT
+    path: Path, cached: np.ndarray, encoded: np.ndarray, *, limit: float = MAX_ERROR
 ) -> None:
-    """Raise `InputError` if cached values are not those that were encoded again."""
+    """Raise `InputError` if cached values differ from newly encoded ones by more than `limit`."""
     difference = float(np.sqrt(np.square(cached - encoded).mean() / np.square(encoded).mean()))
-    if not difference <= most:
+    if not difference <= limit:
         raise InputError(
-            f"{quote_path(path)} is not of these weights: encoded again, its video gives values "
-            f"that differ by {difference:.2f}, relative RMS; the most is {most}. Give "
-            "the VAE and text encoder that the caches were made with, or encode the videos. "
-            "(--weights)"
+            f"{quote_path(path)} was made with other weights: its relative RMS difference from new "
+            f"encodings is {difference:.2f}, and the maximum is {limit}. Give the VAE and text "
+            "encoder that made the caches, or encode the videos. (--weights)"
         )

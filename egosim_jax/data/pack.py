@@ -1,4 +1,4 @@
-"""Packing of clips into records: the source files, or frames decoded at a model's size."""
+"""Pack clips into records: their source files, or frames decoded at a model's size."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.video import probe_encoded
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
-MAX_FILE = 1 << 28
-"""Maximum size of a source file that is packed, in bytes."""
+MAX_FILE_BYTES = 1 << 28
+"""Maximum size of a packed source file, in bytes."""
 
 
 def pack(
@@ -37,11 +37,11 @@ def pack(
     grid: VideoGrid = WAN_GRID,
     resampling: Resampling = "first",
 ) -> Iterator[str | None]:
-    """Write the shards of clips: decoded at `spec`, or as their source files without one.
+    """Write clips as shards: frames decoded at `spec`, or source files if that is None.
 
-    Clips must fit the latent `grid`; with a `spec`, `resampling` takes their frames. Yields, after
-    each clip, why it was skipped, or None. Raises `InputError` if all were skipped, or if another
-    process writes to the same folder.
+    Clips must fit the latent `grid`. With a `spec`, `resampling` chooses their frames. After each
+    clip, yields why it was skipped, or None. Raises `InputError` if all clips were skipped, or if
+    another process writes to the same folder.
     """
     failed = 0
     check_presence(items)
@@ -82,7 +82,7 @@ def clip_metadata(clip: ClipFiles | Triplet) -> dict[str, object]:
 
 
 def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID) -> Record:
-    """Return a record of the bytes of a clip's files, after the strict checks.
+    """Return a record with the bytes of a clip's files, after the strict checks.
 
     Raises `InputError` listing what `check_clip` finds.
     """
@@ -95,7 +95,7 @@ def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID) -> Record:
     if files.target is not None:
         paths["target"] = files.target
     arrays = {
-        name: np.frombuffer(read_bytes(path, limit=MAX_FILE), np.uint8)
+        name: np.frombuffer(read_bytes(path, limit=MAX_FILE_BYTES), np.uint8)
         for name, path in paths.items()
     }
     arrays["first_frame"] = np.frombuffer(encoded_first_frame(files.first_frame), np.uint8)
@@ -128,7 +128,7 @@ def triplet_record(triplet: Triplet) -> Record:
 
 
 def read_triplets(source: ShardReader) -> Iterator[Triplet]:
-    """Yield the clips of shards of frames or videos at their own length and size.
+    """Yield the clips in shards of frames or videos, at their own length and size.
 
     Raises `InputError` for shards of latents or without targets.
     """
@@ -145,10 +145,10 @@ def read_triplets(source: ShardReader) -> Iterator[Triplet]:
 
 
 def frame_rates(source: ShardReader, count: int) -> set[Fraction]:
-    """Return the frame rates of the first `count` clips of shards; none if they do not say it.
+    """Return the frame rates of the first `count` clips in shards; empty if they are unknown.
 
-    Frames of files do if they were taken by the rule `rate`. Raises `InputError` as `read_triplets`
-    does.
+    Shards of frames know the rate only if the rule `rate` took the frames. Raises `InputError` as
+    `read_triplets` does.
     """
     _check_targets(source)
     manifest = source.manifest

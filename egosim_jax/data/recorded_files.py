@@ -1,4 +1,4 @@
-"""Files that the description of a recording names: their paths, and measured depth."""
+"""Files that a recording's description names: paths and measured depth."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
 DESCRIPTION = "recording.json"
-"""Name of the description in the folder of a recording."""
+"""File name of the description in a recording's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthFiles:
-    """Measured depth: one file per frame, of the image's aspect but maybe another size."""
+    """Measured depth: one file per frame, with the image's aspect ratio but maybe another size."""
 
     paths: tuple[Path | None, ...]
-    """PNG of 16 bits or npy of each frame; None where a frame has none."""
+    """16-bit PNG or npy of each frame; None for a frame without depth."""
     unit_m: float
     """Length of one unit of the files in meters: 0.001 for millimeters."""
 
 
 def stored_path(path: Path, folder: Path) -> str:
-    """Return a path for a description: relative to its folder if it is in it."""
+    """Return a path as a description stores it: relative if it is inside the folder."""
     path = path.resolve()
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
 def found_path(text: Any, folder: Path) -> Path:
-    """Return the path of a file that a description names."""
+    """Return the path of a file that a description names. Raises `InputError`."""
     if not isinstance(text, str) or not text or "\0" in text:
         raise InputError(f"{DESCRIPTION}: {quote(text)} is not a path.")
     path = Path(text)
@@ -43,7 +43,7 @@ def found_path(text: Any, folder: Path) -> Path:
 
 
 def found_depth(written: Any, folder: Path) -> DepthFiles | None:
-    """Return the measured depth that a description names, if any. Raises `InputError`."""
+    """Return the measured depth that a description names, or None. Raises `InputError`."""
     if written is None:
         return None
     paths = written.get("paths") if isinstance(written, dict) else None

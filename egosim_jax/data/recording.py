@@ -1,17 +1,17 @@
-"""Recordings: a stretch of a video and all that a dataset or device knows of it.
+"""Recordings: a segment of a video, and all that a dataset or device knows about it.
 
     recording.json    video and frames in it, rate, size, caption, names, depth files, provenance
     arrays.npz        where known: world_from_camera `f 4 4`, intrinsics_px `3 3`, joints_m
-                      `f n j 3`, and what is known of the scene's points
+                      `f n j 3`, and the fields of the scene's points
 
     {"format": "egosim_jax.recording", "version": 1, "recording_id": "fold_12",
      "video": "/data/fold/12.mp4", "start": 0, "frames": 240, "fps": "30", "height": 1080, ...
      "sha256": "9a..."}
 
-Conventions are those of the project: OpenCV axes (x right, y down, z forward), pixel centers at
-integer coordinates, joints in the world of the cameras. Poses and points are in meters if `metric`,
-else in an unknown unit, in which no hand is given. What is unknown is None, never guessed.
-Paths inside the folder are stored relative to it, all others absolute. Nothing is unpickled.
+The conventions are the project's: OpenCV axes (x right, y down, z forward), pixel centers at integer
+coordinates, joints in the world of the cameras. Poses and points are in meters if `metric`, else in
+an unknown unit; then there are no hands. Unknown values are None, never guessed. Paths inside the
+folder are stored relative to it, all others absolute. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -58,15 +58,15 @@ from egosim_jax.types import (
 FORMAT, VERSION = "egosim_jax.recording", 1
 ARRAYS = "arrays.npz"
 MAX_FRAMES = 1 << 20
-"""Longest recording in frames: about ten hours."""
+"""Maximum length of a recording in frames: about ten hours."""
 MAX_BYTES = 1 << 28
-"""Largest description in bytes."""
+"""Maximum size of a description in bytes."""
 MAX_FPS = 1000
-"""Highest frame rate that is accepted."""
+"""Maximum frame rate."""
 RATE = re.compile(r"[0-9]{1,40}(?:\.[0-9]{1,40}|/[1-9][0-9]{0,39})?")
-"""Frame rate in a description; a fraction with an exponent would be computed in full."""
+"""Frame rate in a description. No exponents: `Fraction("1e999999999")` would fill the memory."""
 MAX_TEXT = 10_000
-"""Longest caption, name or entry of the provenance, in characters."""
+"""Maximum length of a caption, name or entry of the provenance, in characters."""
 _DTYPES = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64",
            "points_m": "float32", "colors": "uint8", "error_px": "float32",
            "frames": "int32", "indices": "int32", "pixels_px": "float32"}  # fmt: skip
@@ -75,7 +75,7 @@ _DTYPES = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A stretch of a video with what is known of its cameras, hands, scene and content."""
+    """A segment of a video, with its cameras, hands, scene and caption where known."""
 
     recording_id: str
     """Unique id, which names the outputs."""
@@ -88,13 +88,13 @@ class Recording:
     fps: Fraction
     """Frame rate of the video in frames per second."""
     height: int
-    """Rows of a frame in pixels, as displayed."""
+    """Height of a displayed frame in pixels."""
     width: int
-    """Columns of a frame in pixels, as displayed."""
+    """Width of a displayed frame in pixels."""
     world_from_camera: Float[np.ndarray, "f 4 4"] | None = None
     """Camera poses in OpenCV axes."""
     intrinsics_px: Float[np.ndarray, "3 3"] | None = None
-    """Pinhole intrinsics of all frames; None also for a lens that is not a pinhole."""
+    """Pinhole intrinsics of all frames; None if unknown or if the lens is not a pinhole."""
     metric: bool = False
     """True if poses, joints and points are in meters; False if their unit is unknown."""
     joints_m: Float[np.ndarray, "f n j 3"] | None = None
@@ -108,12 +108,12 @@ class Recording:
     caption: str | None = None
     """Caption: a sentence about what happens in the video."""
     names: tuple[str, ...] = ()
-    """Names of objects that are acted on; empty if unknown."""
+    """Names of the manipulated objects; empty if unknown."""
     provenance: Mapping[str, str] = field(default_factory=dict)
-    """Dataset, files and decisions of the reader, as free key-value pairs."""
+    """Dataset, files and decisions of the reader, as arbitrary key-value pairs."""
 
     def __post_init__(self) -> None:
-        """Check everything that can be checked without decoding; raise `InputError`."""
+        """Check all fields, without decoding the video. Raises `InputError`."""
         if not is_safe_id(self.recording_id):
             raise InputError(
                 f"recording_id {quote(self.recording_id)} is not a valid file name; use {SAFE_IDS}."
@@ -163,7 +163,7 @@ class Recording:
     ) -> Video:
         """Decode frames `start` to `stop` (exclusive; the end if None) of the recording.
 
-        Raises `InputError` unless all of them are there, and as large as the recording says.
+        Raises `InputError` if a frame is missing or has another size than the recording.
         """
         stop = self.frames if stop is None else stop
         size, name = (self.height, self.width), quote_path(self.video)
@@ -182,14 +182,14 @@ class Recording:
     def read_depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
         """Return measured depth in meters at the image's size, infinite where unknown, or None.
 
-        A smaller map is enlarged by repeating the nearest value, so that edges stay sharp.
+        A smaller map is enlarged by nearest neighbor, so that edges stay sharp.
         """
         if self.depth is None or (path := self.depth.paths[frame]) is None:
             return None
         values = read_depth_image(path) * np.float32(self.depth.unit_m)
         rows, columns = (
-            np.minimum((np.arange(size) + 0.5) * have / size, have - 1).astype(int)
-            for size, have in zip((self.height, self.width), values.shape, strict=True)
+            np.minimum((np.arange(size) + 0.5) * stored / size, stored - 1).astype(int)
+            for size, stored in zip((self.height, self.width), values.shape, strict=True)
         )
         values = values[rows[:, None], columns]
         return np.where(np.isfinite(values) & (values > 0), values, np.float32(np.inf))
@@ -259,7 +259,7 @@ class Recording:
 
     @classmethod
     def load(cls, folder: Path) -> Recording:
-        """Read a recording. Raises `InputError` for what is damaged or not valid."""
+        """Read a recording. Raises `InputError` if it is damaged or invalid."""
         folder = folder.resolve()
         try:
             return _load(folder)
@@ -362,8 +362,8 @@ def _load(folder: Path) -> Recording:
             )
     if sha256(folder / ARRAYS) != written.get("sha256"):
         raise InputError(
-            f"{ARRAYS} is damaged: it is not what {DESCRIPTION} was written for (SHA-256). Import "
-            "it again."
+            f"{ARRAYS} is damaged: its SHA-256 differs from the one in {DESCRIPTION}. Import it "
+            "again."
         )
     arrays: dict[str, Any] = read_arrays(folder / ARRAYS, {}, optional=_DTYPES)
     points = {n: arrays.pop(n) for n in list(_DTYPES)[3:] if n in arrays}

@@ -1,6 +1,6 @@
-"""Records: one clip, or one window of a clip, as named arrays in the bytes of a safetensors file.
+"""Records: one clip, or one window of a clip, serialized as a safetensors file.
 
-The header of the file carries the record's metadata as JSON.
+The header of the file holds the record's metadata as JSON.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Record:
     arrays: Mapping[str, np.ndarray]
     """Read-only arrays by name."""
     metadata: Mapping[str, Any]
-    """JSON values by key: `video_id`, `prompt`, `extra` and further keys of the writer."""
+    """JSON values by key: `video_id`, `prompt`, `extra` and the writer's further keys."""
 
 
 def to_bytes(record: Record) -> bytes:
@@ -48,7 +48,7 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     try:
         arrays = {
             key: np.frombuffer(tensor["data"], _DTYPES[tensor["dtype"]]).reshape(tensor["shape"])
-            # safetensors returns them in any order.
+            # safetensors returns tensors in arbitrary order; records must be reproducible.
             for key, tensor in sorted(safetensors.deserialize(data), key=lambda pair: pair[0])
         }
         length = int.from_bytes(data[:8], "little")

@@ -1,4 +1,4 @@
-"""Points of a scene as a capture knows them."""
+"""Scene points of a capture, with colors and observations."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from jaxtyping import Float32, Int32, UInt8
 from egosim_jax.types import InputError
 
 MAX_POINTS = 1 << 26
-"""Largest number of points, or of observations of them."""
+"""Maximum number of points, and of observations."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class ScenePoints:
-    """Points of the scene, with their colors and the pixels that observe them where known."""
+    """Scene points, with colors and the pixels that observe them where known."""
 
     points_m: Float32[np.ndarray, "p 3"]
-    """Positions in the world, in meters or in the unit of the cameras."""
+    """World positions, in the unit of the camera poses."""
     colors: UInt8[np.ndarray, "p 3"] | None = None
     """Colors of the points."""
     error_px: Float32[np.ndarray, " p"] | None = None
     """Mean reprojection error of each point, in pixels."""
     frames: Int32[np.ndarray, " o"] | None = None
-    """Frame of each observation, counted from the recording's first."""
+    """Frame index of each observation, from the recording's first frame."""
     indices: Int32[np.ndarray, " o"] | None = None
-    """Point of each observation."""
+    """Point index of each observation."""
     pixels_px: Float32[np.ndarray, "o 2"] | None = None
     """Column and row of each observation, in pixels."""
 
@@ -53,13 +53,13 @@ class ScenePoints:
             value = getattr(self, name)
             if value is None:
                 continue
-            have = f"{getattr(value, 'dtype', type(value).__name__)} {np.shape(value)}"
-            if have != f"{dtype} {shape}" or not np.isfinite(value).all():
+            found = f"{getattr(value, 'dtype', type(value).__name__)} {np.shape(value)}"
+            if found != f"{dtype} {shape}" or not np.isfinite(value).all():
                 raise InputError(
-                    f"{name} of the points is {have}: it must be finite {dtype} {shape}."
+                    f"{name} of the points is {found}: it must be finite {dtype} {shape}."
                 )
         if seen > MAX_POINTS:
-            raise InputError(f"{seen:,} observations are more than {MAX_POINTS:,}, the most.")
+            raise InputError(f"{seen:,} observations exceed the maximum, {MAX_POINTS:,}.")
         if self.indices is not None and seen:
             low, high = int(self.indices.min()), int(self.indices.max())
             if not 0 <= low <= high < count:
@@ -68,7 +68,7 @@ class ScenePoints:
                 )
 
     def within(self, start: int, stop: int) -> ScenePoints:
-        """Return the same points with the observations of some frames, which start at 0 then."""
+        """Return the points with the observations in a range of frames, renumbered from 0."""
         if self.frames is None or self.indices is None or self.pixels_px is None:
             return self
         kept = (self.frames >= start) & (self.frames < stop)

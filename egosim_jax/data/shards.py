@@ -8,9 +8,9 @@ A folder holds `manifest.json` and `shard-00000.array_record`, ... There are thr
     latents   inputs of a training step: latents "f h w c", packed mask "f h w m", embeddings, ...
 
 All records of a folder hold the same arrays. A folder is written next to its destination and
-renamed in one step, so that it is complete or absent. Reading trusts nothing: the manifest is
-validated, file sizes are compared with it at opening, ArrayRecord verifies its own hashes on every
-read, and `check` verifies the SHA-256 of the files and decodes every record.
+renamed in one step, so it is complete or absent. Reading trusts nothing. The manifest is validated,
+file sizes are compared with it at opening, and ArrayRecord verifies its own hashes on every read.
+`check` also verifies the SHA-256 of the files and decodes every record.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _OPTIONS = "group_size:1,uncompressed"
 
 
 class ShardWriter(AbstractContextManager["ShardWriter"]):
-    """A context manager that writes a folder of shards, or nothing if an exception ends it.
+    """A context manager that writes a folder of shards; an exception leaves no folder.
 
     An existing dataset is replaced only with `overwrite`, in one step, once the new one is
     complete. Raises `InputError` if the folder holds a dataset or other files, or if records
@@ -197,8 +197,8 @@ def gather(
 ) -> Manifest:
     """Concatenate folders of shards into one by renaming their files; write its manifest last.
 
-    All parts were written with the same kind, spec and provenance, to which `provenance` is added.
-    The same call resumes an interrupted one. Raises `InputError` naming missing parts, and shards
+    All parts must have the same kind, spec and provenance; `provenance` is added. Calling again
+    resumes an interrupted call. Raises `InputError` naming missing parts, and shards
     that differ from the manifest of their part.
     """
     missing = [part.name for part in parts if not (part / MANIFEST).exists()]

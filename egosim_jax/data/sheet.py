@@ -1,4 +1,4 @@
-"""Contact sheets: frames of several videos on one image."""
+"""Contact sheets: frames of several videos in one image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class SheetClip:
 def draw_sheet(
     clips: Sequence[SheetClip], out: Path, *, moments: Sequence[int], width: int | None = None
 ) -> None:
-    """Draw a row for each video of each clip, with its frames at `moments`.
+    """Draw one row per video of each clip, with the frames at the indices `moments`.
 
     The last frame replaces frames beyond the end. Frames are resized to `width` pixels, if given.
     """

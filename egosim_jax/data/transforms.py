@@ -1,8 +1,8 @@
-"""Resizing and windowing of videos for a model; the same code in training and inference.
+"""Resize and cut videos for a model, with the same code in training and inference.
 
 Every video is resized to the model's size, without cropping and without keeping the aspect ratio:
-colors with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Videos that already have
-the right size stay unchanged.
+colors with Pillow's LANCZOS filter, masks with BILINEAR (EgoSim release). Videos of the right size
+stay unchanged.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from egosim_jax.io.video import decode_video, probe_encoded
 from egosim_jax.types import InputError, VideoSpec
 
 Resampling = Literal["first", "stride", "linspace", "rate"]
-"""Rule by which frames of a clip are taken (`resample`)."""
+"""Rule that chooses the frames of a clip (`resample`)."""
 COLORS = ("target", "prior", "hands")
 """Names of the color videos of a record."""
 
@@ -49,14 +49,14 @@ def resize_mask(
 
 
 def resample(count: int, frames: int, rule: Resampling, *, step: int = 1) -> Int[np.ndarray, " n"]:
-    """Return the frames of a clip of `count` that are taken, at most `frames`.
+    """Return the indices of at most `frames` frames to take from a clip of `count`.
 
     first      the first ones, without gaps
-    stride     every (count // frames)-th from the first: DWM's loader of videos
-    linspace   from the first to the last, at equal distances and rounded; DWM's encoder of latents,
-               which repeats frames of a clip that is too short
-    rate       every `step`-th from the first: the evaluation behind DWM's tables, whose step is the
-               clip's frame rate through 8, rounded down
+    stride     every (count // frames)-th from the first, as DWM's video loader does
+    linspace   from the first to the last, equally spaced and rounded, as DWM's latent encoder does;
+               a clip that is too short repeats frames
+    rate       every `step`-th from the first, as in the evaluation behind DWM's tables, whose step
+               is the clip's frame rate divided by 8, rounded down
     """
     match rule:
         case "linspace":
@@ -78,7 +78,7 @@ class DecodeWindow(grain.transforms.RandomMap):
     """A transform that cuts a random window of `spec.frames` frames out of a record.
 
     Takes records of kind "videos", which it decodes, and of kind "frames". Returns `target`,
-    `prior`, `hands`, `mask` and `first_frame`; the image is that of the clip for every window.
+    `prior`, `hands`, `mask` and `first_frame`, which is the clip's image for every window.
     """
 
     spec: VideoSpec
@@ -86,10 +86,10 @@ class DecodeWindow(grain.transforms.RandomMap):
 
     def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
         """Cut the same window out of every video. Raises `InputError` if the clip is shorter."""
-        have = record_length(element)
-        if have < self.spec.frames:
-            raise InputError(f"{have} frames are fewer than the window's {self.spec.frames}.")
-        start = int(rng.integers(0, have - self.spec.frames + 1))
+        length = record_length(element)
+        if length < self.spec.frames:
+            raise InputError(f"{length} frames are fewer than the window's {self.spec.frames}.")
+        start = int(rng.integers(0, length - self.spec.frames + 1))
         return decode_record(element, self.spec, start=start)
 
 
@@ -137,7 +137,7 @@ def decode_record(
 ) -> dict[str, np.ndarray]:
     """Return frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
 
-    Without a mask everything is observed. Raises `InputError` naming the video that cannot be
+    Without a mask, every pixel is observed. Raises `InputError` naming the video that cannot be
     decoded or is too short.
     """
     stop = start + spec.frames

@@ -1,6 +1,6 @@
-"""Windows of clips for which a clip is generated, and the file of their results.
+"""Windows of clips to generate, and the file of their results.
 
-Of the lines of results.jsonl the last one of an id counts.
+The last line of an id in results.jsonl is the valid one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Window:
     start: int
     """First frame of the window in the clip."""
     output_id: str
-    """Stem of the output files."""
+    """Name of the output files, without suffix."""
 
     @property
     def split(self) -> str:
@@ -40,9 +40,9 @@ class Window:
 
 
 def windows_of(clips: Iterable[ClipFiles], starts: Sequence[int]) -> list[Window]:
-    """Return the windows of clips that start at some frames.
+    """Return the windows of all clips that start at the frames `starts`.
 
-    With several starts the ids are {video_id}_{start}.
+    With several starts, the ids are {video_id}_{start}.
     """
     several = len(starts) > 1
     return [
@@ -78,7 +78,7 @@ def _is_result(line: Any) -> bool:
 
 
 def conditions_sha256(files: ClipFiles) -> str:
-    """Return the SHA-256 of the files of a clip's conditions, of those that exist, by role."""
+    """Return one SHA-256 of a clip's condition files: the hash of each existing file by role."""
     roles = {
         "prior": files.prior,
         "mask": files.mask,

@@ -1,9 +1,13 @@
-"""Readers of datasets and captures, each of which finds recordings and reads them one by one.
+"""Readers of datasets and captures: each finds recordings and reads them one by one.
 
-A reader is a frozen dataclass: where the data is, and the choices that a user may make. `find`
-lists what is there without reading it, so that an interrupted import resumes quickly; an entry's
-`read` checks everything and raises `InputError` for what it cannot use, and the others are read
-nevertheless. Cameras, units, joint order and pixel centers of each format are stated in its module.
+A reader is a frozen dataclass with the path of the data and the user's options. `find` lists the
+entries without reading them, so that an interrupted import resumes quickly. `Entry.read` checks
+everything and raises `InputError` for an unusable recording; the import continues with the others.
+Each module documents its format's cameras, units, joint order and pixel centers.
+
+- Reader, Entry: the protocol of a reader, and a recording that it found
+- make_id, natural_order: id from path parts, sort key of numbered names
+- inside, find_files, require: checks of paths, files and optional libraries
 """
 
 from __future__ import annotations
@@ -21,16 +25,16 @@ from egosim_jax.types import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A recording that a reader found, and how to read it."""
+    """A recording that a reader found, and the function that reads it."""
 
     recording_id: str
     """Unique id, which names the folder."""
     read: Callable[[Path], Recording]
-    """Function that reads it, given the folder for what it has to write."""
+    """Function that reads it, given a folder for files that it has to write."""
     source: Path
     """File or folder that it is read from."""
     options: Mapping[str, str] = field(default_factory=dict)
-    """Choices of the user that its content depends on, by option."""
+    """The user's options that its content depends on, and their values."""
 
 
 @runtime_checkable
@@ -41,7 +45,7 @@ class Reader(Protocol):
     """Name of the dataset on the command line."""
 
     def find(self) -> Iterable[Entry]:
-        """List what is there. Raises `InputError` if the source is not such a dataset."""
+        """List the recordings. Raises `InputError` if the source is not such a dataset."""
         ...
 
 
@@ -51,7 +55,7 @@ def make_id(parts: Sequence[str]) -> str:
 
 
 def inside(root: Path, name: object, *, what: str) -> Path:
-    """Return the path of a file that an untrusted file names, which must be below `root`."""
+    """Return the path that an untrusted file names. Raises `InputError` unless it is below `root`."""
     path = Path(name) if isinstance(name, str) and name and "\0" not in name else None
     if path is None or path.is_absolute() or ".." in path.parts:
         raise InputError(
@@ -72,7 +76,7 @@ def require(module: str) -> None:
 
 
 def find_files(source: Path, pattern: str, *, what: str) -> list[Path]:
-    """Return the files below a folder that match, or the file itself, in natural order."""
+    """Return the matching files below a folder, or the file itself, in natural order."""
     found = [source] if source.is_file() else sorted(source.rglob(pattern), key=natural_order)
     if not found:
         raise InputError(

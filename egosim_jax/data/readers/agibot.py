@@ -8,20 +8,20 @@
         right; state/effector/position `n 2`, opening in millimeters
     task_info/task_<task>.json: parts of each episode, with start, end and a sentence
 
-or, as in the challenges, the video, the two JSON and the h5 in one folder. A recording is a part
-of an episode, as in EgoSim's ids, or all of it where no parts are known. The world is the robot's
-base.
+or, as in the challenges, the video, the two JSON files and the h5 file in one folder. A recording is
+a part of an episode, as in EgoSim's ids, or the complete episode if it has no parts. The world is
+the robot's base.
 
-Two readings of the extrinsics are in use, camera to base and base to camera. The points between
-the fingers are projected by both, and the reading that puts more of them into the image is taken
-and recorded; with none or no difference the recording is refused unless the user decides.
+Two readings of the extrinsics are in use: camera to base, and base to camera. Both project the
+points between the fingers. The reading that puts more points into the image is taken and recorded.
+If the counts do not differ, the recording is refused unless the user decides.
 
-A gripper has three joints: the flange, and the tips of thumb and index finger, `TOOL_M` along the
-flange's z axis and half of the opening apart along its y axis. The set documents the opening as
-growing when the gripper opens, other users found the reverse; where the command (0 open, 1 closed)
-and the measured value change together, its sign decides. Intel's cameras have pixel centers at
-integers. A lens that is not a pinhole is remapped, which writes a video. Followed: the set's card
-of 2025 and the loaders of its challenges.
+A gripper has three joints: the flange, and the tips of thumb and index finger. The tips are `TOOL_M`
+along the flange's z axis, and half of the opening to either side along its y axis. The dataset
+documents that the value grows when the gripper opens; other users found the reverse. If the measured
+value grows with the command (0 open, 1 closed), it is inverted. Intel's cameras have pixel centers
+at integers. A lens that is not a pinhole is remapped, which writes a video. Followed: the dataset's
+card of 2025 and the loaders of its challenges.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ from egosim_jax.types import Cameras, InputError
 
 TOOL_M = 0.23
 """Distance from the flange to the fingertips along its z axis, in meters, as EnerVerse-AC draws."""
-OPEN_MM = 120.0
-"""Largest value of the opening in millimeters."""
+MAX_OPENING_MM = 120.0
+"""Maximum opening of a gripper in millimeters."""
 MAX_SURPLUS = 2
-"""Most frames by which video, poses and states of an episode may differ in number."""
+"""Maximum difference in length of video, poses and states of an episode, in frames."""
 CHUNK = 64
-"""Frames that are remapped at a time."""
+"""Number of frames to remap at a time."""
 Reading = Literal["camera_to_base", "base_to_camera"]
 
 
@@ -169,7 +169,7 @@ class AgiBot:
     def _decide(
         self, matrices: Float[np.ndarray, "f 4 4"], tools: Float[np.ndarray, "f 2 3"], lens: Lens
     ) -> tuple[Float[np.ndarray, "f 4 4"], dict[str, str]]:
-        """Return camera poses in the base by the reading that sees the grippers, and its shares."""
+        """Return camera poses in the base by the chosen reading, and the evidence for it."""
         readings: dict[Reading, np.ndarray] = {
             "camera_to_base": matrices, "base_to_camera": invert(matrices),
         }  # fmt: skip
@@ -191,7 +191,7 @@ class AgiBot:
 def share_in_view(
     poses: Float[np.ndarray, "f 4 4"], tools: Float[np.ndarray, "f 2 3"], lens: Lens
 ) -> float:
-    """Return the share of points between the fingers that camera poses put into the image."""
+    """Return the fraction of points between the fingers that are inside the image."""
     local = transform(invert(poses), tools)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = project(lens.intrinsics_px, local)
@@ -230,7 +230,7 @@ def _text(entry: Mapping[str, Any], name: str) -> str | None:
 
 
 def _span(part: _Part, counts: Mapping[str, int]) -> slice:
-    """Return the frames of a part, which video, poses and states must all have."""
+    """Return the frames of a part. Raises `InputError` if video, poses or states lack them."""
     written = ", ".join(f"{name} {count}" for name, count in counts.items())
     if max(counts.values()) - min(counts.values()) > MAX_SURPLUS:
         raise InputError(
@@ -242,7 +242,7 @@ def _span(part: _Part, counts: Mapping[str, int]) -> slice:
     if not 0 <= part.start < stop or (part.stop or 0) > length + MAX_SURPLUS:
         raise InputError(
             f"Part {part.number} is from frame {part.start} to {part.stop}: the episode has "
-            f"{written}, and a part at least one frame of it."
+            f"{written}, and a part must have at least one frame of it."
         )
     return slice(part.start, stop)
 
@@ -291,7 +291,7 @@ def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"]:
 def _read_grippers(
     path: Path,
 ) -> tuple[Float[np.ndarray, "f 2 3 3"], Float[np.ndarray, "f 2 3"], dict[str, str]]:
-    """Return joints and points between the fingers in the base, and how the opening was read."""
+    """Return joints and points between the fingers in the base, and the reading of the opening."""
     end, effector = "state/end", "effector/position"
     shapes = {f"{end}/position": (None, 2, 3), f"{end}/orientation": (None, 2, 4),
               f"state/{effector}": (None, None)}  # fmt: skip
@@ -308,8 +308,11 @@ def _read_grippers(
         return np.full((len(positions), 2, 3, 3), np.nan), tools, {"hands": "not grippers"}
     notes = {"opening": "grows when it opens"}
     if _closes(arrays.get(f"action/{effector}"), opening):
-        opening, notes = OPEN_MM - opening, {"opening": "grows when it closes, as the command"}
-    half = np.clip(opening, 0, OPEN_MM) / 2000
+        opening, notes = (
+            MAX_OPENING_MM - opening,
+            {"opening": "grows when it closes, as the command"},
+        )
+    half = np.clip(opening, 0, MAX_OPENING_MM) / 2000
     zero = np.zeros_like(half)
     local = np.stack(
         [np.stack([zero, side * half, zero + along], axis=-1)

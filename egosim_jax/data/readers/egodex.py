@@ -1,4 +1,4 @@
-"""EgoDex: videos of a headset with poses of the camera and of both hands, from ARKit.
+"""EgoDex: headset videos with ARKit's poses of the camera and of both hands.
 
     <split>/<task>/<id>.hdf5 and .mp4, 1920x1080, 30 frames per second
         camera/intrinsic          3 3, pixels
@@ -7,12 +7,12 @@
         attributes                llm_description, llm_description2, which_llm_description,
                                   llm_type, llm_objects
 
-EgoSim's cuts of such files, `<id>_<start>_<end>.hdf5` of 121 poses at 16 frames per second, have
-cameras alone. The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary origin.
-Of the 25 joints of a hand the four metacarpals are not used: our 21 are the wrist (`Hand`), the
-thumb from Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of index, middle,
-ring and little finger. Columns and rows count from the corner of the image (its center is at
-960, 540), so that half a pixel is subtracted. Followed: Apple's loader of the set as of 2025.
+EgoSim's cuts of such files, `<id>_<start>_<end>.hdf5` with 121 poses at 16 frames per second, have
+cameras but no hands. The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary
+origin. The dataset has 25 joints per hand. Our 21 omit the four metacarpals: they are the wrist
+(`Hand`), the thumb from Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of
+index, middle, ring and little finger. Pixel coordinates start at the corner of the image (its center
+is at 960, 540), so half a pixel is subtracted. Followed: Apple's loader as of 2025.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from egosim_jax.types import Cameras, InputError
 _SEGMENTS = ("Knuckle", "IntermediateBase", "IntermediateTip", "Tip")
 _FINGERS = ("Thumb", "IndexFinger", "MiddleFinger", "RingFinger", "LittleFinger")
 JOINT_NAMES = ("Hand", *(finger + segment for finger in _FINGERS for segment in _SEGMENTS))
-"""Names of our 21 keypoints in the set, without the side."""
+"""The dataset's names of our 21 keypoints, without the side."""
 SIDES = ("left", "right")
 TEXTS = ("llm_description", "llm_description2", "which_llm_description", "llm_type", "llm_objects")
-"""Attributes that are read."""
+"""Attributes to read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +51,9 @@ class EgoDex:
 
     dataset: ClassVar[str] = "egodex"
     source: Annotated[Path, tyro.conf.Positional]
-    """Folder of the set, of a split or of a task, or one .hdf5 file."""
+    """Folder of the dataset, a split or a task, or one .hdf5 file."""
     min_confidence: float = 0.1
-    """Median confidence of a hand's joints below which it is missing from a frame."""
+    """Minimum median confidence of a hand's joints; below it, the hand is missing from the frame."""
 
     def find(self) -> Iterator[Entry]:
         """List the .hdf5 files."""
@@ -138,15 +138,15 @@ class EgoDex:
 def _fit_intrinsics(
     intrinsics: Float[np.ndarray, "3 3"], height: int, width: int
 ) -> Float[np.ndarray, "3 3"]:
-    """Return intrinsics of pixel centers at integers, for a video that may have been resized.
+    """Return intrinsics with pixel centers at integers, for a video that may have been resized.
 
-    The principal point is the center of the image, from which its size follows.
+    The principal point is the image center, so it gives the size of the original image.
     """
     columns, rows = 2 * intrinsics[0, 2], 2 * intrinsics[1, 2]
     if not (columns > 0 and rows > 0 and abs(columns * height - rows * width) < 2 * columns):
         raise InputError(
             f"camera/intrinsic is for an image of {columns:g}x{rows:g}, the video has "
-            f"{width}x{height}: it must have the same aspect. Use the video that belongs to it."
+            f"{width}x{height}: it must have the same aspect. Use the matching video."
         )
     fitted = intrinsics.copy()
     fitted[:2] *= width / columns
@@ -157,7 +157,7 @@ def _fit_intrinsics(
 def _texts(texts: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
     """Return the caption and the names of objects.
 
-    Of a task that can be reversed, `which_llm_description` names the one that was done.
+    For a reversible task, `which_llm_description` says which direction was recorded.
     """
     first = {name: values[0] for name, values in texts.items() if values}
     reversible = first.get("llm_type") == "reversible"

@@ -1,13 +1,13 @@
-"""Clips that EgoSim's release prepares: a video with the cameras of Depth Anything 3.
+"""Clips of EgoSim's data preparation: a video with cameras from Depth Anything 3.
 
     video_16fps.mp4 or video.mp4, caption.txt
-    _proc/poses_da3_smoothed or _proc/poses_da3, at any depth in it:
+    _proc/poses_da3_smoothed or _proc/poses_da3, at any depth:
         extrinsics_000000.npy `4 4`, world to camera, OpenCV axes; intrinsics_000000.npy `3 3`;
         depth_000000.npy `h w` of the first frame
 
-One pose per frame of the video is needed, and the smoothed ones are preferred. Pixel centers are at
-integers, as points are back-projected there. Depth Anything 3 estimates meters, so that `metric` is
-True, with its error. Hands are those of HaMeR in _proc/mano_full (`hamer`), if that is there.
+Every frame needs a pose, and smoothed poses are preferred. Pixel centers are at integers, because
+the release back-projects points from integers. Depth Anything 3 estimates meters, so `metric` is
+True, up to its error. Hands come from HaMeR's results in _proc/mano_full (`hamer`), if they exist.
 Followed: jinkun-hao/EgoSim of 2026, `data_process`.
 """
 
@@ -34,20 +34,20 @@ from egosim_jax.io.segments import probe_long_video
 from egosim_jax.types import Cameras, InputError
 
 VIDEOS = ("video_16fps.mp4", "video.mp4")
-"""Names of the video, the one that poses belong to first."""
+"""Names of the video; poses belong to the first."""
 MAX_DRIFT = 0.02
-"""Largest relative change of the focal length over the frames, whose median is taken."""
+"""Maximum relative change of the focal length over the frames; the median is used."""
 MAX_CAPTION_BYTES = 10_000
-"""Largest caption in bytes."""
+"""Maximum size of a caption in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EgoSimClips:
-    """Clips as EgoSim's data preparation leaves them: cameras, caption, first depth."""
+    """Clips of EgoSim's data preparation: cameras, caption, depth of the first frame."""
 
     dataset: ClassVar[str] = "egosim"
     source: Annotated[Path, tyro.conf.Positional]
-    """Folder of one clip, or of several."""
+    """Folder of one clip, or folder of such folders."""
 
     def find(self) -> Iterator[Entry]:
         """List the folders with a video and `_proc`."""
@@ -123,7 +123,7 @@ def _read(clip: Path, folder: Path) -> Recording:
 
 
 def _find_poses(folder: Path) -> Path:
-    """Return the folder of extrinsics, the smoothed ones if there are any."""
+    """Return the folder of extrinsics; smoothed ones are preferred."""
     found = sorted({path.parent for path in folder.rglob("extrinsics_*.npy")})
     if not found:
         raise InputError(f"{quote_path(folder)} has no extrinsics_*.npy at any depth.")

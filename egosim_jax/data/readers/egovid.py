@@ -2,15 +2,15 @@
 
     *.csv                   video_id `<uuid>_<start>_<end>`, name, llava_cap, noun_cls, ...
     poses/<video_id>/       intri.npy `3 3` at 540 rows, fused_pose.npy or sfm_pose.npy `f 4 4`
-    <video_id>.mp4          clips, or Ego4D's videos <uuid>.mp4, from which frames start to end are
-                            taken (without the last)
+    <video_id>.mp4          clips, or Ego4D's videos <uuid>.mp4, cut to frames start to end
+                            (exclusive)
 
-Neither the direction of the poses (camera to world or the reverse) nor the pixel centers are
-documented: the direction is decided from the video by epipolar geometry (`pose_reading`) and
-recorded, and left unknown if the video does not decide; pixel centers are taken as integers. Poses
-count only if there is one per frame of the clip. The fused poses come from structure from motion
-that was scaled by an accelerometer: the scale is not trusted, so that `metric` is False. Hands are
-not part of the set. Followed: the set's README of 2025.
+The dataset documents neither the direction of the poses (camera to world or the reverse) nor the
+pixel centers. The direction is decided from the video by epipolar geometry (`pose_reading`) and
+recorded; poses stay unknown if the video does not decide. Pixel centers are assumed at integers.
+Poses are used only if every frame of the clip has one. The fused poses are structure from motion
+scaled by an accelerometer. That scale is not trusted, so `metric` is False. The dataset has no
+hands. Followed: its README of 2025.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from egosim_jax.types import InputError
 POSES = ("fused_pose.npy", "sfm_pose.npy")
 """Files of poses, the recommended one first."""
 ROWS = 540
-"""Rows of the images that the intrinsics are for."""
+"""Height in pixels of the images that the intrinsics are for."""
 MAX_NPY_BYTES = 1 << 24
-"""Largest file of poses in bytes."""
+"""Maximum size of a file of poses in bytes."""
 MAX_LINE = 1 << 20
-"""Longest line of a table in characters."""
+"""Maximum length of a line in a table, in characters."""
 _ID = re.compile(r"([A-Za-z0-9-]+)_(\d{1,9})_(\d{1,9})")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EgoVid:
-    """EgoVid-5M: captions, and cameras where the set has them."""
+    """EgoVid-5M: captions, and cameras where the dataset has them."""
 
     dataset: ClassVar[str] = "egovid"
     source: Annotated[Path, tyro.conf.Positional]
     """Folder with the CSV files and poses/, or one CSV file in it."""
     videos: Path | None = None
-    """Folder with the videos at any depth, by default that of the CSV file."""
+    """Folder with the videos at any depth; by default the folder of the CSV file."""
 
     def find(self) -> Iterator[Entry]:
-        """List the rows whose video exists; a table names far more than anyone downloads."""
+        """List the rows whose video exists; the tables name more videos than users download."""
         root = self.source if self.source.is_dir() else self.source.parent
         folder = self.videos or root
         videos = {path.stem: path for path in sorted(folder.rglob("*.mp4"))}
@@ -136,7 +136,7 @@ def _halve(frame: np.ndarray) -> np.ndarray:
 
 
 def read_matrices(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return the finite numbers of an npy file as float64; None in a shape is any size."""
+    """Return the finite numbers of an npy file as float64; None in a shape allows any size."""
     name = quote_path(path)
     try:
         values = read_npy(read_bytes(path, limit=MAX_NPY_BYTES), name)
@@ -145,7 +145,7 @@ def read_matrices(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
             raise
         raise InputError(f"{name} is not a readable npy file: {quote_text(str(error))}.") from error
     fits = values.ndim == len(shape)
-    if not fits or any(w not in (None, h) for h, w in zip(values.shape, shape, strict=True)):
+    if not fits or any(n not in (None, size) for size, n in zip(values.shape, shape, strict=True)):
         raise InputError(f"{name} has shape {values.shape}; expected {shape}.")
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         raise InputError(f"{name} holds {values.dtype} that are not all finite numbers.")
@@ -158,7 +158,7 @@ def _split(video_id: str) -> tuple[str, int, int]:
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:
-    """Yield the rows of a table, which may have gigabytes, one by one."""
+    """Yield the rows of a table one by one; a table may have gigabytes."""
     name = quote_path(path)
     try:
         with open_regular(path) as file:

@@ -1,13 +1,13 @@
-"""Hands that HaMeR estimated, as JSON of EgoSim's `mano_full`: a source of joints for a recording.
+"""HaMeR's hands, as JSON of EgoSim's `mano_full`: a source of joints for a recording.
 
     {"frames": [{"frame_idx": 0, "hands": [{"is_right": 1, "confidence": .9,
         "cam_t_full": [x, y, z], "keypoints_3d": 21 x 3, ...}]}]}
 
-The keypoints are those of a right hand in meters, in our order, without its place; a left one is
-mirrored in x. `cam_t_full` places it before a camera whose focal length is 5000 / 256 of the longer
-side of the image and whose center is that of the image, counted from its corner. That camera is
-not the recording's: the pixels are kept, and the hand is placed so that the recording's camera sees
-it there, by linear least squares. Of several hands of one side the most confident is taken.
+The keypoints describe a right hand in meters, in our order, without its position. A left hand is
+mirrored in x. `cam_t_full` is the hand's position in HaMeR's camera: its focal length is 5000 / 256
+of the image's longer side, and its principal point is the image center, counted from the corner.
+The recording has another camera, so the hand is moved until that camera sees it at the same pixels,
+by linear least squares. If a side has several hands, the most confident one is used.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.types import Cameras, InputError
 
 FOCAL = 5000 / 256
-"""Focal length of HaMeR's camera, in longer sides of the image."""
+"""Focal length of HaMeR's camera, relative to the longer side of the image."""
 MAX_BYTES = 1 << 28
-"""Largest file in bytes."""
+"""Maximum size of a file in bytes."""
 
 
 def read_hamer(path: Path, cameras: Cameras) -> Float[np.ndarray, "f 2 21 3"]:
     """Return joints in the world, left before right, NaN where there is no hand.
 
-    Raises `InputError` if the file is not of HaMeR, or names frames that the cameras do not have.
+    Raises `InputError` if the file is not HaMeR's, or names frames that the cameras do not have.
     """
     written = read_json(path, limit=MAX_BYTES)
     frames = written.get("frames") if isinstance(written, dict) else None
@@ -49,23 +49,24 @@ def read_hamer(path: Path, cameras: Cameras) -> Float[np.ndarray, "f 2 21 3"]:
                 f"must be from 0 to {count - 1}. Run HaMeR on the same video."
             )
         for hand in hands:
-            side, confidence, points, place = _hand(hand, path)
+            side, confidence, points, position = _hand(hand, path)
             if confidence > best[number, side]:
                 best[number, side] = confidence
-                local = place_hand(points, place, cameras)
+                local = place_hand(points, position, cameras)
                 joints[number, side] = transform(cameras.world_from_camera[number], local)
     return joints
 
 
 def place_hand(
-    points: Float[np.ndarray, "21 3"], place: Float[np.ndarray, " 3"], cameras: Cameras
+    points: Float[np.ndarray, "21 3"], position: Float[np.ndarray, " 3"], cameras: Cameras
 ) -> Float[np.ndarray, "21 3"]:
-    """Return a hand in camera coordinates, placed where HaMeR's camera and ours see it alike."""
-    seen = points + place
+    """Return a hand in camera coordinates that projects to the same pixels as in HaMeR's camera."""
+    seen = points + position
     focal = FOCAL * max(cameras.height, cameras.width)
     center = np.array([cameras.width / 2, cameras.height / 2]) - 0.5
     pixels = focal * seen[:, :2] / seen[:, 2:] + center
     rays = (pixels - cameras.intrinsics_px[:2, 2]) / cameras.intrinsics_px[[0, 1], [0, 1]]
+    # Each pixel gives two linear equations for the translation t: t_xy - ray t_z = ray z - xy.
     rows = np.zeros((21, 2, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = 1
     rows[:, :, 2] = -rays
@@ -75,26 +76,26 @@ def place_hand(
 
 
 def _hand(hand: Any, path: Path) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Return side, confidence, keypoints and place of a hand."""
+    """Return side, confidence, keypoints and position of a hand."""
     written: dict[str, Any] = hand if isinstance(hand, dict) else {}
     try:
         right = _first(written.get("is_right"))
         confidence = _first(written.get("confidence", 0.0))
         points = np.array(written.get("keypoints_3d"), float).reshape(21, 3)
-        place = np.array(written.get("cam_t_full"), float).reshape(3)
+        position = np.array(written.get("cam_t_full"), float).reshape(3)
     except (TypeError, ValueError, IndexError) as error:
         raise InputError(
             f"{quote_path(path)}: a hand must have is_right, cam_t_full of 3 and keypoints_3d of "
             "21 x 3 numbers. Run EgoSim's reconstruct_full_mano.py first."
         ) from error
     finite = np.isfinite([right, confidence]).all() and np.isfinite(points).all()
-    if right not in (0.0, 1.0) or not finite or not np.isfinite(place).all():
+    if right not in (0.0, 1.0) or not finite or not np.isfinite(position).all():
         raise InputError(f"{quote_path(path)}: a hand has values that are not finite.")
-    if (points[:, 2] + place[2] <= 0).any():
+    if (points[:, 2] + position[2] <= 0).any():
         raise InputError(f"{quote_path(path)}: a hand is behind the camera.")
-    return int(right), confidence, points * [2 * right - 1, 1, 1], place
+    return int(right), confidence, points * [2 * right - 1, 1, 1], position
 
 
 def _first(value: Any) -> float:
-    """Return a number that may be in a list."""
+    """Return a number, or the first number of a list."""
     return float(np.ravel(value)[0])

@@ -1,4 +1,4 @@
-"""Joints of hands as datasets give them, made fit for a recording."""
+"""Clean the hand joints of a dataset for a recording."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from egosim_jax.types import HAND_SIZE_M, Cameras, InputError, near_view
 def clean_joints(
     joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras
 ) -> tuple[Float[np.ndarray, "f n j 3"], dict[str, str]]:
-    """Return joints with NaN for hands that are implausible or never near the view, and the counts.
+    """Return joints with NaN for hands that are implausible or never near the view, and counts.
 
-    Raises `InputError` if hands are given and none ever comes near the view: then joints and
+    Raises `InputError` if there are hands but none is ever near the view, because then joints and
     cameras are not in one world.
     """
     joints = np.array(joints_m, float)
@@ -27,8 +27,8 @@ def clean_joints(
     given = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
     if given.any() and not seen.any():
         raise InputError(
-            "No joint of its hands comes near the view of the camera in any frame: joints and "
-            "camera poses must be in one world, in meters. The recording is of no use for hands."
+            "No hand joint comes near the camera's view in any frame: joints and camera poses must "
+            "be in one world, in meters. The recording cannot be used for hands."
         )
     joints[:, ~seen] = np.nan
     counts = {

@@ -1,6 +1,6 @@
-"""HOT3D clips: five seconds of Aria or Quest 3 with cameras and both hands, a tar file each.
+"""HOT3D clips: tar files of five seconds from Aria or Quest 3, with cameras and both hands.
 
-    <n>.image_<stream>.jpg      images; stream 214-1 is Aria's in color
+    <n>.image_<stream>.jpg      images; stream 214-1 is Aria's color camera
     <n>.cameras.json            per stream: T_world_from_camera, and calibration of a fisheye624
     <n>.hands.json              per side: umetrack_pose with joint_angles and T_world_from_wrist
     <n>.info.json               timestamps in nanoseconds
@@ -8,9 +8,9 @@
 
 Transforms are quaternions w x y z and translations in meters; camera axes are OpenCV's, pixel
 centers at integers. The fisheye is remapped to a pinhole. Aria's color camera is mounted sideways:
-its images are turned clockwise by 90 degrees, and the cameras with them. Hands are computed from
-UmeTrack's model (`umetrack`); MANO's parameters are not used, nor are hands of clips without a
-shape, as those for testing. Followed: facebookresearch/hot3d, `clip_util.py`, of 2025.
+its images and camera axes are rotated clockwise by 90 degrees. Hands are computed from UmeTrack's
+model (`umetrack`), not from MANO's parameters. Clips without a hand shape, such as the test clips,
+have no hands. Followed: facebookresearch/hot3d, `clip_util.py`, of 2025.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ COLOR = "214-1"
 """Stream of Aria's color camera."""
 SIDES = ("left", "right")
 MAX_MEMBERS = 100_000
-"""Largest number of files of a clip."""
+"""Maximum number of files in a clip."""
 MAX_MEMBER_BYTES = 1 << 26
-"""Largest file of a clip in bytes."""
+"""Maximum size of a file in a clip, in bytes."""
 MAX_DRIFT_PX = 1.0
-"""Largest change of the calibration during a clip, in pixels."""
+"""Maximum change of the calibration during a clip, in pixels."""
 CLOCKWISE = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-"""Axes of the turned camera, in those of the original one."""
+"""Rotation `original_from_rotated` of the camera axes."""
 _FRAME = re.compile(r"(\d{1,9})\.cameras\.json")
 
 
@@ -61,7 +61,7 @@ class Hot3D:
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of clips, or one .tar file."""
     stream: str = COLOR
-    """Stream to read; Quest 3 has only 1201-1 and 1201-2, in gray."""
+    """Stream to read; Quest 3 has only the gray streams 1201-1 and 1201-2."""
 
     def find(self) -> Iterator[Entry]:
         """Yield the clips of a HOT3D folder."""
@@ -78,7 +78,9 @@ class Hot3D:
         with _open_clip(path) as clip:
             keys = sorted(match[1] for name in clip.names if (match := _FRAME.fullmatch(name)))
             if not keys:
-                raise InputError(f"{quote_path(path)} has no <n>.cameras.json: no clip of HOT3D.")
+                raise InputError(
+                    f"{quote_path(path)} has no <n>.cameras.json: it is not a HOT3D clip."
+                )
             cameras = [clip.camera(key, self.stream) for key in keys]
             lens = _lens([calibration for calibration, _ in cameras], clip.name)
             remap = Remap.of(lens)
@@ -125,7 +127,7 @@ class _Clip:
         for member in tar:
             members.append(member)
             if len(members) > MAX_MEMBERS:
-                raise InputError(f"{name} has more than {MAX_MEMBERS:,} files, the most.")
+                raise InputError(f"{name} has more files than the maximum, {MAX_MEMBERS:,}.")
         self._tar, self.names = tar, {m.name: m for m in members if m.isreg()}
 
     def read(self, name: str) -> bytes:
@@ -138,14 +140,14 @@ class _Clip:
         return file.read()
 
     def json(self, name: str) -> Any:
-        """Return the contents of a JSON file that is an object."""
+        """Return the object in a JSON file."""
         value = parse_json(self.read(name), source=f"{self.name}: {name}", limit=MAX_MEMBER_BYTES)
         if not isinstance(value, dict):
             raise InputError(f"{self.name}: {name} is not a JSON object.")
         return value
 
     def image(self, name: str) -> np.ndarray:
-        """Return an image of the Aria camera, decoded."""
+        """Decode an image."""
         return decode_image(self.read(name), name=f"{self.name}: {name}")
 
     def camera(self, key: str, stream: str) -> tuple[dict[str, Any], np.ndarray]:
@@ -160,7 +162,7 @@ class _Clip:
         return camera["calibration"], self._pose(camera.get("T_world_from_camera"), key)
 
     def hands(self, keys: list[str]) -> np.ndarray | None:
-        """Return the keypoints of both hands in the world; None in a clip without a shape."""
+        """Return the keypoints of both hands in the world; None if the clip has no hand shape."""
         if "__hand_shapes.json__" not in self.names:
             return None
         model = HandModel.from_json(self.json("__hand_shapes.json__").get("umetrack"))
@@ -178,7 +180,7 @@ class _Clip:
         return joints
 
     def rate(self, keys: list[str], stream: str) -> Fraction:
-        """Return the frame rate, from timestamps."""
+        """Return the frame rate, computed from timestamps."""
         times = []
         for key in keys:
             stamps = self.json(f"{key}.info.json").get("image_timestamps_ns")
@@ -192,29 +194,29 @@ class _Clip:
 
     def _pose(self, written: Any, key: str) -> np.ndarray:
         parts = written if isinstance(written, dict) else {}
-        what = f"{self.name}: transform of frame {key}"
-        w, x, y, z = _numbers(parts.get("quaternion_wxyz"), 4, what)[:4]
-        translation = _numbers(parts.get("translation_xyz"), 3, what)[:3]
+        name = f"{self.name}: transform of frame {key}"
+        w, x, y, z = _numbers(parts.get("quaternion_wxyz"), 4, name)[:4]
+        translation = _numbers(parts.get("translation_xyz"), 3, name)[:3]
         return make_poses(np.array([[x, y, z, w]]), translation[None])
 
 
-def _numbers(value: Any, least: int, what: str) -> np.ndarray:
+def _numbers(value: Any, minimum: int, name: str) -> np.ndarray:
     try:
         numbers = np.array(value, float)
     except (TypeError, ValueError):
         numbers = np.zeros(0)
-    if numbers.ndim != 1 or not least <= len(numbers) <= 64 or not np.isfinite(numbers).all():
-        raise InputError(f"{what} is {quote(value)}: it must be at least {least} finite numbers.")
+    if numbers.ndim != 1 or not minimum <= len(numbers) <= 64 or not np.isfinite(numbers).all():
+        raise InputError(f"{name} is {quote(value)}: it must be at least {minimum} finite numbers.")
     return numbers
 
 
 def _lens(calibrations: list[dict[str, Any]], name: str) -> Lens:
-    """Return the lens of all frames."""
+    """Return the lens that all frames share. Raises `InputError` if the calibration changes."""
     first = calibrations[0]
     if "FISHEYE624" not in str(first.get("projection_model_type")):
         raise InputError(
-            f"{name}: its camera model is {quote(first.get('projection_model_type'))}; FISHEYE624 "
-            "is read."
+            f"{name}: its camera model is {quote(first.get('projection_model_type'))}; expected "
+            "FISHEYE624."
         )
     parameters = [
         _numbers(c.get("projection_params"), 15, f"{name}: projection_params") for c in calibrations

@@ -77,7 +77,7 @@ def test_datasets_of_one_root_keep_their_clips_and_names(root):
     assert near(load_triplet(clip, SPEC).target, own[0].target)
     assert near(load_triplet(others[0], SPEC).target, make_triplet("open/00000").target)
     for name in ("a/b", "..", "a.b", ""):
-        with pytest.raises(InputError, match="must be that of a folder: use letters"):
+        with pytest.raises(InputError, match="must be a valid folder name: use letters"):
             write_folders(root, own, name=name, fps=8)
 
 
@@ -122,7 +122,7 @@ def test_commands_take_the_chosen_captions(root, tmp_path):
 
 
 def test_captions_of_a_column_cannot_be_chosen(clips, tmp_path):
-    with pytest.raises(InputError, match="captions in the column prompt: those of prompts"):
+    with pytest.raises(InputError, match="captions in the column prompt: prompts can be chosen only"):
         Pack(metadata=clips, out=tmp_path / "shards", prompts="prompts").run()
     with pytest.raises(InputError, match="scenes of the tabletop world have one caption"):
         Generate(config="debug", prompts="prompts").run()
