@@ -11,7 +11,7 @@ from typing import Literal
 from egosim_jax.types import InputError
 
 Prompts = Literal["prompts_rewrite", "prompts"]
-"""Captions to read from DWM's folders: rewritten (original where there is none), or original."""
+"""Captions to read from DWM's folders: rewritten (else the original), or original only."""
 MAX_CLIPS = 400_000
 """Maximum number of clips in a metadata file or list."""
 SAFE_IDS = "letters, digits, '.', '_' and '-', and '/' between folders without dots"

@@ -170,8 +170,8 @@ def load_triplet(
     """Read frames `[start, start + spec.frames)` of a clip at the size of `spec`.
 
     Another `resampling` takes the same frames of every video, out of all its frames, and has no
-    `start`. The CLIP image is the clip's, whatever the window. Raises `InputError` with the problems
-    of `check_clip`, or naming a damaged video.
+    `start`. The CLIP image is the clip's, whatever the window. Raises `InputError` with the
+    problems of `check_clip`, or naming a damaged video.
     """
     if start and resampling != "first":
         raise InputError(

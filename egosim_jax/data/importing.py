@@ -74,8 +74,8 @@ def _import_one(dataset: str, entry: Entry, folder: Path) -> bool:
             differing = [n for n, value in made_of.items() if written.get(n) != value]
             if differing:
                 raise InputError(
-                    f"{folder} holds a recording with another {', '.join(differing)}: choose another "
-                    "folder, or remove it. (--out)"
+                    f"{folder} holds a recording with another {', '.join(differing)}: choose "
+                    "another folder, or remove it. (--out)"
                 )
             return True
     recording = entry.read(folder)

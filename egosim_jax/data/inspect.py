@@ -34,8 +34,8 @@ def choose_clips(
     """Decode videos of one clip per combination of values in the columns `by`.
 
     Without columns, decode videos of the first `limit` clips, in order. Keep `moments` frames of
-    each video, evenly spaced from the first to the last, at the clip's own size. Raises `InputError`
-    for latents and for unknown columns.
+    each video, evenly spaced from the first to the last, at the clip's own size. Raises
+    `InputError` for latents and for unknown columns.
     """
     if reader.manifest.kind == "latents":
         raise InputError(f"{reader.folder} holds latents, not videos or frames. (--shards)")

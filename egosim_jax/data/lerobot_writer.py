@@ -123,8 +123,8 @@ def write_lerobot(
 ) -> None:
     """Write a dataset, complete or absent; `names` are the names of the numbers in a row.
 
-    Clips are read from `episodes` and written one by one. Raises `InputError` if there is nothing to
-    write, if clips differ in size, if the folder holds files, or without pyarrow.
+    Clips are read from `episodes` and written one by one. Raises `InputError` if there is nothing
+    to write, if clips differ in size, if the folder holds files, or without pyarrow.
     """
     check_new(folder)
     if find_spec("pyarrow") is None:

@@ -84,7 +84,7 @@ class Manifest:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read and validate a folder's manifest. Raises `InputError` if there is none, or a bad one."""
+    """Read and validate a folder's manifest. Raises `InputError` if it is missing or invalid."""
     path = folder / MANIFEST
     if not path.is_file():
         raise InputError(f"{quote_path(folder)} is not a dataset: it has no {MANIFEST}.")

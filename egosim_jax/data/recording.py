@@ -8,10 +8,10 @@
      "video": "/data/fold/12.mp4", "start": 0, "frames": 240, "fps": "30", "height": 1080, ...
      "sha256": "9a..."}
 
-The conventions are the project's: OpenCV axes (x right, y down, z forward), pixel centers at integer
-coordinates, joints in the world of the cameras. Poses and points are in meters if `metric`, else in
-an unknown unit; then there are no hands. Unknown values are None, never guessed. Paths inside the
-folder are stored relative to it, all others absolute. Nothing is unpickled.
+The conventions are the project's: OpenCV axes (x right, y down, z forward), pixel centers at
+integer coordinates, joints in the world of the cameras. Poses and points are in meters if `metric`,
+else in an unknown unit; then there are no hands. Unknown values are None, never guessed. Paths
+inside the folder are stored relative to it, all others absolute. Nothing is unpickled.
 """
 
 from __future__ import annotations

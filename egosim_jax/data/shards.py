@@ -140,7 +140,7 @@ class ShardWriter(AbstractContextManager["ShardWriter"]):
         self._writer, self._records, self._bytes = None, 0, 0
 
     def _note(self, arrays: Mapping[str, np.ndarray], name: str) -> None:
-        """Merge the shapes of a record into those of the manifest."""
+        """Merge the shapes of a record into the manifest's shapes."""
         for key, array in arrays.items():
             if array.dtype.name not in DTYPES:
                 raise InputError(

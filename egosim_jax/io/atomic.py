@@ -1,7 +1,7 @@
-"""Atomic writes: complete or absent, never through a link, never two writers at once.
+"""Atomic writes: complete or absent, never through a link, never by two writers at once.
 
-What is written has an unpredictable hidden name until it is on disk; then it is renamed. A crash
-leaves at most such a hidden file or folder, which the next write of the same name removes.
+A file or folder has an unpredictable hidden name until it is on disk; then it is renamed. A crash
+leaves at most this hidden file or folder, which the next write of the same name removes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.types import InputError
 
 TEMPORARY = ".tmp"
-"""Infix of every temporary name."""
+"""Middle part of every temporary name."""
 LOCK = ".lock"
 """Name of the file that a process locks while it writes to a folder."""
 PART, LOG = ".part", ".part.log"
-"""Suffixes of a large file that is written in pieces, and of the log of its pieces."""
+"""Suffixes of a large file written in pieces, and of the log of its pieces."""
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _NEW = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -37,9 +37,9 @@ _NEW = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
 def atomic_write(path: Path) -> Iterator[Path]:
     """Create a temporary file to write to; rename it to `path` when the block ends.
 
-    The temporary file is new, empty, in the folder of `path` and has its suffix; folders are made
-    as needed. It is on disk before it is renamed. After an error it is removed; an older `path`
-    stays.
+    The temporary file is new and empty, in the folder of `path` and with its suffix. Folders are
+    created as needed. The file is on disk before it is renamed. An error removes it and leaves an
+    older `path` unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
@@ -60,7 +60,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Create a temporary folder to write to; rename it to `path` when the block ends.
 
-    An older `path` is exchanged for it in one step and then removed; after an error it stays.
+    An older `path` is exchanged for it in one step and then removed. An error leaves it unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
@@ -82,10 +82,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def check_replaceable(path: Path, names: re.Pattern[str], *, description: str) -> Path:
-    """Return the resolved path of a folder to write, if writing it loses no other files.
+    """Return the resolved path of a folder that can be replaced without losing other files.
 
-    Raises `InputError` unless nothing exists there, or an empty folder, or an earlier folder of the
-    same kind: one with a JSON `description` that records SHA-256, and only files of these `names`.
+    Raises `InputError` unless the path is free, an empty folder or an earlier folder of the same
+    kind: with a JSON `description` that records SHA-256, and with only files of these `names`.
     """
     path = Path(os.path.realpath(path))
     if not os.path.lexists(path):
@@ -125,7 +125,7 @@ def _is_description(path: Path) -> bool:
 def append_line(path: Path, record: Mapping[str, Any]) -> None:
     """Append one JSON object as a line, on disk when this returns.
 
-    An incomplete last line, as a crash leaves one, is removed first.
+    An incomplete last line, left by a crash, is removed first.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -157,7 +157,7 @@ def _end_of_lines(descriptor: int) -> int:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or the list of names in a folder, is on disk."""
+    """Wait until a file, or the directory entries of a folder, are on disk."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -171,10 +171,10 @@ _held: dict[Path, tuple[int, int]] = {}
 
 @contextmanager
 def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Keep other processes from writing to a folder, which is made if need be.
+    """Keep other processes from writing to a folder, which is created if needed.
 
-    The same process may lock a folder again. Raises `InputError` naming the process that has it,
-    or, with `wait`, waits for it.
+    The same process may lock a folder again. Raises `InputError` naming the process that holds the
+    lock, or waits for it with `wait`.
     """
     hold_folder(folder, wait=wait)
     try:
@@ -223,7 +223,7 @@ def _temporary_name(path: Path) -> Path:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove temporary files of `path` whose writers ended: nobody holds their locks."""
+    """Remove temporary files of `path` that nobody locks, because their writers ended."""
     stem = path.stem.encode()[:120].decode("utf-8", "ignore")
     start, end = f".{stem}.", f"{TEMPORARY}{path.suffix}"
     with os.scandir(path.parent) as entries:
@@ -246,7 +246,7 @@ def _remove_stale(path: Path) -> None:
 
 
 def _put_in_place(new: Path, path: Path) -> None:
-    """Rename a folder to `path`; if that exists, `new` is the older one afterwards."""
+    """Rename a folder to `path`; if that exists, exchange both, so that `new` is the older one."""
     if not path.exists():
         new.rename(path)
         return
@@ -259,6 +259,7 @@ def _put_in_place(new: Path, path: Path) -> None:
         code = ctypes.get_errno()
         if code not in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
             raise OSError(code, os.strerror(code), str(path))
+    # No exchange on this system: for a moment, `path` does not exist.
     aside = _temporary_name(path)
     path.rename(aside)
     new.rename(path)

@@ -1,7 +1,7 @@
-"""Readers of untrusted files: bounded before anything is built from them.
+"""Bounded readers of untrusted files, and quoting of untrusted values in messages.
 
-Only regular files are opened, so that a pipe or a device cannot block. Sizes are checked before
-reading, depth and repeated names while parsing, and no message repeats an untrusted value in full.
+Only regular files are opened, because a pipe or a device could block. Sizes are checked before
+reading, depth and repeated names while parsing. No message repeats an untrusted value in full.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Literal, NoReturn
 from egosim_jax.types import InputError
 
 MAX_JSON_BYTES = 16 << 20
-"""Largest JSON document that is parsed, in bytes; Python objects take up to 30 times as much."""
+"""Maximum size of a JSON document in bytes; its Python objects take up to 30 times as much."""
 MAX_QUOTED = 80
 """Maximum length of an untrusted value in a message, in characters."""
 
@@ -26,7 +26,7 @@ MAX_QUOTED = 80
 def open_regular(path: Path) -> io.BufferedReader:
     """Open a regular file for reading.
 
-    Raises `InputError` for what is missing, unreadable, a folder, a pipe, a socket or a device.
+    Raises `InputError` if it is missing, unreadable, a folder, a pipe, a socket or a device.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -51,15 +51,15 @@ def read_bytes(path: Path, *, limit: int) -> bytes:
 
 
 def read_json(path: Path, *, limit: int = MAX_JSON_BYTES) -> Any:
-    """Parse a JSON file (`parse_json`)."""
+    """Read a JSON file of at most `limit` bytes (`parse_json`)."""
     return parse_json(read_bytes(path, limit=limit), source=quote_path(path), limit=limit)
 
 
 def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     """Parse one JSON document in UTF-8, with or without a byte order mark.
 
-    Raises `InputError`, naming `source`, for what is too large or too deep, repeats a name, holds
-    half a surrogate pair or is not JSON.
+    Raises `InputError`, naming `source`, if it is too large, nested too deeply or not JSON, repeats
+    a name or holds half a surrogate pair.
     """
     if len(data) > limit:
         raise InputError(f"{source}: {len(data):,} bytes of JSON, more than {limit:,}.")
@@ -79,8 +79,8 @@ def read_lines(
 ) -> Iterator[tuple[int, Any]]:
     """Yield line numbers, from 1, and values of a file of JSON lines; blank lines are skipped.
 
-    Only a line feed ends a line. A `last` line without one was cut off by a crash and is dropped,
-    unless it may have been written by hand.
+    Only a line feed ends a line. A last line without one is dropped, because a crash cut it off;
+    `last="read"` is for files written by hand.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -96,15 +96,15 @@ def read_lines(
 
 
 @contextmanager
-def refusing(what: str, kind: type[InputError] = InputError) -> Iterator[None]:
-    """Turn exceptions of a decoder about untrusted bytes into `InputError`."""
+def refusing(message: str, kind: type[InputError] = InputError) -> Iterator[None]:
+    """Turn any exception of a decoder of untrusted bytes into `InputError`."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise kind(f"{what}: {quote_text(reason or type(error).__name__)}.") from error
+        raise kind(f"{message}: {quote_text(reason or type(error).__name__)}.") from error
 
 
 def check_version(found: Any, supported: int, *, source: str) -> None:
@@ -117,9 +117,9 @@ def check_version(found: Any, supported: int, *, source: str) -> None:
 
 
 def quote(value: Any) -> str:
-    """Describe an untrusted value for a message, in at most some `MAX_QUOTED` characters.
+    """Describe an untrusted value for a message, in about `MAX_QUOTED` characters or less.
 
-    Text is quoted and cut, numbers are shown, containers only named with their size.
+    Text is quoted and cut, numbers are shown, and containers are described by type and length.
     """
     if isinstance(value, str):
         cut = value[:MAX_QUOTED]
@@ -140,14 +140,14 @@ def quote_text(text: str) -> str:
     return ascii(text[:MAX_QUOTED])[1:-1] + ("…" if len(text) > MAX_QUOTED else "")
 
 
-def listing(items: Sequence[str], *, most: int = 5) -> str:
-    """Join findings on one line: the first ones, and the number of the others."""
-    more = f"; and {len(items) - most:,} more" if len(items) > most else ""
-    return "; ".join(items[:most]) + more
+def listing(items: Sequence[str], *, limit: int = 5) -> str:
+    """Join findings on one line: the first `limit`, and the number of further ones."""
+    more = f"; and {len(items) - limit:,} more" if len(items) > limit else ""
+    return "; ".join(items[:limit]) + more
 
 
 def quote_path(path: Path | str) -> str:
-    """Return a path for a message, escaped if it has characters that cannot be printed."""
+    """Return a path for a message, escaped if it has unprintable characters."""
     text = str(path)
     return text if text.isprintable() else ascii(text)
 
@@ -164,7 +164,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _check_surrogates(value: Any) -> None:
-    rest = [value]
+    rest = [value]  # a stack: recursion would fail on deep documents
     while rest:
         item = rest.pop()
         if isinstance(item, str):

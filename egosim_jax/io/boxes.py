@@ -1,7 +1,7 @@
 """Limit the sample tables of MP4 files before FFmpeg allocates memory for them.
 
-A few bytes of a sample table can declare billions of samples, for each of which FFmpeg allocates
-24 bytes or more. MP4 boxes nest: 4 bytes of size, 4 bytes of type, then the content.
+A few bytes of a sample table can declare billions of samples, and FFmpeg allocates at least 24
+bytes for each. MP4 boxes nest: 4 bytes of size, 4 bytes of type, then the content.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import io
 from egosim_jax.types import InputError
 
 MAX_SAMPLES = 2**22
-"""Samples of all tracks: video and, for example, 90 s of uncompressed audio at 48 kHz."""
+"""Maximum number of samples in all tracks, such as 90 s of uncompressed audio at 48 kHz."""
 MAX_BOXES = 100_000
-"""Boxes of a file."""
+"""Maximum number of boxes in a file."""
 _CONTAINERS = {
     b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"dinf", b"udta", b"tref", b"mvex",
     b"moof", b"traf", b"mfra", b"wave",

@@ -1,9 +1,9 @@
-"""Training checkpoints: the only file that knows Orbax.
+"""Training checkpoints, in the only module that uses Orbax.
 
-A checkpoint holds the training state and the position of the data iterator together, and is
-written atomically in the background: a run that was killed while saving resumes from the checkpoint
-before. Once it is complete, the hashes of its files are written into it, because Orbax does not
-notice a changed byte; they are compared before it is read.
+A checkpoint holds the training state together with the position of the data iterator. It is written
+atomically in the background: a run that is killed while saving resumes from the previous
+checkpoint. The hashes of its files are added when it is complete and compared before it is read,
+because Orbax does not notice a changed byte.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from egosim_jax.types import InputError
 
 STATE, DATA = "state", "data"
 HASHES = "sha256.json"
-"""File in a checkpoint's folder with the hash of every other file in it."""
+"""File in a checkpoint's folder with the hashes of all its other files."""
 
 
 class Checkpoints:
     """The checkpoints of one run folder: the newest `keep`, and one every `keep_every` steps.
 
-    Close it, also after an error: saving continues in a thread. Raises `InputError` if the metadata
-    that Orbax reads first is damaged.
+    Close it, even after an error, because saving continues in a thread. Raises `InputError` if the
+    metadata that Orbax reads first is damaged.
     """
 
     def __init__(self, folder: Path, *, keep: int = 2, keep_every: int | None = None):
@@ -44,6 +44,7 @@ class Checkpoints:
         preserve: Any = [policies.LatestN(keep)]
         if keep_every is not None:
             preserve.append(policies.EveryNSteps(keep_every))
+        # The training loop decides when to save; Orbax must not skip a step.
         always = ocp.training.save_decision_policies.FixedIntervalPolicy(1)
         try:
             # Orbax declares protocols that its policies and pathlib do not satisfy exactly.
@@ -74,15 +75,15 @@ class Checkpoints:
     def check_room(self, state: Any, saved: Sequence[int]) -> None:
         """Raise `InputError` unless the disk has room for the checkpoints that will be kept.
 
-        `saved` are the steps at which there will be one.
+        `saved` are the steps of the future checkpoints.
         """
         sizes = [leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)]
         steps = [*self.steps, *saved]
         every = self.keep_every
         older = sum(every is not None and step % every == 0 for step in steps[: -self.keep])
         # The newest one is complete before the oldest one is deleted.
-        most = min(len(steps), older + self.keep + 1)
-        need = sum(sizes) * (most - len(self.steps))
+        peak = min(len(steps), older + self.keep + 1)
+        need = sum(sizes) * (peak - len(self.steps))
         free = shutil.disk_usage(self.folder).free
         if free < need:
             raise InputError(
@@ -92,9 +93,9 @@ class Checkpoints:
             )
 
     def save(self, step: int, state: Any, data: Any) -> None:
-        """Start saving, after waiting for a save that is still running.
+        """Start saving in the background, after the previous save has ended.
 
-        Raises the error of that save, as `wait` does.
+        Raises the error of the previous save, as `wait` does.
         """
         self.wait()
         with self._explained(step):
@@ -119,7 +120,7 @@ class Checkpoints:
             if not any("No space left" in str(cause) for cause in _causes(error)):
                 raise
             kept = max((kept for kept in self.steps if kept < step), default=None)
-            newest = "there is no other" if kept is None else f"the newest is that of step {kept}"
+            newest = "there is no other" if kept is None else f"the newest is of step {kept}"
             raise InputError(
                 f"The disk of {self.folder} is full: the checkpoint of step {step} was not saved, "
                 f"{newest}. Free space and run the same command again. (--out)"
@@ -128,8 +129,8 @@ class Checkpoints:
     def restore(self, state: Any, data: Any, *, fallback: bool = False) -> Any:
         """Return the newest state, with the shardings of the abstract `state`.
 
-        `data` is set to the saved position in place. With `fallback` a damaged checkpoint is moved
-        away and the one before it used. Raises `InputError` naming the damaged files, or listing
+        `data` is set to the saved position in place. With `fallback`, a damaged checkpoint is moved
+        away and the previous one is used. Raises `InputError` naming the damaged files, or listing
         the paths that differ when the checkpoint was made by another model or optimizer.
         """
         for step in reversed(self.steps):
@@ -170,7 +171,8 @@ class Checkpoints:
     def _damage(self, step: int) -> list[str]:
         """Return a line for each file of a checkpoint that differs from its hash.
 
-        Without hashes there is none: the run was killed between the checkpoint and its hashes.
+        A checkpoint without hashes counts as undamaged: the run was killed before they were
+        written.
         """
         folder = self.folder / str(step)
         if not (folder / HASHES).exists():

@@ -1,11 +1,11 @@
-"""Decoding of untrusted videos, packet by packet and frame by frame.
+"""Decode untrusted videos, packet by packet and frame by frame.
 
-Only the contents of regular files are opened, never names or addresses that a file may refer to,
-and what a header declares is held against caps before anything is decoded. Damage is refused as far
-as it shows: the decoder has to get through without an error, mark no frame as corrupt and give a
-frame for each packet that the container lists. H.264 has no checksum, so a changed bit that leaves
-a valid stream passes. Frames are turned and mirrored as the display matrix says, and those outside
-the edit list are not part of the video, as in every player.
+Only the contents of regular files are opened, never names or addresses inside a file. The header is
+checked against limits before anything is decoded. Detectable damage is refused: the decoder must
+report no error, mark no frame as corrupt and return a frame for each packet that the container
+lists. H.264 has no checksum, so a changed bit that leaves a valid stream passes. Frames are rotated
+and mirrored by the display matrix, and frames outside the edit list are omitted, as in every
+player.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from egosim_jax.io.images import MAX_IMAGE_PIXELS
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000
-"""Maximum length of a video in frames, unless the caller gives another."""
+"""Default maximum length of a video in frames."""
 MAX_PIXELS = 2**31
-"""Maximum number of pixels decoded from one video, frames x height x width: about 10 s."""
+"""Maximum number of pixels to decode from one video, frames x height x width: about 10 s."""
 MAX_KEPT = 3 * 2**28
-"""Maximum size of the frames of one call, in bytes."""
+"""Maximum size of the frames that one call returns, in bytes."""
 
 File = io.BufferedReader | io.BytesIO
 Decoding = Literal["accurate", "official"]
-"""Conversion of YUV to RGB: accurate, or bit for bit as in EgoSim's loader (imageio's FFmpeg)."""
+"""Conversion of YUV to RGB: accurate, or bit-exact with EgoSim's loader (imageio's FFmpeg)."""
 Damage = Literal["refuse", "stop"]
 """Action at damage in a video: raise `InputError`, or stop and return the frames before it."""
 
@@ -71,7 +71,7 @@ class DamagedError(InputError):
 
 @contextmanager
 def open_file(path: Path) -> Iterator[File]:
-    """Open a file here, so that no video library resolves a name."""
+    """Open a file, so that FFmpeg gets bytes and never resolves a name."""
     with open_regular(path) as file:
         if not os.fstat(file.fileno()).st_size:
             raise InputError(f"{quote_path(path)} is empty (0 bytes).")
@@ -80,7 +80,7 @@ def open_file(path: Path) -> Iterator[File]:
 
 @contextmanager
 def open_video(file: File, name: str, max_frames: int | None) -> Iterator[InputContainer]:
-    """Open a container with a video stream of an allowed size, and length unless that is None."""
+    """Open a container with a video stream within the limits; None allows any length."""
     check_boxes(file, name)
     with refusing(f"{name} is not a readable video"):
         container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
@@ -99,7 +99,7 @@ def open_video(file: File, name: str, max_frames: int | None) -> Iterator[InputC
 
 
 def read_packets(container: InputContainer, name: str, max_frames: int) -> Iterator[Packet | None]:
-    """Yield packets, then None, for which the decoder returns its remaining frames.
+    """Yield packets, then None, which flushes the decoder.
 
     Raises `DamagedError` at the end if the file was cut off.
     """
@@ -107,7 +107,7 @@ def read_packets(container: InputContainer, name: str, max_frames: int) -> Itera
     try:
         with refusing(f"{name} is damaged", DamagedError):
             for number, packet in enumerate(container.demux(stream)):
-                check_size(name, number // 2, 0, max_frames)  # empty ones count, too
+                check_size(name, number // 2, 0, max_frames)  # empty packets count, too
                 if packet.is_corrupt:
                     raise DamagedError(f"{name} is cut off after {read} frames.")
                 if packet.size:
@@ -123,7 +123,7 @@ def read_packets(container: InputContainer, name: str, max_frames: int) -> Itera
 
 
 def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
-    """Decode a packet, or with None what remains. Raises `DamagedError`."""
+    """Decode a packet; None flushes the decoder. Raises `DamagedError`."""
     with refusing(f"{name} is damaged", DamagedError):
         return stream.decode(packet)
 
@@ -152,7 +152,7 @@ def to_rgb(frame: VideoFrame, decoding: Decoding) -> np.ndarray:
 
 
 def upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
-    """Rotate and mirror frames by the display matrix (a b u, c d v, x y w).
+    """Rotate and mirror a frame by its display matrix (a b u, c d v, x y w).
 
     A point (x, y) is shown at (a x + c y, b x + d y), y downward.
     """
@@ -167,7 +167,7 @@ def upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
 
 
 def check_size(name: str, frames: int, area: int, max_frames: int) -> None:
-    """Raise `InputError` if so many frames of so many pixels are not read at once."""
+    """Raise `InputError` if `frames` frames of `area` pixels exceed the limits."""
     if frames > max_frames:
         raise InputError(f"{name} is longer than {max_frames} frames, the most that is read.")
     if frames * area > MAX_PIXELS:
@@ -185,7 +185,7 @@ def frame_rate(stream: VideoStream, name: str) -> Fraction:
 
 
 def is_hdr(stream: VideoStream) -> bool:
-    """Return True for a stream whose transfer function is PQ or HLG."""
+    """Return True if the transfer function of a stream is PQ or HLG."""
     return stream.codec_context.color_trc in _HDR
 
 
@@ -199,7 +199,7 @@ class FrameBuffer:
         return self._count
 
     def append(self, frame: np.ndarray) -> None:
-        """Add a frame of the first one's shape. Raises `InputError` if there are too many."""
+        """Append a frame of the first frame's shape. Raises `InputError` above the limit."""
         if self._count == len(self._kept):
             room = min(max(16, 2 * self._count), MAX_KEPT // frame.nbytes)
             if room <= self._count:

@@ -23,9 +23,9 @@ def sha256(path: Path) -> str:
 
 
 def sha256_within(path: Path) -> str:
-    """Return the SHA-256 of a file, or that of the names and hashes of the files in a folder.
+    """Return the SHA-256 of a file, or of the names and hashes of the files in a folder.
 
-    Files whose names start with a dot do not count, nor do subfolders.
+    Hidden files and subfolders are ignored.
     """
     if not path.is_dir():
         return sha256(path)
@@ -38,9 +38,9 @@ def fingerprint(value: Any) -> str:
     """Return the SHA-256 of a value's content, in hexadecimal.
 
     Covers numbers, text, paths, arrays, containers, dataclasses and callables. An object with a
-    method `fingerprint` is asked for it. A function counts by its name, source, defaults and what
-    it closes over; any other object by its class, the source of its `__call__` and its attributes.
-    Not seen: globals, files, and the code of the functions that are called in turn.
+    method `fingerprint` provides its own. Functions are hashed by name, source, defaults and
+    closure; other objects by class, source of `__call__` and attributes. Globals, files and the
+    code of called functions are not covered.
     """
     digest = hashlib.sha256()
     for part in _parts(value, ()):
@@ -95,7 +95,7 @@ def _function(function: Callable[..., Any], within: tuple[int, ...]) -> Iterator
         source = inspect.getsource(plain).encode("utf-8", "surrogatepass")
     except (OSError, TypeError):
         source = b""
-    # A line of source may hold several lambdas.
+    # The source line of a lambda may hold other lambdas, too: hash its bytecode instead.
     yield from [source] if source and plain.__name__ != "<lambda>" else _code(plain.__code__)
     yield from _parts((plain.__defaults__, plain.__kwdefaults__), within)
     for cell in plain.__closure__ or ():
@@ -120,7 +120,7 @@ def _code(code: CodeType) -> Iterator[bytes]:
 def _object(value: Any, within: tuple[int, ...]) -> Iterator[bytes]:
     kind = type(value)
     yield f"object {kind.__qualname__}".encode()
-    call = getattr(kind, "__call__", None)  # noqa: B004 - its source is wanted, not whether it is
+    call = getattr(kind, "__call__", None)  # noqa: B004 - its source is needed
     if inspect.isfunction(call):
         yield from _function(call, within)
     if dataclasses.is_dataclass(value):

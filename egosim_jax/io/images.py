@@ -1,4 +1,4 @@
-"""Reading of images as uint8 RGB arrays, checked before they are decoded."""
+"""Read images as uint8 RGB arrays, and depth maps, checked before they are decoded."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.ndarray, "h w 3"]:
     """Decode the bytes of an image file (`read_image`); `name` replaces the path in errors.
 
-    Of 16 bits the upper 8 are taken.
+    The upper 8 of 16 bits are kept.
     """
     with refusing(f"{name} is not a readable image"):
         with Image.open(io.BytesIO(data), formats=IMAGES) as image:
@@ -40,7 +40,7 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
             if image.mode in ("I", "F"):
                 raise InputError(f"{name} has 32 bits a channel; save it with 8 or 16.")
             if image.format == "PNG":
-                image.verify()  # the CRC of every chunk; then it has to be opened again
+                image.verify()  # checks the CRC of every chunk and consumes the file: open it again
         with Image.open(io.BytesIO(data), formats=IMAGES) as image:
             if image.mode.startswith("I;16"):
                 gray = (np.asarray(image) >> 8).astype(np.uint8)
@@ -48,16 +48,12 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
             return np.asarray(image.convert("RGB"))
 
 
-MAX_BYTES = 1 << 28
-"""Largest file in bytes."""
-
-
 def read_depth_image(path: Path) -> Float32[np.ndarray, "h w"]:
     """Read the values of a depth map, in the unit of the file.
 
-    Raises `InputError` unless it is a PNG of one channel with 16 bits, or an npy of numbers `h w`.
+    Raises `InputError` unless it is a 16-bit PNG with one channel, or an npy of numbers `h w`.
     """
-    name, data = quote_path(path), read_bytes(path, limit=MAX_BYTES)
+    name, data = quote_path(path), read_bytes(path, limit=MAX_IMAGE_BYTES)
     try:
         if path.suffix.lower() == ".png":
             with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
@@ -69,13 +65,13 @@ def read_depth_image(path: Path) -> Float32[np.ndarray, "h w"]:
         return read_npy(data, name).astype(np.float32)
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(
-            f"{name} is not a depth map: {quote_text(str(error))}. It must be a PNG of one channel "
-            f"with 16 bits, or an npy of numbers, at most {MAX_IMAGE_PIXELS:,} pixels."
+            f"{name} is not a depth map: {quote_text(str(error))}. It must be a 16-bit PNG with one "
+            f"channel, or an npy of numbers, at most {MAX_IMAGE_PIXELS:,} pixels."
         ) from error
 
 
 def read_npy(data: bytes, name: str) -> np.ndarray:
-    """Parse the bytes of an npy file of numbers, without pickle; raise `ValueError`."""
+    """Parse the bytes of an npy file of numbers, without pickle. Raises `ValueError`."""
     file = io.BytesIO(data)
     readers = {
         (1, 0): np.lib.format.read_array_header_1_0,

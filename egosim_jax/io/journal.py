@@ -4,9 +4,9 @@
     {"phase": "1 action", "made_of": {"action": "9a..."}, "chain": "..."}
     {"phase": "1 generate", "file": "clip_1/frames.npz", "sha256": "...", "seconds": 2.1, ...}
 
-A line is appended when its file is complete and on disk, so a killed run resumes at the phase that
-was interrupted. `made_of` records the hashes of a run's inputs: another run is refused. `chain` is
-the hash of the previous line and this one: a changed, missing or reordered line is detected.
+A line is appended when its file is complete and on disk, so a killed run resumes at the interrupted
+phase. `made_of` records the hashes of a run's inputs, so another run in the folder is refused.
+`chain` hashes the previous line and this one, so a changed, missing or reordered line is detected.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files cut into parts of limited size, and joined again.
+"""Cut files into parts of limited size, and join them again.
 
 A folder of parts has `parts.json`, with the SHA-256 of every file and of its parts in order, and
 the parts, `NAME.000`, `NAME.001`, ...
@@ -20,12 +20,12 @@ from egosim_jax.types import InputError
 
 DESCRIPTION = "parts.json"
 PART_BYTES = 16 << 20
-"""Largest part in bytes."""
+"""Maximum size of a part in bytes."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
 def cut(files: Sequence[Path], folder: Path, *, part_bytes: int = PART_BYTES) -> None:
-    """Write the parts of some files to a folder, which they replace in one step."""
+    """Cut files into parts in a folder, which is replaced in one step."""
     described = {}
     with atomic_folder(folder) as temporary:
         for path in files:
@@ -40,10 +40,9 @@ def cut(files: Sequence[Path], folder: Path, *, part_bytes: int = PART_BYTES) ->
 
 
 def join(folder: Path, out: Path) -> list[Path]:
-    """Join the parts in a folder to files in another, and return these.
+    """Join the parts in a folder to files in the folder `out`; return their paths.
 
-    Raises `InputError` naming the first part that is missing or damaged; no file is written from
-    such parts.
+    Raises `InputError` naming the first missing or damaged part; its file is not written.
     """
     joined = []
     for name, entry in _described(folder).items():
@@ -53,7 +52,7 @@ def join(folder: Path, out: Path) -> list[Path]:
                 data = read_bytes(folder / part["file"], limit=PART_BYTES)
                 if digest(data) != part["sha256"]:
                     raise InputError(
-                        f"{quote_path(folder / part['file'])} is damaged: its SHA-256 is not that "
+                        f"{quote_path(folder / part['file'])} is damaged: its SHA-256 is not the one "
                         f"in {DESCRIPTION}. Copy it again."
                     )
                 file.write(data)
@@ -68,7 +67,7 @@ def join(folder: Path, out: Path) -> list[Path]:
 
 
 def _described(folder: Path) -> dict[str, Any]:
-    """Return the files of a folder of parts by name, after checking every name in it."""
+    """Return the description of each file in a folder of parts, after checking all names."""
     path = folder / DESCRIPTION
     found = read_json(path)
     files = found.get("files") if isinstance(found, dict) else None

@@ -1,4 +1,4 @@
-"""Run folders: their config, their environment, and atomic writing of text and JSON."""
+"""Run folders with config and environment, and atomic writing of text and JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
 OUTPUT = "out"
-"""Name of fields that hold an output folder, which are not compared."""
+"""Name of config fields with an output folder, which are not compared."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "av")
 
 
@@ -66,7 +66,7 @@ def environment() -> dict[str, Any]:
 
 
 def _version(package: str) -> str | None:
-    """Return the version of a package, or None if it is not installed, as in a bundle."""
+    """Return the version of a package; None if it is not installed, such as in a bundle."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -74,9 +74,9 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Return the commit of the checkout that this package runs from, if it is one.
+    """Return the commit of the checkout that this package runs from; None outside a checkout.
 
-    A package that is installed in an environment within another checkout has none.
+    An installed package has no commit, even if its environment is inside another checkout.
     """
     root = Path(__file__).resolve().parents[2]
     command = ["git", "-C", str(root), "rev-parse", "--show-toplevel", "HEAD"]
@@ -92,10 +92,10 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
     """Create a run folder with config and environment, or resume in one with an equal config.
 
     The folder is locked until the process ends. Fields named `out` are not compared, so that a
-    folder can be moved, and neither are fields whose dotted paths are in `mutable`, or below them.
-    Of several processes the first one locks and writes. Raises `InputError` when the folder cannot
-    be written, is in use, lost its config, or holds a run of another config, naming the fields that
-    differ.
+    folder can be moved. Fields whose dotted paths are in `mutable`, or below, are not compared
+    either. Of several processes, the first locks and writes. Raises `InputError` when the folder
+    cannot be written, is in use, lost its config, or holds a run of another config, naming the
+    fields that differ.
     """
     import jax
 
@@ -115,8 +115,8 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
         if not isinstance(recorded, dict):
             raise InputError(f"{path} is not a config. Restore it. (--out)")
         differing = [
-            f"{field}: {what}"
-            for field, what in sorted(_differences(recorded, wanted).items())
+            f"{field}: {difference}"
+            for field, difference in sorted(_differences(recorded, wanted).items())
             if not any(f"{field}.".startswith(f"{free}.") for free in mutable)
         ]
         if differing:
@@ -129,15 +129,15 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
         write_json(folder / ENVIRONMENT, environment())
 
 
-def _differences(have: Any, want: Any, path: str = "") -> dict[str, str]:
+def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, str]:
     """Return the differences by dotted path, `out` fields excluded."""
-    if isinstance(have, dict) and isinstance(want, dict):
+    if isinstance(recorded, dict) and isinstance(wanted, dict):
         found = {}
-        for key in have.keys() | want.keys():
+        for key in recorded.keys() | wanted.keys():
             if key != OUTPUT:
                 below = f"{path}.{quote_text(key)}" if path else quote_text(key)
-                found |= _differences(have.get(key), want.get(key), below)
+                found |= _differences(recorded.get(key), wanted.get(key), below)
         return found
-    if have == want:
+    if recorded == wanted:
         return {}
-    return {path: f"the folder has {quote(have)}, this run has {quote(want)}"}
+    return {path: f"the folder has {quote(recorded)}, this run has {quote(wanted)}"}

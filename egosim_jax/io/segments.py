@@ -1,7 +1,7 @@
-"""Segments of long videos, read without decoding what precedes them.
+"""Read segments of long videos without decoding the frames before them.
 
-The packets of a file are listed first, which decodes nothing, so that frames are counted exactly
-whatever the frame rate does; then decoding starts at the last key frame before the segment.
+First the packets are listed without decoding, which counts frames exactly at any frame rate. Then
+decoding starts at the last key frame before the segment.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class _Listing:
 def probe_long_video(path: Path) -> VideoInfo:
     """Count the frames of a video of any length and read its size and rate.
 
-    Only the first frame is decoded; whether all are equally spaced is known from their packets.
-    Raises `InputError` if it is not readable or damaged.
+    Decodes only the first frame; the packets show whether frames are equally spaced. Raises
+    `InputError` if the video is unreadable or damaged.
     """
     name = quote_path(path)
     with open_file(path) as file:
@@ -73,10 +73,10 @@ def read_segment(
     count: int,
     each: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Video:
-    """Decode `count` frames of a video of any length, from frame `start` on.
+    """Decode `count` frames of a video of any length, starting at frame `start`.
 
-    `each` is applied to every frame as it is decoded. Raises `InputError` if the file is not
-    readable or damaged, or ends before the segment does.
+    `each` is applied to every frame as it is decoded. Raises `InputError` if the file is unreadable
+    or damaged, or ends before the segment.
     """
     check_counts({"The number of frames": count})
     name = quote_path(path)
@@ -122,7 +122,7 @@ def _list(file: File, name: str) -> _Listing:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
                 if not packet.is_discard:
                     times.append(packet.pts)
-        except OSError as error:  # as FFmpeg reports what it cannot parse
+        except OSError as error:  # from FFmpeg's parsers
             raise DamagedError(f"{name} is damaged: {quote_text(str(error))}.") from error
     file.seek(0)
     if not times or not keys or len(set(times)) != len(times):
@@ -131,13 +131,13 @@ def _list(file: File, name: str) -> _Listing:
 
 
 def _unevenness(times: list[int]) -> float:
-    """Return the largest distance of frames from equal spacing between the first and last one."""
+    """Return the maximum deviation of frame times from equal spacing, in units of the stream."""
     even = np.linspace(times[0], times[-1], len(times))
     return float(np.abs(np.array(times) - even).max())
 
 
 def _frames(container: InputContainer, name: str, dts: int) -> Iterator[VideoFrame]:
-    """Yield decoded frames from a key frame on."""
+    """Yield decoded frames, starting at the key frame with decoding time `dts`."""
     stream = container.streams.video[0]
     container.seek(dts, stream=stream, backward=True)
     size, count = None, 0

@@ -1,10 +1,10 @@
-"""Reading and writing of videos: uint8 RGB arrays, H.264 on disk.
+"""Read and write videos: uint8 RGB arrays in memory, H.264 on disk.
 
-Colors cross between RGB and YUV 4:2:0 with accurate rounding and interpolated chroma. The
-scaler's fast default, with which EgoSim's loader reads (`decoding="official"`), gives frames about
-one gray level darker, an error that would add up in a loop that writes clips and reads them back.
-What is written is tagged BT.601, limited range, which is also what readers assume of untagged
-files. What is refused in reading is in `io/decoding.py`.
+Colors are converted between RGB and YUV 4:2:0 with accurate rounding and interpolated chroma.
+EgoSim's loader (`decoding="official"`) uses the scaler's fast default, whose frames are about one
+gray level darker. That error would accumulate in a loop that writes clips and reads them back.
+Written files are tagged BT.601, limited range, as readers assume of untagged files.
+`io/decoding.py` says which files are refused.
 """
 
 from __future__ import annotations
@@ -66,15 +66,15 @@ class VideoInfo:
     width: int
     fps: Fraction
     hdr: bool = False
-    """True if brightness is coded for HDR, by PQ or HLG: converted to 8 bits, it looks pale."""
+    """True if brightness is encoded for HDR, by PQ or HLG; its 8-bit version looks pale."""
     unevenness_s: float = 0.0
-    """Largest distance in seconds of a frame from equal spacing; 0 if it was not measured."""
+    """Maximum deviation of frame times from equal spacing, in seconds; 0 if not measured."""
 
 
 def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
     """Count a video's frames and read its size and rate; only the first frame is decoded.
 
-    Raises `InputError` for a file that is missing, unreadable, empty, or above the caps.
+    Raises `InputError` for a file that is missing, unreadable, empty or above the limits.
     """
     with open_file(path) as file:
         return _probe(file, quote_path(path), damage)
@@ -96,9 +96,9 @@ def read_video(
 ) -> Video:
     """Decode frames `start` (inclusive) to `stop` (exclusive; the end if None) of a video file.
 
-    `each` is applied to every frame as it is decoded, for instance to make it smaller. A video
-    that ends before `stop` gives the frames it has. Raises `InputError` for a file that is
-    missing, unreadable, damaged, above the caps, or that has no frame in that range.
+    `each` is applied to every frame as it is decoded, for example to make it smaller. A video that
+    ends before `stop` yields fewer frames. Raises `InputError` for a file that is missing,
+    unreadable, damaged, above the limits or without a frame in that range.
     """
     with open_file(path) as file:
         return _decode(
@@ -207,8 +207,8 @@ def encode_video(
 ) -> bytes:
     """Encode RGB frames as an H.264 (yuv420p) mp4 file.
 
-    `crf` is x264's quality: 0 lossless, 10 visually lossless (about 50 dB), 23 its default.
-    Raises `InputError` for no frames or for odd sizes, which 4:2:0 cannot hold.
+    `crf` is x264's quality: 0 is lossless, 10 visually lossless (about 50 dB), 23 its default.
+    Raises `InputError` for no frames, and for odd sizes, which 4:2:0 cannot represent.
     """
     count, height, width, _ = frames.shape
     if count == 0 or height % 2 or width % 2:
@@ -224,10 +224,10 @@ def encode_video(
 def write_frames(
     path: Path, frames: Iterable[np.ndarray], fps: int | float | Fraction, *, crf: int = 10
 ) -> tuple[int, int, int]:
-    """Write frames one by one as `write_video` does, and return their number, height and width.
+    """Write frames one by one as `write_video` does; return their number, height and width.
 
-    All must be uint8 `h w 3` of the first one's size, of which an odd last row or column is cut
-    off. Raises `InputError` for none, or for other sizes.
+    Frames are uint8 `h w 3` of one size. An odd last row or column is cut off. Raises `InputError`
+    for no frames, and for frames of different sizes.
     """
     rest = iter(frames)
     first = next(rest, None)
@@ -263,7 +263,7 @@ def _encode(
     with av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        # x264's macroblock tree gives other bits at every run on some processors.
+        # With its macroblock tree, x264 is not deterministic on some processors.
         stream.options = {"crf": str(crf), "x264-params": "mbtree=0"}
         stream.codec_context.colorspace = _SMPTE170M
         stream.codec_context.color_range = _LIMITED_RANGE

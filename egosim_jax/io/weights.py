@@ -1,9 +1,8 @@
 """Save and load network weights as safetensors.
 
 A network is one file whose keys are the dotted paths of its nnx state, such as
-`blocks.self_attn.q.kernel`; stacked blocks keep their leading `layers` axis. All differences
-between a file and a network are reported in one list. `egosim_jax.convert` reads the checkpoints
-of other projects.
+`blocks.self_attn.q.kernel`. Stacked blocks keep their leading `layers` axis. One error lists all
+differences between a file and a network. `convert` reads the checkpoints of other projects.
 """
 
 from __future__ import annotations
@@ -34,16 +33,16 @@ if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
-LISTED = 12
-"""Mismatches that an error message lists."""
+MAX_LISTED = 12
+"""Maximum number of mismatches in an error message."""
 
 
 class WeightsError(InputError):
     """Mismatch between weights and a network; `problems` has one line per differing path."""
 
     def __init__(self, problems: Sequence[str], *, source: str):
-        what = f"{len(problems)} weights of {quote_path(source)} do not match"
-        super().__init__(f"{what}: {listing(problems, most=LISTED)}.")
+        message = f"{len(problems)} weights of {quote_path(source)} do not match"
+        super().__init__(f"{message}: {listing(problems, limit=MAX_LISTED)}.")
         self.problems = list(problems)
 
 
@@ -59,16 +58,17 @@ def _leaves(module: nnx.Module) -> dict[str, nnx.Variable]:
     return {".".join(map(str, path)): leaf for path, leaf in nnx.to_flat_state(state)}
 
 
-def mismatches(have: Mapping[str, Any], want: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """List every path that is missing, unexpected or has another shape than `want`."""
+def mismatches(tensors: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """List every path that is missing, unexpected or of another shape than expected."""
     problems = []
-    for path in sorted(want.keys() | have.keys()):
-        if path not in have:
-            problems.append(f"{path}: missing; expected {want[path]}")
-        elif path not in want:
-            problems.append(f"{path}: unexpected, with shape {tuple(have[path].shape)}")
-        elif tuple(have[path].shape) != want[path]:
-            problems.append(f"{path}: has shape {tuple(have[path].shape)}; expected {want[path]}")
+    for path in sorted(expected.keys() | tensors.keys()):
+        shape = tuple(tensors[path].shape) if path in tensors else None
+        if shape is None:
+            problems.append(f"{path}: missing; expected {expected[path]}")
+        elif path not in expected:
+            problems.append(f"{path}: unexpected, with shape {shape}")
+        elif shape != expected[path]:
+            problems.append(f"{path}: has shape {shape}; expected {expected[path]}")
     return problems
 
 
@@ -82,7 +82,7 @@ def fill(
 ) -> None:
     """Set the parameters of a module, concrete or abstract, from tensors by dotted path.
 
-    `dtype` casts the tensors; by default they keep their own. On a mesh each device reads its own
+    `dtype` casts the tensors; the default keeps their own. On a mesh, each device reads its own
     shard. Raises `WeightsError` listing every mismatch, before anything is changed.
     """
     problems = mismatches(tensors, flat_shapes(module))
@@ -110,9 +110,9 @@ def fill(
 
 
 def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, str]:
-    """Return the hash of each network's file in a weights folder, or of the networks in `only`.
+    """Return a hash per network in a weights folder, or per network in `only`.
 
-    It is the hash in the file's header or, without one, the SHA-256 of the file.
+    It is the hash in the file's header, or the SHA-256 of a file without one.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a weights folder. (--weights)")
@@ -127,8 +127,8 @@ def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, st
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
     """Write the weights of a module as safetensors, atomically.
 
-    `dtype` casts the tensors; by default they keep their own. All processes must call it together;
-    the first one writes.
+    `dtype` casts the tensors; the default keeps their own. All processes must call this together;
+    the first process writes.
     """
     tensors = {}
     for name, leaf in _leaves(module).items():
@@ -157,7 +157,7 @@ def write(
 
 
 def link_others(folder: Path, origin: Path) -> None:
-    """Symlink the networks and tokenizer of `origin` that a weights folder does not have."""
+    """Symlink the networks and tokenizer of `origin` that a weights folder lacks."""
     for path in origin.glob("[!.]*"):
         link = folder / path.name
         kept = path.is_dir() or path.suffix == ".safetensors"
@@ -166,7 +166,7 @@ def link_others(folder: Path, origin: Path) -> None:
 
 
 def gather(array: Any) -> np.ndarray | None:
-    """Gather an array from all processes; None in all but the first."""
+    """Gather an array from all processes; return None except in the first process."""
     import jax
     from jax.experimental import multihost_utils
 
@@ -183,9 +183,9 @@ def load(
 
 
 def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
-    """Load the parameters of a weights folder onto the devices, each reading its own shard.
+    """Load the parameters in a weights folder onto devices; each reads its own shard.
 
-    `abstract` has the shapes and dtypes to load, under the name of each network. Raises
+    `abstract` has the shapes and dtypes to load, under each network's name. Raises
     `WeightsError` listing every mismatch.
     """
     import jax

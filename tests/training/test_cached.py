@@ -59,7 +59,7 @@ def test_caches_give_the_latents_of_their_videos_and_those_of_another_vae_are_re
     expected = list(ShardReader(tmp_path / "encoded"))
     for caption in (tmp_path / "home" / "prompts_rewrite").iterdir():
         caption.write_text(caption.read_text("utf-8") + "Nothing else moves.\n", "utf-8")
-    with pytest.raises(InputError, match=r"prompt_embeds_rewrite/0\.pt was made with other weights"):
+    with pytest.raises(InputError, match=r"rewrite/0\.pt was made with other weights"):
         list(shard_caches(MODEL, weights, read_metadata(path), out=tmp_path / "whole"))
     with monkeypatch.context() as patch:
         patch.setattr(configs, "get", lambda _: MODEL)

@@ -55,7 +55,7 @@ def make_id(parts: Sequence[str]) -> str:
 
 
 def inside(root: Path, name: object, *, what: str) -> Path:
-    """Return the path that an untrusted file names. Raises `InputError` unless it is below `root`."""
+    """Return the path that an untrusted file names. Raises `InputError` if it leaves `root`."""
     path = Path(name) if isinstance(name, str) and name and "\0" not in name else None
     if path is None or path.is_absolute() or ".." in path.parts:
         raise InputError(

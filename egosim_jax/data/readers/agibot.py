@@ -8,20 +8,20 @@
         right; state/effector/position `n 2`, opening in millimeters
     task_info/task_<task>.json: parts of each episode, with start, end and a sentence
 
-or, as in the challenges, the video, the two JSON files and the h5 file in one folder. A recording is
-a part of an episode, as in EgoSim's ids, or the complete episode if it has no parts. The world is
-the robot's base.
+or, as in the challenges, the video, the two JSON files and the h5 file in one folder. A recording
+is a part of an episode, as in EgoSim's ids, or the complete episode if it has no parts. The world
+is the robot's base.
 
 Two readings of the extrinsics are in use: camera to base, and base to camera. Both project the
 points between the fingers. The reading that puts more points into the image is taken and recorded.
-If the counts do not differ, the recording is refused unless the user decides.
+If both readings are equal, the recording is refused unless the user decides.
 
-A gripper has three joints: the flange, and the tips of thumb and index finger. The tips are `TOOL_M`
-along the flange's z axis, and half of the opening to either side along its y axis. The dataset
-documents that the value grows when the gripper opens; other users found the reverse. If the measured
-value grows with the command (0 open, 1 closed), it is inverted. Intel's cameras have pixel centers
-at integers. A lens that is not a pinhole is remapped, which writes a video. Followed: the dataset's
-card of 2025 and the loaders of its challenges.
+A gripper has three joints: the flange, and the tips of thumb and index finger. The tips are
+`TOOL_M` along the flange's z axis, and half of the opening to either side along its y axis. The
+dataset documents that the value grows when the gripper opens; other users found the reverse. If the
+measured value grows with the command (0 open, 1 closed), it is inverted. Intel's cameras have pixel
+centers at integers. A lens that is not a pinhole is remapped, which writes a video. Followed: the
+dataset's card of 2025 and the loaders of its challenges.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ EgoSim's cuts of such files, `<id>_<start>_<end>.hdf5` with 121 poses at 16 fram
 cameras but no hands. The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary
 origin. The dataset has 25 joints per hand. Our 21 omit the four metacarpals: they are the wrist
 (`Hand`), the thumb from Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of
-index, middle, ring and little finger. Pixel coordinates start at the corner of the image (its center
-is at 960, 540), so half a pixel is subtracted. Followed: Apple's loader as of 2025.
+index, middle, ring and little finger. Pixel coordinates start at the corner of the image (its
+center is at 960, 540), so half a pixel is subtracted. Followed: Apple's loader as of 2025.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class EgoDex:
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset, a split or a task, or one .hdf5 file."""
     min_confidence: float = 0.1
-    """Minimum median confidence of a hand's joints; below it, the hand is missing from the frame."""
+    """Minimum median confidence of a hand's joints; below it, the hand is missing in a frame."""
 
     def find(self) -> Iterator[Entry]:
         """List the .hdf5 files."""

@@ -27,8 +27,8 @@ def clean_joints(
     given = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
     if given.any() and not seen.any():
         raise InputError(
-            "No hand joint comes near the camera's view in any frame: joints and camera poses must "
-            "be in one world, in meters. The recording cannot be used for hands."
+            "No hand joint comes near the view of the camera in any frame: joints and camera poses "
+            "must be in one world, in meters. The recording cannot be used for hands."
         )
     joints[:, ~seen] = np.nan
     counts = {

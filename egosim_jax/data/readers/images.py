@@ -1,4 +1,4 @@
-"""Captures of single images: they are written as the video of a recording."""
+"""Write the images of a capture as the video of a recording."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from egosim_jax.io.video import write_frames
 from egosim_jax.types import InputError
 
 MAX_IMAGES = 100_000
-"""Largest number of images of a capture."""
+"""Maximum number of images in a capture."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class ImageVideo:
-    """Video that was written from images, and the pinhole that it is of."""
+    """Video written from images, and its pinhole camera."""
 
     path: Path
     frames: int
@@ -36,14 +36,14 @@ class ImageVideo:
 def write_images(
     folder: Path, images: Iterable[np.ndarray], lens: Lens, fps: Fraction
 ) -> ImageVideo:
-    """Write images as video.mp4 of a folder, remapped to a pinhole if their lens is not one."""
+    """Write images as video.mp4 in a folder; remap them if their lens is not a pinhole."""
     remap = None if lens.is_pinhole() else Remap.of(lens)
     intrinsics = lens.intrinsics_px if remap is None else remap.intrinsics_px
     path = folder / "video.mp4"
     frames = _checked(images, lens) if remap is None else remap.apply(images)
     count, height, width = write_frames(path, frames, fps)
     return ImageVideo(path=path, frames=count, height=height, width=width,
-                        intrinsics_px=intrinsics, remap=remap)  # fmt: skip
+                      intrinsics_px=intrinsics, remap=remap)  # fmt: skip
 
 
 def _checked(images: Iterable[np.ndarray], lens: Lens) -> Iterator[np.ndarray]:
@@ -57,7 +57,7 @@ def _checked(images: Iterable[np.ndarray], lens: Lens) -> Iterator[np.ndarray]:
 
 
 def longest_run(names: Sequence[str], known: Callable[[str], bool]) -> slice:
-    """Return the longest run of names that are known: a video has no gaps."""
+    """Return the longest contiguous run of known names, because a video has no gaps."""
     best = run = slice(0, 0)
     for index, name in enumerate(names):
         run = slice(run.start if known(name) else index + 1, index + 1)

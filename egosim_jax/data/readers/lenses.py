@@ -1,9 +1,9 @@
-"""Lenses that are not pinholes, and the remapping of their images to a pinhole's.
+"""Distorting lenses, and the remapping of their images to a pinhole camera.
 
-A lens takes rays `x y 1` (or any point before the camera) to pixels. With r the distance from the
-axis on the plane z = 1, and theta = atan r the angle:
+A lens projects rays `x y 1` (or any point in front of the camera) to pixels. r is the distance from
+the axis on the plane z = 1, and theta = atan r is the angle to the axis:
 
-    brown    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' alike;
+    brown    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' likewise;
              COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV, Intel's and nerfstudio's `k1 k2 p1 p2 k3`
     fisheye  theta' = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), along the ray's
              direction; OPENCV_FISHEYE
@@ -25,9 +25,9 @@ from jaxtyping import Float, UInt8
 from egosim_jax.types import InputError
 
 MAX_ZOOM = 2.0
-"""Largest enlargement by which black borders are avoided."""
+"""Maximum zoom to avoid black borders."""
 PINHOLE_PX = 0.5
-"""Largest distortion in pixels of a lens that counts as a pinhole."""
+"""Maximum distortion in pixels of a lens that counts as a pinhole."""
 _COUNTS = {"brown": 5, "fisheye": 4, "fisheye624": 12}
 
 
@@ -43,9 +43,9 @@ class Lens:
     intrinsics_px: Float[np.ndarray, "3 3"]
     """Focal lengths and principal point in pixels."""
     height: int
-    """Rows of the image in pixels."""
+    """Height of the image in pixels."""
     width: int
-    """Columns of the image in pixels."""
+    """Width of the image in pixels."""
 
     def __post_init__(self) -> None:
         """Check the number of coefficients, and that all are finite and plausible."""
@@ -57,7 +57,7 @@ class Lens:
             )
 
     def project(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 2"]:
-        """Return columns and rows in pixels of points in camera coordinates, with z above 0."""
+        """Project points in camera coordinates, with z above 0, to columns and rows in pixels."""
         x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
         distort = _brown if self.model == "brown" else _fisheye
         x, y = distort(x, y, [float(value) for value in self.coefficients])
@@ -65,9 +65,9 @@ class Lens:
         return np.stack([fx * x + skew * y + cx, fy * y + cy], axis=-1)
 
     def unproject(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Return x and y at z = 1 of the rays of pixels, by Newton's method; NaN outside the lens.
+        """Return x and y of the pixels' rays at z = 1, by Newton's method; NaN outside the lens.
 
-        A pixel is outside if the method does not come within a thousandth of a pixel.
+        A pixel is outside the lens if the method does not converge to a thousandth of a pixel.
         """
         center = self.intrinsics_px[:2, 2]
         focal = self.intrinsics_px[[0, 1], [0, 1]]
@@ -104,16 +104,16 @@ class Lens:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Remap:
-    """Remapping of the images of a lens to those of a pinhole of the same size."""
+    """Remapping of a lens's images to a pinhole camera of the same size."""
 
     lens: Lens
     """Lens of the images."""
     intrinsics_px: Float[np.ndarray, "3 3"]
-    """Intrinsics of the pinhole, whose image has no black borders."""
+    """Intrinsics of the pinhole camera, whose image has no black borders."""
 
     @classmethod
     def of(cls, lens: Lens) -> Remap:
-        """Return the remapping with the smallest enlargement that leaves no black borders."""
+        """Return the remapping with the smallest zoom that leaves no black borders."""
         height, width = lens.height, lens.width
         focal = float(np.sqrt(lens.intrinsics_px[0, 0] * lens.intrinsics_px[1, 1]))
         border = _grid(height, width, 129)
@@ -127,15 +127,15 @@ class Remap:
             if ((seen >= 0) & (seen <= [width - 1, height - 1])).all():
                 return cls(lens=lens, intrinsics_px=intrinsics)
         raise InputError(
-            f"A lens {lens.model} with {lens.coefficients} cannot be remapped to a pinhole: more "
-            f"than {MAX_ZOOM:g} times its focal length would be needed to fill the image. Check "
-            "its coefficients."
+            f"A lens {lens.model} with {lens.coefficients} cannot be remapped to a pinhole: "
+            f"filling the image needs more than {MAX_ZOOM:g} times its focal length. Check its "
+            "coefficients."
         )
 
     def apply(
         self, images: Iterable[UInt8[np.ndarray, "h w 3"]]
     ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-        """Yield remapped images, interpolated bilinearly."""
+        """Yield images remapped with bilinear interpolation."""
         import cv2
 
         height, width = self.lens.height, self.lens.width
@@ -151,7 +151,7 @@ class Remap:
             yield cv2.remap(image, x, y, cv2.INTER_LINEAR)
 
     def move(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Return where pixels of the lens's image are in the pinhole's; NaN outside the lens."""
+        """Map pixels of the lens's image to the pinhole's image; NaN outside the lens."""
         rays = self.lens.unproject(pixels)
         return rays * self.intrinsics_px[[0, 1], [0, 1]] + self.intrinsics_px[:2, 2]
 

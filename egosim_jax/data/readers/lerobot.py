@@ -1,14 +1,14 @@
-"""LeRobot datasets, versions 2.0, 2.1 and 3.0: one camera's video of each episode, and its task.
+"""LeRobot datasets, versions 2.0, 2.1 and 3.0: one camera's video and the task per episode.
 
     v2   meta/info.json, meta/episodes.jsonl, one video per episode and camera
-    v3   meta/info.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet, and videos that
-         hold several episodes each: one is from `from_timestamp` to `to_timestamp` in seconds
+    v3   meta/info.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet; a video holds
+         several episodes, each from `from_timestamp` to `to_timestamp` in seconds
 
-Paths come from the templates in info.json, in which only the fields of the format are filled.
-Cameras, hands and their units are not part of the format (a robot's state has no common meaning),
-so they stay unknown. Videos may be of any codec that FFmpeg reads, as AV1. Followed: huggingface's
-`lerobot` of 2026, `dataset_metadata.py` and `io_utils.py`; tasks.parquet is a pandas file whose
-index is the text, or has a column `task`.
+Paths come from the templates in info.json; only the fields of the format are filled in. The format
+does not define cameras, hands and their units (a robot's state has no common meaning), so they stay
+unknown. Videos may have any codec that FFmpeg reads, such as AV1. tasks.parquet is a pandas file:
+the text is its index or a column `task`. Followed: huggingface's `lerobot` of 2026,
+`dataset_metadata.py` and `io_utils.py`.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import InputError
 
 EGOCENTRIC = ("ego", "head", "top")
-"""Parts of camera names that are preferred if there are several cameras."""
+"""Parts of the preferred camera's name if there are several cameras."""
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 MAX_EPISODES = 1_000_000
-"""Largest number of episodes."""
+"""Maximum number of episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class LeRobot:
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset, with meta/info.json."""
     camera: str | None = None
-    """Key of the camera, such as observation.images.head; by default the only or egocentric one."""
+    """Key of the camera, such as observation.images.head; default: the only or egocentric one."""
 
     def find(self) -> Iterator[Entry]:
         """Yield the episodes of a LeRobot dataset."""
@@ -107,14 +107,14 @@ class LeRobot:
 
 
 def read_info(root: Path, versions: Sequence[str] = VERSIONS) -> dict[str, Any]:
-    """Return meta/info.json of a dataset with its features, of some versions, and its fps."""
+    """Return meta/info.json, checked: one of `versions`, with features and a frame rate."""
     info = read_json(root / "meta" / "info.json")
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
-        raise InputError(f"{root}/meta/info.json is not that of a LeRobot dataset.")
+        raise InputError(f"{root}/meta/info.json does not describe a LeRobot dataset.")
     if (version := info.get("codebase_version")) not in versions:
         raise InputError(
-            f"{root} is of LeRobot version {quote(version)}; {', '.join(versions)} are "
-            "read. Convert it with LeRobot's own script."
+            f"{root} is of LeRobot version {quote(version)}; supported are {', '.join(versions)}. "
+            "Convert it with LeRobot's own script."
         )
     fps = info.get("fps")
     if not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
@@ -125,9 +125,9 @@ def read_info(root: Path, versions: Sequence[str] = VERSIONS) -> dict[str, Any]:
 def read_rows(
     root: Path, info: Mapping[str, Any], episode: int, columns: Sequence[str]
 ) -> dict[str, list[Any]]:
-    """Return columns of the frames of an episode of version 3.0, in their order.
+    """Return columns of an episode's frames in order, from a dataset of version 3.0.
 
-    Raises `InputError` if there is no such episode, or if it does not have the frames that its
+    Raises `InputError` if there is no such episode, or if its frames are not the ones that its
     description names.
     """
     require("pyarrow")
@@ -159,7 +159,7 @@ def read_rows(
 
 
 class _Probe:
-    """Probing of videos, of which the last is remembered: several episodes share one."""
+    """Probe of videos that caches the last result, because episodes share a video."""
 
     def __init__(self) -> None:
         self._path: Path | None = None
@@ -189,10 +189,10 @@ def _choose_camera(features: Mapping[str, Any], wanted: str | None) -> str:
         return chosen[0]
     if not videos and wanted is None and "image" in dtypes.values():
         raise InputError(
-            "The dataset stores images in its tables, not videos, which is not read. Convert it "
-            "with LeRobot's own script."
+            "The dataset stores images in its tables: only videos are read. Convert it with "
+            "LeRobot's own script."
         )
-    keys = listing([quote_text(key) for key, dtype in dtypes.items() if dtype == "video"], most=20)
+    keys = listing([quote_text(key) for key, dtype in dtypes.items() if dtype == "video"], limit=20)
     raise InputError(
         f"The camera to read is not clear: the dataset has the videos {keys or '(none)'}. Choose "
         "one. (--camera)"
@@ -220,7 +220,7 @@ def _episodes_v2(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
                 index=number,
                 video=_video_path(root, info, camera, fields),
                 start_s=0.0,
-                length=_count(row.get("length"), "length", least=1),
+                length=_count(row.get("length"), "length", minimum=1),
                 tasks=_texts(row.get("tasks")),
             )
         except InputError as error:
@@ -251,7 +251,7 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
                     index=index,
                     video=_video_path(root, info, camera, fields),
                     start_s=start,
-                    length=_count(row["length"], "length", least=1),
+                    length=_count(row["length"], "length", minimum=1),
                     tasks=_texts(row["tasks"]) if "tasks" in row else _tasks(root, info, row),
                 )
             except InputError as error:
@@ -259,7 +259,7 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
 
 
 def _tasks(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the tasks of an episode whose row does not name them, from the rows of its frames."""
+    """Return an episode's tasks from the rows of its frames, if its own row has none."""
     fields = {n: _count(row.get(f"data/{n}"), n) for n in ("chunk_index", "file_index")}
     path = _fill(root, info.get("data_path"), fields, what="data_path")
     frames = read_parquet(path, ["episode_index", "task_index"])
@@ -270,7 +270,7 @@ def _tasks(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> tuple
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return the texts of tasks by index, from either form of meta/tasks.parquet."""
+    """Return the text of each task by its index, from either form of meta/tasks.parquet."""
     names = ("task", "__index_level_0__")
     table = read_parquet(root / "meta" / "tasks.parquet", ["task_index"], optional=names)
     texts = next((table[name] for name in names if name in table), None)
@@ -287,7 +287,8 @@ def _video_path(
 
 
 def _fill(root: Path, template: object, fields: Mapping[str, int | str], *, what: str) -> Path:
-    """Fill a path template of info.json, in which nothing but plain fields is allowed."""
+    """Fill in a path template of info.json, which may hold only plain fields."""
+    # str.format would also resolve attributes and items, and pad to gigabytes.
     parts = []
     try:
         for text, name, form, conversion in string.Formatter().parse(str(template)):
@@ -305,15 +306,15 @@ def _fill(root: Path, template: object, fields: Mapping[str, int | str], *, what
             parts.append(format(fields[name], form) if form else str(fields[name]))
     except ValueError as error:
         raise InputError(
-            f"meta/info.json: {what} is {quote(template)}, of which {quote_text(str(error))} "
-            f"cannot be filled; fields are {', '.join(fields)}."
+            f"meta/info.json: {what} is {quote(template)}: {quote_text(str(error))} cannot be "
+            f"filled in; fields are {', '.join(fields)}."
         ) from error
     return inside(root, "".join(parts), what=f"meta/info.json: {what}")
 
 
-def _count(value: Any, name: str, *, least: int = 0) -> int:
-    if type(value) is not int or not least <= value < max(MAX_EPISODES, MAX_FRAMES):
-        raise InputError(f"{name} is {quote(value)}, not a whole number of at least {least}.")
+def _count(value: Any, name: str, *, minimum: int = 0) -> int:
+    if type(value) is not int or not minimum <= value < max(MAX_EPISODES, MAX_FRAMES):
+        raise InputError(f"{name} is {quote(value)}, not a whole number of at least {minimum}.")
     return value
 
 

@@ -1,8 +1,8 @@
-"""LZFSE: the size of what a stream unpacks to, checked before it is unpacked.
+"""Decompress LZFSE after checking the declared size, because liblzfse sets no limit.
 
-A stream is a row of blocks, each with a magic number and the number of bytes that it unpacks to,
-and ends with `bvx$`. The library that unpacks it sets no limit. Followed: Apple's
-reference implementation, `lzfse_internal.h`.
+A stream is a sequence of blocks and ends with `bvx$`. Each block has a magic number and declares
+the number of bytes that it decompresses to. Followed: Apple's reference implementation,
+`lzfse_internal.h`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ _TWENTY = (1 << 20) - 1
 
 
 def unpack(data: bytes, size: int) -> bytes:
-    """Return what a stream unpacks to, `size` bytes. Raises `ValueError` if it is anything else.
+    """Decompress a stream to `size` bytes. Raises `ValueError` if it has another size.
 
-    Data of that size is returned as it is: some apps do not pack.
+    Data that already has that size is returned unchanged: some apps do not compress.
     """
     if len(data) == size:
         return data
@@ -32,7 +32,7 @@ def unpack(data: bytes, size: int) -> bytes:
 
 
 def unpacked_size(data: bytes) -> int:
-    """Return the sum of what the blocks unpack to. Raises `ValueError` if it is no such stream."""
+    """Return the total declared size of the blocks. Raises `ValueError` if this is not LZFSE."""
 
     def number(at: int, count: int) -> int:
         if at + count > len(data):

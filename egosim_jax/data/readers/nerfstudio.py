@@ -1,10 +1,10 @@
 """nerfstudio captures: transforms.json with images, poses, intrinsics and maybe depth.
 
-`transform_matrix` takes camera to world in OpenGL's axes (x right, y up, z backward), which are
-turned to OpenCV's; the world stays the file's. Columns and rows count from the corner of the
-image, so that half a pixel is subtracted. Depth files have thousandths of a meter. The unit of
-poses is arbitrary unless the user says that it is the meter (as of Polycam and Record3D captures).
-Frames are in order of their file names. Followed: nerfstudio 1.1, `nerfstudio_dataparser.py`.
+`transform_matrix` is camera to world in OpenGL's axes (x right, y up, z backward), which are
+converted to OpenCV's; the world stays the file's. Pixel coordinates start at the corner of the
+image, so half a pixel is subtracted. Depth files are in millimeters. The unit of poses is
+arbitrary, unless the user says that it is meters (as in Polycam and Record3D captures). Frames are
+sorted by file name. Followed: nerfstudio 1.1, `nerfstudio_dataparser.py`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from egosim_jax.io.images import read_image
 from egosim_jax.types import InputError
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
-"""Camera models that are read."""
+"""Supported camera models."""
 MAX_SPREAD = 0.01
-"""Largest relative difference of focal lengths between frames, whose median is taken."""
+"""Maximum relative difference of focal lengths between frames; the median is used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +41,11 @@ class Nerfstudio:
 
     dataset: ClassVar[str] = "nerfstudio"
     source: Annotated[Path, tyro.conf.Positional]
-    """Folder with transforms.json, or a file like it."""
+    """Folder with transforms.json, or a file in that format."""
     fps: float
-    """Frame rate of the images in order of their names, which the file does not know."""
+    """Frame rate of the images, sorted by name; the file does not hold it."""
     metric: bool = False
-    """Poses are in meters."""
+    """True if poses are in meters."""
 
     def find(self) -> Iterator[Entry]:
         """List the one capture of the source."""
@@ -93,11 +93,11 @@ def _read_lens(written: Mapping[str, Any], frames: list[dict[str, Any]], path: P
     model = written.get("camera_model", "OPENCV")
     if model not in MODELS:
         raise InputError(
-            f"{quote_path(path)}: camera_model is {quote(model)}; {', '.join(MODELS)} are read."
+            f"{quote_path(path)}: camera_model is {quote(model)}; expected {', '.join(MODELS)}."
         )
 
     def value(name: str, default: float | None = None) -> float:
-        """Return a number that is the file's, or the median of the frames'."""
+        """Return the number for all frames, or the median of the frames' own numbers."""
         found = [written[name]] if name in written else [e.get(name, default) for e in frames]
         for item in found:
             if isinstance(item, bool) or not isinstance(item, (int, float)) or not abs(item) < 1e6:
@@ -139,7 +139,7 @@ def _pose(entry: Mapping[str, Any], path: Path) -> np.ndarray:
 
 
 def _find_depth(root: Path, frames: list[dict[str, Any]], video: ImageVideo) -> DepthFiles | None:
-    """Return depth files, unless their pixels would have to be remapped as the images were."""
+    """Return depth files; None if the images were remapped, because depth is not."""
     names = [entry.get("depth_file_path") for entry in frames]
     if not any(names) or video.remap is not None:
         return None

@@ -1,8 +1,8 @@
-"""Decision whether poses are camera to world or world to camera, from the video itself.
+"""Decide from the video whether poses are camera to world or world to camera.
 
-Points are tracked between frames that are some apart. With the relative pose of one reading the
-tracks satisfy the epipolar constraint, with that of the other they do not; the median Sampson
-distance of each in pixels is the evidence (Hartley and Zisserman, Multiple View Geometry, 11.4.3).
+Points are tracked between frames `GAP` apart. The tracks satisfy the epipolar constraint for the
+relative pose of the right reading only. The evidence is the median Sampson distance of each reading
+in pixels (Hartley and Zisserman, Multiple View Geometry, 11.4.3).
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from jaxtyping import Float, UInt8
 from egosim_jax.geometry import invert
 
 PAIRS = 6
-"""Number of frame pairs that are compared."""
+"""Number of frame pairs to compare."""
 GAP = 8
-"""Frames between the two of a pair."""
+"""Distance between the frames of a pair."""
 MIN_TRACKS = 20
-"""Fewest tracks of a pair that counts."""
+"""Minimum number of tracks for a pair to count."""
 MAX_ERROR_PX = 3.0
-"""Largest median Sampson distance of a reading that is accepted, in pixels."""
+"""Maximum median Sampson distance of an accepted reading, in pixels."""
 MIN_RATIO = 1.5
-"""Smallest ratio of the distances of the two readings that decides."""
+"""Minimum ratio between the two readings' distances for a decision."""
 
 
 def read_poses(
@@ -31,7 +31,7 @@ def read_poses(
     matrices: Float[np.ndarray, "f 4 4"],
     intrinsics_px: Float[np.ndarray, "3 3"],
 ) -> tuple[Float[np.ndarray, "f 4 4"] | None, Mapping[str, str]]:
-    """Return poses `world_from_camera` by the reading that fits the video, or None, and why."""
+    """Return `world_from_camera` by the reading that fits the video, or None; and the evidence."""
     readings = {"camera_to_world": matrices, "world_to_camera": invert(matrices)}
     errors: dict[str, list[float]] = {name: [] for name in readings}
     for start in np.linspace(0, max(0, len(frames) - 1 - GAP), PAIRS).astype(int).tolist():
@@ -52,7 +52,7 @@ def read_poses(
 
 
 def _track(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels in the first frame and where they are in the second, tracked both ways."""
+    """Return pixels in the first frame and in the second, tracked forward and backward."""
     import cv2
 
     gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (first, second)]

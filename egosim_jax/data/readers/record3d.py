@@ -1,17 +1,18 @@
-"""Record3D captures of an iPhone: images with poses, intrinsics and depth of the LiDAR.
+"""Record3D captures of an iPhone: images with poses, intrinsics and LiDAR depth.
 
-    NAME.r3d, a zip archive, or a folder with what is in it
+    NAME.r3d, a zip archive, or a folder with its files
         metadata        JSON: w h, dw dh, fps, K (9 numbers by columns), poses (qx qy qz qw x y z),
                         perFrameIntrinsicCoeffs (fx fy cx cy, at w x h)
         rgbd/<n>.jpg    images
         rgbd/<n>.depth  float32 meters `dh dw`, compressed by LZFSE
 
 or a folder exported as "EXR + RGB", with metadata.json and rgb/<n>.jpg, whose EXR depth is not
-read. Poses take camera to world in OpenGL's axes, as ARKit's, in meters, the world is y up.
-Intrinsics count from the corner of the image, so that half a pixel is subtracted; ARKit refocuses
-all the time, and the median over the frames is taken if it changes little. Depth is written as
-PNG of millimeters, and needs the package pyliblzfse; without it depth is unknown, and that is
-recorded. Followed: nerfstudio 1.1, `record3d_utils.py`, and readers of .r3d files of 2025.
+read. Poses are camera to world in ARKit's axes, which are OpenGL's, in meters; the world is y up.
+Pixel coordinates start at the corner of the image, so half a pixel is subtracted. ARKit refocuses
+continuously; the median over the frames is used if the focal length changes little. Depth is
+written as PNG in millimeters and needs the package pyliblzfse. Without it, depth is unknown, and
+the recording says so. Followed: nerfstudio 1.1, `record3d_utils.py`, and readers of .r3d files of
+2025.
 """
 
 from __future__ import annotations
@@ -52,11 +53,11 @@ from egosim_jax.io.untrusted.npz import DAMAGE
 from egosim_jax.types import InputError
 
 MAX_FILE_BYTES = 1 << 28
-"""Largest file of a capture, or entry of an archive, in bytes."""
+"""Maximum size of a file in a capture or archive, in bytes."""
 MAX_SPREAD = 0.03
-"""Largest relative change of the focal length during a capture."""
+"""Maximum relative change of the focal length during a capture."""
 MAX_DEPTH_SIDE = 4096
-"""Largest number of rows or columns of a depth map."""
+"""Maximum height and width of a depth map in pixels."""
 _IMAGE = re.compile(r"(?:rgbd|rgb)/(\d{1,9})\.jpg")
 
 ReadFile = Callable[[str], bytes]
@@ -124,7 +125,7 @@ def _read(path: Path, folder: Path) -> Recording:
 
 @contextmanager
 def _open_capture(path: Path) -> Iterator[tuple[list[str], ReadFile]]:
-    """Open an archive or a folder: names of files in it, and a function that reads one."""
+    """Open an archive or folder; yield its file names and a function that reads a file."""
     if path.is_dir():
         files = (file for file in path.glob("**/*") if file.is_file())
         names = [str(file.relative_to(path)) for file in files]
@@ -227,7 +228,7 @@ def _write_depth(
     path: Path,
     folder: Path,
 ) -> tuple[DepthFiles | None, str]:
-    """Write depth maps as PNG of millimeters; return them, or None, and why."""
+    """Write depth maps as PNG in millimeters; return them, or None, and their source or why not."""
     found = [f"rgbd/{number}.depth" in names for number in range(frames)]
     if not any(found):
         return None, "none"

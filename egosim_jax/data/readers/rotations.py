@@ -1,4 +1,4 @@
-"""Rotations from the quaternions that datasets store."""
+"""Rotations and poses from quaternions and OpenGL axes, as datasets store them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 def from_quaternions(xyzw: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Return rotation matrices of quaternions x y z w; NaN unless they are of unit length.
+    """Return rotation matrices of unit quaternions x y z w; NaN for other lengths.
 
     Lengths from 0.99 to 1.01 are normalized.
     """
@@ -32,4 +32,4 @@ def make_poses(
 
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turn of camera axes: OpenGL's (x right, y up, z backward) and OpenCV's, either way."""
+"""Conversion of camera axes from OpenGL's (x right, y up, z backward) to OpenCV's, or back."""

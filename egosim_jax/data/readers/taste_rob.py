@@ -1,8 +1,8 @@
-"""TASTE-Rob: egocentric videos of a fixed camera, with a sentence of what the hands do.
+"""TASTE-Rob: egocentric videos of a fixed camera, with captions of the hands' actions.
 
-The layout of the archive is not public, so that a table is needed: a CSV with a column of video
-paths and one of captions, by any of the names below. The camera does not move: all its poses are
-the identity; intrinsics, hands and scale are unknown.
+The layout of the archive is not public, so the reader needs a table: a CSV with a column of video
+paths and a column of captions, under any of the names below. The camera does not move: all poses
+are the identity. Intrinsics, hands and scale are unknown.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from egosim_jax.types import InputError
 VIDEO_COLUMNS = ("video", "video_path", "file", "file_name", "filename", "path", "name")
 CAPTION_COLUMNS = ("caption", "prompt", "text", "language", "instruction", "description")
 MAX_BYTES = 1 << 28
-"""Largest table in bytes."""
+"""Maximum size of a table in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TasteRob:
-    """TASTE-Rob, or any videos of a fixed camera with a table of captions."""
+    """TASTE-Rob, or any fixed-camera videos with a table of captions."""
 
     dataset: ClassVar[str] = "taste_rob"
     source: Annotated[Path, tyro.conf.Positional]
@@ -76,8 +76,8 @@ def read_table(path: Path) -> list[tuple[str, str]]:
         raise InputError(f"{name} cannot be read as CSV: {quote_text(str(error))}.") from error
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     columns = [
-        next((header.index(column) for column in wanted if column in header), None)
-        for wanted in (VIDEO_COLUMNS, CAPTION_COLUMNS)
+        next((header.index(column) for column in names if column in header), None)
+        for names in (VIDEO_COLUMNS, CAPTION_COLUMNS)
     ]
     video, caption = columns
     if video is None or caption is None:

@@ -1,7 +1,7 @@
-"""TRUMANS: motions of humans in rooms, which cannot be imported, and why.
+"""TRUMANS: human motions in rooms, which cannot be imported.
 
-Its bodies are parameters of SMPL-X, a model whose license does not allow to ship it, and it has no
-egocentric videos: they would have to be rendered from its Blender files.
+Its bodies are parameters of SMPL-X, whose license forbids shipping the model. It has no egocentric
+videos; they would have to be rendered from its Blender files. The reader exists to say this.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ class Trumans:
 
     dataset: ClassVar[str] = "trumans"
     source: Annotated[Path, tyro.conf.Positional]
-    """Folder of the set."""
+    """Folder of the dataset."""
 
     def find(self) -> Iterator[Entry]:
-        """Refuse TRUMANS, whose bodies are parameters of SMPL-X, without egocentric video."""
+        """Raise `InputError`, which explains why TRUMANS cannot be imported."""
         raise InputError(
             f"{self.source} cannot be imported: TRUMANS has no egocentric video, and its bodies "
-            "are parameters of SMPL-X, whose license does not allow to ship the model. Render a "
+            "are parameters of SMPL-X, whose license forbids shipping the model. Render a "
             "head camera and export 21 keypoints per hand in the world with your own SMPL-X, and "
             "write them with egosim_jax.data.recording.Recording.save."
         )

@@ -1,13 +1,13 @@
-"""UmeTrack's hand model: keypoints from joint angles, as HOT3D annotates hands.
+"""UmeTrack's hand model: keypoints from joint angles, as in HOT3D's annotations.
 
-Each of five fingers, thumb first, has four hinges: hinge i turns about an axis through a point of
-the hand at rest. A keypoint is a weighted mean over the bones that it follows: the wrist (bones 0
-and 1), and the frames after the second, third and fourth hinge of each finger. The model is a left
-hand in millimeters; a right one is mirrored in x. Source: Han et al., UmeTrack, 2022; followed:
-Meta's hand_tracking_toolkit of 2025.
+Each of five fingers, thumb first, has four hinges: hinge i rotates about an axis through a point of
+the hand at rest. A keypoint is a weighted mean over its bones: the wrist (bones 0 and 1), and the
+frames after the second, third and fourth hinge of each finger. The model is a left hand in
+millimeters; a right hand is mirrored in x. Source: Han et al., UmeTrack, 2022. Followed: Meta's
+hand_tracking_toolkit of 2025.
 
-The model has two joints of the thumb where we have three: ours at its base is the point about which
-its first hinge turns.
+The model's thumb has two joints where ours has three. Our joint at the base of the thumb is the
+pivot of its first hinge.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ORDER = (5, -1, 6, 7, 0, 8, 9, 10, 1, 11, 12, 13, 2, 14, 15, 16, 3, 17, 18, 19, 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class HandModel:
-    """Shape of a person's hand."""
+    """Shape of the wearer's hands."""
 
     axes: Float[np.ndarray, "20 3"]
     """Unit vector of each hinge."""
@@ -84,7 +84,7 @@ class HandModel:
 
 
 def _table(written: Any, name: str, rows: int, columns: int | None) -> np.ndarray:
-    """Return at least so many rows of finite numbers, and of them the first ones."""
+    """Return the first `rows` rows of a table of finite numbers."""
     value = written.get(name) if isinstance(written, Mapping) else None
     try:
         table = np.array(value, float)

@@ -66,7 +66,7 @@ def test_an_episode_is_read_at_another_rate_and_size_and_in_another_scene(record
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"codebase_version": "v2.1"}, "LeRobot version 'v2.1'; v3.0 are read"),
+        ({"codebase_version": "v2.1"}, "LeRobot version 'v2.1'; supported are v3.0"),
         ({HANDS: None}, "has no feature observation.hands.joints_m"),
         ({"number": 7}, "no episode 7 among its 1"),
         ({"clips": 3}, "enough for 2 clips"),

@@ -122,7 +122,7 @@ def test_commands_take_the_chosen_captions(root, tmp_path):
 
 
 def test_captions_of_a_column_cannot_be_chosen(clips, tmp_path):
-    with pytest.raises(InputError, match="captions in the column prompt: prompts can be chosen only"):
+    with pytest.raises(InputError, match="in the column prompt: prompts can be chosen only"):
         Pack(metadata=clips, out=tmp_path / "shards", prompts="prompts").run()
     with pytest.raises(InputError, match="scenes of the tabletop world have one caption"):
         Generate(config="debug", prompts="prompts").run()
