@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax.io.bounded import quote_path, read_bytes, refusing
+from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.types import InputError
 
 MAX_IMAGE_PIXELS = 2**25
@@ -49,7 +50,7 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
 
 
 def read_depth_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Read the values of a depth map, in the unit of the file.
+    """Read a depth map, in the unit of the file.
 
     Raises `InputError` unless it is a 16-bit PNG with one channel, or an npy of numbers `h w`.
     """
@@ -65,25 +66,6 @@ def read_depth_image(path: Path) -> Float32[np.ndarray, "h w"]:
         return read_npy(data, name).astype(np.float32)
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(
-            f"{name} is not a depth map: {quote_text(str(error))}. It must be a 16-bit PNG with one "
-            f"channel, or an npy of numbers, at most {MAX_IMAGE_PIXELS:,} pixels."
+            f"{name} is not a depth map: {quote_text(str(error))}. It must be a 16-bit PNG with "
+            f"one channel, or an npy of numbers, at most {MAX_IMAGE_PIXELS:,} pixels."
         ) from error
-
-
-def read_npy(data: bytes, name: str) -> np.ndarray:
-    """Parse the bytes of an npy file of numbers, without pickle. Raises `ValueError`."""
-    file = io.BytesIO(data)
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    version = np.lib.format.read_magic(file)
-    if version not in readers:
-        raise ValueError(f"{name} is of another version of npy")
-    shape, fortran, dtype = readers[version](file, max_header_size=10_000)
-    if dtype.hasobject or dtype.kind not in "biuf":
-        raise ValueError(f"{name} holds {dtype}")
-    if len(data) - file.tell() != math.prod(shape) * dtype.itemsize:
-        raise ValueError(f"{name} does not have the size that its header says")
-    values = np.frombuffer(data, dtype, offset=file.tell())
-    return values.reshape(shape, order="F" if fortran else "C").copy(order="C")

@@ -1,11 +1,10 @@
 """Memory-mapped tensors of safetensors files.
 
-Opening a file reads its header only; values are paged in when they are accessed. The NumPy reader
-of the safetensors library supports neither bfloat16 nor float8, hence this one.
+Our own code, because the safetensors library's NumPy reader supports neither bfloat16 nor float8.
 
-Files written by egosim_jax are sealed: the header holds the SHA-256 of each piece of each tensor
-and one of the header itself. The header is verified when it is read, a tensor when its values are
-first accessed.
+Opening a file reads only its header; values are paged in on access. Files of egosim_jax are sealed:
+the header holds the SHA-256 of each piece of each tensor and of the header itself. The header is
+verified when it is read, a tensor when its values are first accessed.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ CODES = {
     }.items()
 }  # fmt: skip
 """NumPy dtypes by their code in safetensors headers."""
-MAX_TENSORS, LONGEST_NAME, LARGEST, MAX_AXES = 1 << 17, 512, 1 << 48, 32
+MAX_TENSORS, MAX_NAME, MAX_BYTES, MAX_AXES = 1 << 17, 512, 1 << 48, 32
 """Limits: tensors per file, characters per name, bytes and axes per tensor."""
 POINTER = b"version https://git-lfs.github.com/spec/"
 """First bytes of a Git LFS pointer file."""
@@ -55,7 +54,7 @@ METADATA, OURS = "__metadata__", "egosim_jax"
 HASH, CHECKSUMS, SEAL = "sha256", "checksums", "seal"
 """Metadata of a sealed header: hash over all pieces, hashes per tensor, hash of the header."""
 BLANK = "0" * hashlib.sha256().digest_size * 2
-"""Placeholder of a hash, of equal length."""
+"""Placeholder with the length of a hash."""
 
 
 class RefusedError(ValueError):
@@ -81,14 +80,14 @@ class Tensor:
     strides: tuple[int, ...]
     """Byte strides per axis."""
     checksums: tuple[str, ...] = ()
-    """SHA-256 of equal pieces, empty if the file has none."""
+    """SHA-256 of equal pieces; empty if the file has no checksums."""
     origin: str = ""
     """Tensor name and file, for error messages."""
 
     def array(self) -> np.ndarray:
         """Return the values as a read-only view of the file.
 
-        Raises `InputError` if they do not match the checksums, which the first call verifies.
+        The first call verifies the checksums. Raises `InputError` if they do not match.
         """
         if not self.intact:
             raise InputError(
@@ -99,7 +98,7 @@ class Tensor:
 
     @cached_property
     def intact(self) -> bool:
-        """True if the values match the checksums or there are none."""
+        """True if the values match their checksums, or have no checksums."""
         if not self.checksums:
             return True
         step = len(self.data) // len(self.checksums)
@@ -175,6 +174,7 @@ def header(
         listed[tensor.name] = {"dtype": code, "shape": tensor.shape, "data_offsets": offsets}
     text = json.dumps(listed).encode()
     text += b" " * (-len(text) % 8)
+    # A file cannot hold its own hash: the seal is the hash of the header with a blank seal.
     text = text.replace(_seal(BLANK), _seal(digest(text)))
     return len(text).to_bytes(8, "little") + text
 
@@ -262,27 +262,27 @@ def _tensor(name: str, entry: Any, body: memoryview, checksums: str, path: Path)
 
 def check_name(name: str) -> None:
     """Raise `RefusedError` if the name of a tensor is too long or not printable."""
-    if len(name) > LONGEST_NAME or not name.isprintable():
+    if len(name) > MAX_NAME or not name.isprintable():
         raise RefusedError(
-            f"the name {quote(name)} has more than {LONGEST_NAME} characters or unprintable ones"
+            f"the name {quote(name)} has more than {MAX_NAME} characters or unprintable ones"
         )
 
 
-def check_sizes(what: str, numbers: Sequence[Any]) -> None:
-    """Raise `RefusedError` unless all numbers are valid sizes, 0 to `LARGEST` - 1."""
+def check_sizes(owner: str, numbers: Sequence[Any]) -> None:
+    """Raise `RefusedError` unless all numbers are valid sizes, 0 to `MAX_BYTES` - 1."""
     for number in numbers:
-        if type(number) is not int or not 0 <= number < LARGEST:
-            raise RefusedError(f"{what} has {quote(number)} where a size is expected")
+        if type(number) is not int or not 0 <= number < MAX_BYTES:
+            raise RefusedError(f"{owner} has {quote(number)} where a size is expected")
 
 
-def strides_of(what: str, shape: tuple[int, ...], dtype: np.dtype) -> tuple[int, ...]:
+def strides_of(owner: str, shape: tuple[int, ...], dtype: np.dtype) -> tuple[int, ...]:
     """Return the byte strides of a C-contiguous tensor. Raises `RefusedError` if too large."""
     strides, step = [], dtype.itemsize
     for size in reversed(shape):
         strides.append(step)
         step *= max(size, 1)
-    if step > LARGEST:
-        raise RefusedError(f"{what} has more than {LARGEST:,} bytes")
+    if step > MAX_BYTES:
+        raise RefusedError(f"{owner} has more than {MAX_BYTES:,} bytes")
     return tuple(reversed(strides))
 
 

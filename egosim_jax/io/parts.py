@@ -52,8 +52,8 @@ def join(folder: Path, out: Path) -> list[Path]:
                 data = read_bytes(folder / part["file"], limit=PART_BYTES)
                 if digest(data) != part["sha256"]:
                     raise InputError(
-                        f"{quote_path(folder / part['file'])} is damaged: its SHA-256 is not the one "
-                        f"in {DESCRIPTION}. Copy it again."
+                        f"{quote_path(folder / part['file'])} is damaged: its SHA-256 differs "
+                        f"from the one in {DESCRIPTION}. Copy it again."
                     )
                 file.write(data)
             file.flush()

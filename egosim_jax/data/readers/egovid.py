@@ -32,8 +32,8 @@ from egosim_jax.data.readers import Entry, find_files, make_id
 from egosim_jax.data.readers.pose_reading import read_poses
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import open_regular, quote_path, quote_text, read_bytes
-from egosim_jax.io.images import read_npy
 from egosim_jax.io.segments import probe_long_video, read_segment
+from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import InputError
 

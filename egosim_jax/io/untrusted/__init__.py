@@ -1,1 +1,10 @@
-"""Bounded readers of files that others wrote."""
+"""Readers of file formats that could run code or exhaust memory.
+
+Each checks sizes and types before it builds anything, and raises `InputError`. Plain bytes, JSON
+and lines are read by `egosim_jax.io.bounded`.
+
+- isolated: read_hdf5, read_parquet, in a child process with limits of memory and time
+- npz: read_arrays of an npz, read_npy
+- pickled, pickled_arrays, pickled_models: interpreter of pickles, NumPy arrays, MANO's models
+- pth, torch_zip: tensors of PyTorch's files
+"""

@@ -1,4 +1,4 @@
-"""Arrays from npz files: without pickle, and checked before they are built."""
+"""Read arrays from npy and npz files, without pickle and checked before they are built."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26
+"""Maximum size of a stored and of a compressed array, in bytes."""
 DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError,
           RuntimeError)  # fmt: skip
 """Exceptions of zipfile and NumPy for damaged archives."""
 MAX_ENTRIES = 64
+"""Maximum number of arrays in a file."""
 _HEADER = 4096
 
 
@@ -32,11 +34,10 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Read exactly the named arrays of an npz that `np.savez` wrote.
 
-    `dtypes` names the dtype of each array, and `optional` that of arrays which may be absent; those
-    in `others` may have any that holds numbers.
-    Compressed ones are read if `packed`. Raises `InputError` if an array is missing, unknown, of
-    another dtype, too large or damaged: shapes are checked against sizes before anything is built,
-    contents against their CRC-32.
+    `dtypes` holds the dtype of each array, and `optional` the dtype of arrays that may be absent.
+    Arrays in `others` may have any numeric dtype. `packed` allows compressed arrays. Raises
+    `InputError` if an array is missing, unknown, of another dtype, too large or damaged: shapes are
+    checked against sizes before anything is built, contents against their CRC-32.
     """
     name = quote_path(path)
     with open_regular(path) as file:
@@ -65,14 +66,19 @@ def _read(
     limit = MAX_ARRAY_BYTES if stored else MAX_PACKED_BYTES if packed else 0
     if entry.file_size > limit:
         raise ValueError(f"{quote(entry.filename)} is compressed or too large")
-    data = archive.read(entry)
+    return read_npy(archive.read(entry), quote(entry.filename), dtype=dtype)
+
+
+def read_npy(data: bytes, name: str, *, dtype: str | None = None) -> np.ndarray:
+    """Parse the bytes of an npy file of numbers, without pickle. Raises `ValueError`."""
     header = io.BytesIO(data[:_HEADER])
+    # NumPy writes later versions only for headers of 64 KiB and more, which numbers never need.
     if np.lib.format.read_magic(header) != (1, 0):
-        raise ValueError(f"{quote(entry.filename)} is of another version of npy")
+        raise ValueError(f"{name} is of another version of npy")
     shape, fortran, kind = np.lib.format.read_array_header_1_0(header, max_header_size=_HEADER)
     if kind.hasobject or kind.kind not in "biuf" or (dtype is not None and kind != np.dtype(dtype)):
-        raise ValueError(f"{quote(entry.filename)} holds {quote_text(str(kind))}")
+        raise ValueError(f"{name} holds {quote_text(str(kind))}")
     if len(data) - header.tell() != math.prod(shape) * kind.itemsize:
-        raise ValueError(f"{quote(entry.filename)} does not have the size that its header says")
+        raise ValueError(f"{name} does not have the size that its header declares")
     values = np.frombuffer(data, kind, offset=header.tell())
     return values.reshape(shape, order="F" if fortran else "C").copy(order="C")

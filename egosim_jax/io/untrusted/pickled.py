@@ -1,8 +1,10 @@
 """Interpreter of pickles that calls no function, imports no module and builds only plain values.
 
-A pickle is a program for a stack machine. This one knows containers, numbers and text. Names of
-globals are kept as `Name` and only those on an allow-list; what calling one of them would have made
-is built by the dialect, a subclass (`pth.py` for torch, `pickled_arrays.py` for NumPy).
+Our own code, because `pickle.Unpickler` limits neither operations nor nesting nor memory.
+
+A pickle is a program for a stack machine. This machine supports containers, numbers and text. A
+global on the allow-list becomes a `Name`; any other is refused. A subclass builds the values that
+calls of globals would create (`pth.py` for torch, `pickled_arrays.py` for NumPy).
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any, ClassVar, TypeVar
 from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.io.mapped import MAX_TENSORS, RefusedError, check_name
 
-MAX_PICKLE, MAX_STEPS, DEEPEST = 16 << 20, 1 << 20, 64
+MAX_PICKLE, MAX_STEPS, MAX_DEPTH = 16 << 20, 1 << 20, 64
 """Limits: bytes and operations of the pickle, depth of nested containers."""
 MAX_ITEMS, MAX_KEY = 1 << 20, 1 << 31
 """Limits: items of all containers, counted at every reference, and magnitude of integer keys."""
@@ -24,7 +26,7 @@ Leaf = TypeVar("Leaf")
 
 
 class Opaque:
-    """Object that a pickle uses on its way to a value, and that no result may have."""
+    """Intermediate object of a pickle, which must not remain in the result."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,8 @@ class Interpreter:
     """Dotted names of the globals that a pickle may reference."""
     actions: ClassVar[Mapping[str, Callable[[Interpreter, Any], None]]]
     """Method of each supported pickle operation; all others are refused."""
-    most_bytes: ClassVar[int] = MAX_PICKLE
-    """Largest pickle in bytes."""
+    max_bytes: ClassVar[int] = MAX_PICKLE
+    """Maximum size of a pickle in bytes."""
 
     def __init__(self, program: bytes | memoryview):
         self.program = program
@@ -54,25 +56,25 @@ class Interpreter:
         self.memo: dict[int, Any] = {}
 
     def called(self, name: str, arguments: tuple) -> Any:
-        """Return what a call of a global yields."""
+        """Return the value that a call of a global creates."""
         if (name, arguments) == ("collections.OrderedDict", ()):
             return {}
         raise RefusedError(f"its pickle calls {name} with unsupported arguments")
 
     def referenced(self, identity: Any) -> Any:
-        """Return the object outside of the pickle that it references."""
+        """Return the object outside of the pickle that a persistent id references."""
         raise RefusedError(f"its pickle references {quote(identity)} outside of it")
 
     def set_state(self, target: Any, state: Any) -> None:
-        """Set the state of an object; that of dictionaries, such as `_metadata`, is ignored."""
+        """Set the state of an object; states of dictionaries, such as `_metadata`, are ignored."""
         if not (isinstance(state, dict) and isinstance(target, dict)):
             raise RefusedError("its pickle sets the state of an object that is not a dictionary")
 
     def run(self) -> Any:
         """Return the object that the pickle describes."""
-        if len(self.program) > self.most_bytes:
+        if len(self.program) > self.max_bytes:
             raise RefusedError(
-                f"its pickle has {len(self.program):,} bytes; the limit is {self.most_bytes:,}"
+                f"its pickle has {len(self.program):,} bytes; the limit is {self.max_bytes:,}"
             )
         for step, (opcode, argument, _) in enumerate(pickletools.genops(bytes(self.program))):
             if step == MAX_STEPS:
@@ -206,12 +208,12 @@ ACTIONS: dict[str, Callable[[Interpreter, Any], None]] = {
     "REDUCE": Interpreter._call,
     "BUILD": Interpreter._build,
 }  # fmt: skip
-"""Method of each operation that plain values need."""
+"""Method of each operation that builds plain values."""
 Interpreter.actions = ACTIONS
 
 
 def flatten(tree: Any, kind: type[Leaf]) -> dict[str, Leaf]:
-    """Return the leaves of one kind in nested containers by their keys joined with dots."""
+    """Return the leaves of one kind in nested containers, by their keys joined with dots."""
     found: dict[str, Leaf] = {}
     left = [(tree, "", 0)]
     nodes = items = 0
@@ -224,7 +226,7 @@ def flatten(tree: Any, kind: type[Leaf]) -> dict[str, Leaf]:
             found[name] = node
         elif isinstance(node, (dict, list, tuple)):
             items += len(node)
-            if items > MAX_ITEMS or depth > DEEPEST:
+            if items > MAX_ITEMS or depth > MAX_DEPTH:
                 raise RefusedError("its containers are nested too deeply or reference themselves")
             for key, value in node.items() if isinstance(node, dict) else enumerate(node):
                 if isinstance(value, (kind, dict, list, tuple, Opaque)):

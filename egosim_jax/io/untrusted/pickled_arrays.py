@@ -18,14 +18,14 @@ from egosim_jax.types import InputError
 DTYPES = {"f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1"}
 """Codes of the dtypes that arrays may have."""
 MAX_BYTES = 256 << 20
-"""Largest pickle in bytes; its arrays are inside."""
+"""Maximum size of a pickle in bytes, including its arrays."""
 
 
 def read_pickled_arrays(path: Path, *, sha256: str) -> dict[str, np.ndarray]:
     """Return the read-only arrays of a pickle by name, nested keys joined by dots.
 
-    Raises `InputError` with the reason if the file has another SHA-256, is damaged, or has anything
-    but arrays, plain values and containers.
+    Raises `InputError` with the reason if the file has another SHA-256, is damaged, or holds
+    objects other than arrays, plain values and containers.
     """
     data = read_bytes(path, limit=MAX_BYTES)
     try:
@@ -43,14 +43,14 @@ def read_pickled_arrays(path: Path, *, sha256: str) -> dict[str, np.ndarray]:
 
 @dataclass
 class _DType(Opaque):
-    """Dtype, whose byte order its state confirms."""
+    """Dtype; its state must confirm the byte order."""
 
     code: str
 
 
 @dataclass
 class PickledArray(Opaque):
-    """NumPy array of a pickle, which its state fills."""
+    """NumPy array of a pickle, filled by its state."""
 
     filled: np.ndarray | None = None
 
@@ -62,14 +62,14 @@ class PickledArray(Opaque):
 
 
 class NumPyInterpreter(Interpreter):
-    """Pickle interpreter that adds NumPy's arrays, as NumPy writes them at protocols 2 to 4."""
+    """Pickle interpreter that adds NumPy's arrays, as written at protocols 2 to 4."""
 
     allowed = Interpreter.allowed | {
         "numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct",
         "numpy.ndarray", "numpy.dtype",
     }  # fmt: skip
     actions = ACTIONS | dict.fromkeys(("BINBYTES", "SHORT_BINBYTES", "BINBYTES8"), Interpreter.push)
-    most_bytes = MAX_BYTES
+    max_bytes = MAX_BYTES
 
     def called(self, name: str, arguments: tuple) -> Any:
         """Return an array or a dtype that has no state yet."""
@@ -103,7 +103,7 @@ class NumPyInterpreter(Interpreter):
 
 
 def _filled(shape: tuple, dtype: np.dtype, by_column: bool, data: Any) -> np.ndarray:
-    """Return the array of these bytes. Raises `RefusedError` if they are not as many as it has."""
+    """Return the bytes as an array. Raises `RefusedError` if their number does not fit."""
     if len(shape) > MAX_AXES:
         raise RefusedError(f"an array has {len(shape)} axes; the limit is {MAX_AXES}")
     check_sizes("an array", shape)

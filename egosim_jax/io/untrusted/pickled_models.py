@@ -1,14 +1,14 @@
 """Read the pickles of MANO hand models without executing them and without chumpy or scipy.
 
-They were written by Python 2 at protocol 2: its strings are bytes, of which arrays are made. Three
-kinds of objects are in them, each built by a state of plain values:
+Python 2 wrote them at protocol 2, so arrays are built from its byte strings. They hold three kinds
+of objects, each built from a state of plain values:
 
     chumpy.ch.Ch                 an array, `x`
     chumpy.reordering.Select     entries `idxs` of the flattened `a`, in the shape `preferred_shape`
     scipy.sparse.csc.csc_matrix  `data`, `indices` and `indptr` of compressed columns
 
-Everything else is refused, as are globals that would run code. Files that were saved again by a
-later Python or with plain arrays are read as well.
+Other objects are refused, and so are globals that would run code. Files that a later Python saved
+again, also with plain arrays, are read as well.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NEW = frozenset({"copy_reg._reconstructor", "copyreg._reconstructor"})
 OBJECT = frozenset({"__builtin__.object", "builtins.object"})
 SETS = frozenset({"__builtin__.set", "builtins.set"})
 MAX_DENSE = 1 << 24
-"""Most entries of a sparse matrix that is made dense."""
+"""Maximum number of entries in a dense matrix made from a sparse one."""
 
 
 def read_model(path: Path) -> dict[str, np.ndarray]:
@@ -58,14 +58,14 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
 
 @dataclass
 class _Object(Opaque):
-    """Object of one of the three classes, whose state is set later."""
+    """Object of one of the three classes; its state is set later."""
 
     kind: str
     state: dict[str, Any] | None = None
 
 
 class _Model(NumPyInterpreter):
-    """Interpreter that adds strings of Python 2, arrays of chumpy and sparse matrices."""
+    """Interpreter that adds Python 2's strings, chumpy's arrays and sparse matrices."""
 
     allowed = NumPyInterpreter.allowed | {ARRAY, SELECT} | SPARSE | NEW | OBJECT | SETS
     actions: ClassVar = {
@@ -76,7 +76,7 @@ class _Model(NumPyInterpreter):
     }
 
     def called(self, name: str, arguments: tuple) -> Any:
-        """Return an object without its state, or what NumPy's names yield."""
+        """Return an object without its state, or NumPy's array or dtype."""
         classes = {ARRAY, SELECT} | SPARSE
         match arguments:
             case () if name in classes:
@@ -93,7 +93,7 @@ class _Model(NumPyInterpreter):
         return super().called(name, arguments)
 
     def set_state(self, target: Any, state: Any) -> None:
-        """Set the state of an object; of an array, whose bytes Python 2 wrote as a string."""
+        """Set the state of an object, or of an array whose bytes Python 2 wrote as a string."""
         match (target, state):
             case (_Object(state=None), dict()):
                 target.state = state
@@ -106,7 +106,7 @@ class _Model(NumPyInterpreter):
 
 
 def _dense(value: Any) -> np.ndarray | None:
-    """Return the array that a value is, or None if it is none."""
+    """Return a value as an array, or None."""
     match value:
         case PickledArray():
             return value.values()

@@ -1,9 +1,11 @@
 """Read and write PyTorch's `.pth` files without PyTorch and without executing their pickles.
 
+Our own code, because the only other reader, `torch.load`, needs PyTorch, which is no dependency.
+
 A `.pth` is a zip archive of uncompressed entries: `NAME/data.pkl`, a pickle of dictionaries, lists
-and references to tensors, and `NAME/data/KEY`, the bytes of each storage. To the interpreter of
-`pickled.py` this module adds storages and tensors. Every tensor is checked against its storage
-and stays in the memory-mapped file until it is accessed.
+and references to tensors, and `NAME/data/KEY`, the bytes of each storage. This module adds storages
+and tensors to the interpreter in `pickled.py`. Every tensor is checked against its storage and
+stays in the memory-mapped file until it is accessed.
 """
 
 from __future__ import annotations
@@ -52,14 +54,14 @@ class Storage(Opaque):
 
     data: memoryview
     dtype: str | None
-    """Element dtype; None for untyped storages, whose tensors have one."""
+    """Element dtype; None for an untyped storage, whose tensors declare it."""
 
 
 def read_pth(path: Path) -> dict[str, Tensor]:
     """Return the tensors of a `.pth` file by name, nested keys joined by dots.
 
-    The file stays mapped while any of them is alive. Raises `InputError` with the reason if it is
-    not a `.pth` archive, is damaged, or has anything but tensors, plain values and containers.
+    The file stays mapped while a tensor is alive. Raises `InputError` with the reason if it is not
+    a `.pth` archive, is damaged, or holds objects other than tensors, plain values and containers.
     """
     data = map_file(path)
     try:
@@ -74,7 +76,7 @@ def read_pth(path: Path) -> dict[str, Tensor]:
 
 
 def write_pth(path: Path, array: np.ndarray) -> None:
-    """Write one tensor as `torch.save` does, for `torch.load` with `weights_only`; atomically."""
+    """Write one tensor atomically, as `torch.save` does, for `torch.load(weights_only=True)`."""
     kinds = {dtype: kind for kind, dtype in STORAGES.items()}
     kind, array = kinds[array.dtype.name], np.ascontiguousarray(array)
     strides = [step // array.dtype.itemsize for step in array.strides]
@@ -104,7 +106,7 @@ def _numbers(values: Iterable[int]) -> bytes:
 
 
 class _Torch(Interpreter):
-    """Interpreter that adds the tensors of torch, views of the storages in an archive."""
+    """Interpreter that adds torch's tensors, as views of the storages in an archive."""
 
     allowed = Interpreter.allowed | {
         "torch.Size", "torch._utils._rebuild_parameter", "torch._utils._rebuild_tensor_v2",
@@ -176,6 +178,7 @@ def _tensor(storage: Storage, dtype: str, offset: Any, size: tuple, stride: tupl
     here = len(storage.data) // kind.itemsize
     if count and last >= here:
         raise RefusedError(f"a tensor of size {size} reads element {last} of a storage of {here}")
+    # A stride of 0 lets a few bytes declare a huge tensor.
     if count > max(here, 1):
         raise RefusedError(f"a tensor of size {size} repeats the {here} elements of its storage")
     return Tensor(

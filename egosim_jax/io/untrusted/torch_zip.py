@@ -1,7 +1,8 @@
-"""Entries of the uncompressed zip archives that `torch.save` writes.
+"""Read the entries of uncompressed zip archives as `torch.save` writes them.
 
-Python's `zipfile` builds an object for every entry that the directory declares, and reads through a
-file object; this one yields memory-mapped bytes and checks sizes and counts first.
+Our own code, because Python's `zipfile` builds an object for every entry that the directory
+declares and copies contents. This module checks counts and sizes first and returns memory-mapped
+bytes.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from egosim_jax.io.bounded import quote
 from egosim_jax.io.mapped import RefusedError
 
 MAX_ENTRIES = 1 << 17
-"""Entries of an archive."""
+"""Maximum number of entries in an archive."""
 END, END64_LOCATOR = struct.Struct("<10xH4xI2x"), struct.Struct("<8xQ4x")
 END64, LOCAL = struct.Struct("<32xQ8xQ"), struct.Struct("<26xHH")
 CENTRAL = struct.Struct("<8xHH8xIIHHH8xI")
-"""Fields read of the zip records: end of directory (32 and 64 bits), local and central headers."""
+"""Fields of the zip records: end of directory (32 and 64 bits), local and central headers."""
 STORED, ZIP64 = 0, 0xFFFFFFFF
-"""Compression method of uncompressed entries, and the 32-bit marker of a 64-bit number."""
+"""Method of uncompressed entries, and the 32-bit value that refers to a 64-bit number."""
 
 
 class Entry(NamedTuple):
@@ -109,7 +110,7 @@ def _zip64_numbers(extra: bytes) -> Iterator[int]:
 
 
 def _stored(entry: Entry, data: memoryview) -> memoryview:
-    """Return the content of an entry, which follows its local header."""
+    """Return the content of an entry, after its local header."""
     if entry.offset + LOCAL.size > len(data) or data[entry.offset :][:4] != b"PK\3\4":
         raise RefusedError(f"entry {quote(entry.name)} has no local header at the declared offset")
     name, extra = LOCAL.unpack_from(data, entry.offset)

@@ -193,5 +193,5 @@ def test_a_disk_that_fills_up_while_saving_names_the_newest_checkpoint(tmp_path,
 
     monkeypatch.setattr("egosim_jax.io.checkpoint.write_json", full)
     checkpoints.save(8, state(), numbers())
-    with pytest.raises(InputError, match=r"step 8 was not saved, the newest is that of step 7"):
+    with pytest.raises(InputError, match=r"step 8 was not saved, the newest is of step 7"):
         checkpoints.close()

@@ -26,7 +26,6 @@ def test_the_hash_of_a_file_is_that_of_its_bytes(tmp_path):
     assert sha256_within(tmp_path / "a") == sha256(tmp_path / "a")
 
 
-
 @dataclass(frozen=True)
 class Config:
     rate: float
