@@ -212,14 +212,14 @@ class FromScratch(Recipe):
         """Encode every window of a split."""
         from egosim_jax.data.manifest import MANIFEST
         from egosim_jax.data.shards import ShardReader
-        from egosim_jax.data.transforms import record_length
+        from egosim_jax.data.transforms import video_shape
         from egosim_jax.train.encode import encode_shards
 
         latents, model = out / "latents" / split, configs.get(self.config)
         if not (latents / MANIFEST).exists():
             source = ShardReader(frames)
             # To validate: a clip's first window and, if the clip is longer, its last.
-            last = record_length(source[0].arrays) - model.video.frames
+            last = video_shape(source[0].arrays)[0] - model.video.frames
             encode_shards(
                 model,
                 out / "weights",

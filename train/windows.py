@@ -12,7 +12,7 @@ from typing import Any
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.records import RecordError
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.data.transforms import decode_record, record_length
+from egosim_jax.data.transforms import decode_record, video_shape
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.train.encoded_parts import Window
 from egosim_jax.types import InputError, Triplet
@@ -38,7 +38,7 @@ def windows(source: ShardReader, *, frames: int, stride: int) -> list[Window]:
     found = []
     for number in range(len(source)):
         try:
-            last = (known or record_length(source[number].arrays)) - frames
+            last = (known or video_shape(source[number].arrays)[0]) - frames
         except InputError:  # reported when the window is read
             found.append((number, 0))
             continue

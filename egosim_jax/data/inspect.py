@@ -11,7 +11,7 @@ import numpy as np
 
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.sheet import SheetClip
-from egosim_jax.data.transforms import decode_record, record_length, video_shape
+from egosim_jax.data.transforms import decode_record, video_shape
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, VideoSpec
 
@@ -66,6 +66,6 @@ def split_statistics(reader: ShardReader) -> dict[str, SplitStatistics]:
         name = str(record.metadata.get("extra", {}).get("split", "all"))
         split = splits.setdefault(name, SplitStatistics())
         split.records += 1
-        split.lengths[record_length(record.arrays)] += 1
+        split.lengths[video_shape(record.arrays)[0]] += 1
         split.words += len(str(record.metadata.get("prompt", "")).split())
     return dict(sorted(splits.items()))

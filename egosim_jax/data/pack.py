@@ -65,7 +65,11 @@ def pack(
             problem = None
             try:
                 if spec:
-                    record = decoded_record(files, spec, decoding, grid, resampling)
+                    record = triplet_record(
+                        load_triplet(
+                            files, spec, decoding=decoding, grid=grid, resampling=resampling
+                        )
+                    )
                 else:
                     record = encoded_record(files, grid)
                 writer.add(record.arrays, record.metadata)
@@ -102,20 +106,8 @@ def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID) -> Record:
     return Record(arrays=arrays, metadata=clip_metadata(files))
 
 
-def decoded_record(
-    files: ClipFiles,
-    spec: VideoSpec,
-    decoding: Decoding = "accurate",
-    grid: VideoGrid = WAN_GRID,
-    resampling: Resampling = "first",
-) -> Record:
-    """Return a record of a clip's `spec.frames` frames, after the strict checks."""
-    triplet = load_triplet(files, spec, decoding=decoding, grid=grid, resampling=resampling)
-    return triplet_record(triplet)
-
-
 def triplet_record(triplet: Triplet) -> Record:
-    """Return a record of the frames and metadata of a triplet."""
+    """Return a record with the frames and metadata of a triplet."""
     arrays = {
         "prior": triplet.prior,
         "hands": triplet.hands,

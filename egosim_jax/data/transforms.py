@@ -86,7 +86,7 @@ class DecodeWindow(grain.transforms.RandomMap):
 
     def random_map(self, element: Mapping[str, np.ndarray], rng: np.random.Generator) -> Any:
         """Cut the same window out of every video. Raises `InputError` if the clip is shorter."""
-        length = record_length(element)
+        length = video_shape(element)[0]
         if length < self.spec.frames:
             raise InputError(f"{length} frames are fewer than the window's {self.spec.frames}.")
         start = int(rng.integers(0, length - self.spec.frames + 1))
@@ -110,11 +110,6 @@ class RandomCrop(grain.transforms.RandomMap):
         top = int(rng.integers(0, self.spec.height - rows + 1))
         left = int(rng.integers(0, self.spec.width - columns + 1))
         return {"video": video[:, top : top + rows, left : left + columns]}
-
-
-def record_length(arrays: Mapping[str, np.ndarray]) -> int:
-    """Return the number of frames of a record's prior, encoded or decoded."""
-    return video_shape(arrays)[0]
 
 
 def video_shape(arrays: Mapping[str, np.ndarray]) -> tuple[int, int, int]:

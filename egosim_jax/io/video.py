@@ -44,6 +44,8 @@ from egosim_jax.io.decoding import (
 )
 from egosim_jax.types import InputError
 
+CRF = 10
+"""Default quality of x264: 0 is lossless, 10 visually lossless (about 50 dB), 23 x264's own."""
 _SMPTE170M, _LIMITED_RANGE = 6, 1
 
 
@@ -194,7 +196,7 @@ def _decode(
 
 
 def write_video(
-    path: Path, frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = 10
+    path: Path, frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = CRF
 ) -> None:
     """Write an H.264 mp4 file atomically."""
     data = encode_video(frames, fps, crf=crf)
@@ -203,11 +205,10 @@ def write_video(
 
 
 def encode_video(
-    frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = 10
+    frames: UInt8[np.ndarray, "f h w 3"], fps: int | float | Fraction, *, crf: int = CRF
 ) -> bytes:
     """Encode RGB frames as an H.264 (yuv420p) mp4 file.
 
-    `crf` is x264's quality: 0 is lossless, 10 visually lossless (about 50 dB), 23 its default.
     Raises `InputError` for no frames, and for odd sizes, which 4:2:0 cannot represent.
     """
     count, height, width, _ = frames.shape
@@ -222,7 +223,7 @@ def encode_video(
 
 
 def write_frames(
-    path: Path, frames: Iterable[np.ndarray], fps: int | float | Fraction, *, crf: int = 10
+    path: Path, frames: Iterable[np.ndarray], fps: int | float | Fraction
 ) -> tuple[int, int, int]:
     """Write frames one by one as `write_video` does; return their number, height and width.
 
@@ -248,7 +249,7 @@ def write_frames(
             yield frame[:height, :width]
 
     with atomic_write(path) as temporary, temporary.open("r+b") as file:
-        _encode(file, even(), height, width, fps, crf)
+        _encode(file, even(), height, width, fps, CRF)
     return count, height, width
 
 

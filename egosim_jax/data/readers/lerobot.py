@@ -14,10 +14,10 @@ the text is its index or a column `task`. Followed: huggingface's `lerobot` of 2
 from __future__ import annotations
 
 import string
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -69,7 +69,7 @@ class LeRobot:
         info = read_info(self.source)
         camera, fps = _choose_camera(info["features"], self.camera), info["fps"]
         episodes = _episodes_v3 if info["codebase_version"] == "v3.0" else _episodes_v2
-        probe = _Probe()
+        probe = lru_cache(maxsize=1)(probe_long_video)  # consecutive episodes share a video
         for episode in episodes(self.source, info, camera):
             if isinstance(episode, str):
                 index, _, problem = episode.partition(": ")
@@ -85,7 +85,13 @@ class LeRobot:
                 options={"camera": camera},
             )
 
-    def _read(self, episode: _Episode, fps: Fraction, probe: _Probe, folder: Path) -> Recording:
+    def _read(
+        self,
+        episode: _Episode,
+        fps: Fraction,
+        probe: Callable[[Path], VideoInfo],
+        folder: Path,
+    ) -> Recording:
         info = probe(episode.video)
         start = round(episode.start_s * fps)
         if start + episode.length > info.frames:
@@ -156,19 +162,6 @@ def read_rows(
             f"{row['length']}, from 0 without gaps. Download both again."
         )
     return {name: [frames[name][n] for n in chosen] for name in columns}
-
-
-class _Probe:
-    """Probe of videos that caches the last result, because episodes share a video."""
-
-    def __init__(self) -> None:
-        self._path: Path | None = None
-        self._info: VideoInfo | None = None
-
-    def __call__(self, path: Path) -> VideoInfo:
-        if self._info is None or path != self._path:
-            self._path, self._info = path, probe_long_video(path)
-        return self._info
 
 
 def _fail(problem: str, folder: Path) -> Recording:
