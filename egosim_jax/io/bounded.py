@@ -44,9 +44,7 @@ def read_bytes(path: Path, *, limit: int) -> bytes:
     with open_regular(path) as file:
         data = file.read(limit + 1)
     if len(data) > limit:
-        raise InputError(
-            f"{quote_path(path)} has more than {limit:,} bytes, the most that is read."
-        )
+        raise InputError(f"{quote_path(path)} has more than {limit:,} bytes, the maximum.")
     return data
 
 
@@ -85,7 +83,7 @@ def read_lines(
     name = quote_path(path)
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > limit:
-            raise InputError(f"{name} has more than {limit:,} bytes, the most that is read.")
+            raise InputError(f"{name} has more than {limit:,} bytes, the maximum.")
         number = 0
         while line := file.readline(MAX_JSON_BYTES + 1):
             number += 1

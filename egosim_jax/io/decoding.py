@@ -169,10 +169,10 @@ def upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
 def check_size(name: str, frames: int, area: int, max_frames: int) -> None:
     """Raise `InputError` if `frames` frames of `area` pixels exceed the limits."""
     if frames > max_frames:
-        raise InputError(f"{name} is longer than {max_frames} frames, the most that is read.")
+        raise InputError(f"{name} is longer than {max_frames} frames, the maximum.")
     if frames * area > MAX_PIXELS:
         raise InputError(
-            f"{name} has more than {MAX_PIXELS:,} pixels ({area:,} a frame), the most that is read."
+            f"{name} has more than {MAX_PIXELS:,} pixels ({area:,} per frame), the maximum."
         )
 
 
@@ -205,7 +205,7 @@ class FrameBuffer:
             if room <= self._count:
                 raise InputError(
                     f"{self._name} has more than {MAX_KEPT:,} bytes of frames ({frame.nbytes:,} "
-                    "each), the most that is read at once."
+                    "each), the maximum of one call."
                 )
             self._kept.resize((room, *frame.shape), refcheck=False)
         self._kept[self._count] = frame

@@ -36,7 +36,7 @@ def decode_image(data: bytes, *, name: str = "the encoded image") -> UInt8[np.nd
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 raise InputError(
                     f"{name} has {image.width}x{image.height} pixels, more than "
-                    f"{MAX_IMAGE_PIXELS:,}, the most that is read."
+                    f"{MAX_IMAGE_PIXELS:,}, the maximum."
                 )
             if image.mode in ("I", "F"):
                 raise InputError(f"{name} has 32 bits a channel; save it with 8 or 16.")

@@ -38,7 +38,7 @@ def write_latents(folder):
 
 
 def rewrite_manifest(folder, change):
-    """Change a manifest and write it with its hash, as a liar would."""
+    """Change a manifest and write it with a valid hash, as an attacker would."""
     fields = json.loads((folder / MANIFEST).read_text())
     del fields[SEAL]
     change(fields)
@@ -54,7 +54,7 @@ def problems(folder):
 
 
 def damage_record(folder, index):
-    """Flip a byte within the arrays of a record of the first shard; return the shard."""
+    """Flip a byte in a record's arrays in the first shard; return the shard."""
     path = first_shard(folder)
     data = bytearray(path.read_bytes())
     data[data.index(to_bytes(ShardReader(folder)[index])[200:300])] ^= 0xFF

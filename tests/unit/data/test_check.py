@@ -1,4 +1,4 @@
-"""The check of a dataset names what is damaged."""
+"""The check of a dataset names damaged files and records."""
 
 import numpy as np
 import pytest

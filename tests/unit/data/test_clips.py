@@ -1,4 +1,4 @@
-"""Reading a clip at a model's length and size, strictly or as the EgoSim release does."""
+"""Clips are read at a model's length and size, strictly or as the EgoSim release does."""
 
 import dataclasses
 import io
@@ -178,7 +178,7 @@ def test_lenient_still_refuses_a_missing_prior(files):
 
 
 def test_clips_that_were_written_are_read_back(tmp_path):
-    """Within what 4:2:0 color and near-lossless H.264 leave of smooth images."""
+    """Return True if smooth images differ no more than by 4:2:0 color and near-lossless H.264."""
     spec = VideoSpec(frames=9, height=32, width=48)
     frame, row, column = np.mgrid[:9, :32, :48]
     smooth = [

@@ -1,4 +1,4 @@
-"""DWM's folders and lists: what is written is read, and what is wrong is named."""
+"""DWM's folders and lists: written clips are read back, and every mistake is named."""
 
 from fractions import Fraction
 
@@ -95,7 +95,7 @@ def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
 
 
 def original_captions(root):
-    """Write original captions other than the rewritten ones; return the list."""
+    """Write original captions that differ from the rewritten ones; return the list."""
     for number, folder in enumerate(("open", "carry")):
         path = root / "train" / folder / "prompts" / "00000.txt"
         path.write_text(f"original {number}", "utf-8")
@@ -200,7 +200,7 @@ def test_frames_are_taken_at_intervals(root):
 
 
 def packed_by_rate(root, rates):
-    """Record of a clip of 14 frames, each three times, whose videos have these frame rates."""
+    """Return a clip of 14 frames, each three times, with videos of these frame rates."""
     clip = read_metadata(clips_list(root))[0]
     paths = {"target": clip.target, "prior": clip.prior, "hands": clip.hands}
     for name, path in paths.items():

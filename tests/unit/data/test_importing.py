@@ -17,7 +17,7 @@ from tests.captures import World
 
 @dataclass(frozen=True, kw_only=True)
 class Listed:
-    """A reader of recordings that are made up; those named bad fail."""
+    """A reader of synthetic recordings; recordings named bad fail."""
 
     dataset: ClassVar[str] = "listed"
     names: tuple[str, ...]

@@ -15,7 +15,7 @@ RECORDS = 12
 
 @pytest.fixture
 def source(tmp_path):
-    """Twelve records; the number of each is in all of its array."""
+    """Twelve records; each array is filled with the record's number."""
     with ShardWriter(tmp_path / "shards", kind="latents", shard_bytes=2000) as writer:
         for index in range(RECORDS):
             writer.add({"x": np.full((9, 2), index, np.float32)}, {"video_id": f"clip{index}"})

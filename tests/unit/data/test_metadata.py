@@ -1,4 +1,4 @@
-"""Metadata files: defaults of missing columns, and every invalid input."""
+"""Metadata files: defaults of missing columns, and refusal of every invalid input."""
 
 import dataclasses
 import json

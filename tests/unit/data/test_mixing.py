@@ -23,7 +23,7 @@ def write(folder, count, start, width=2):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A mixture of records 0 to 11 and 12 to 16, three of the first for one of the second."""
+    """A mixture of records 0 to 11 and 12 to 16, with weights 3 to 1."""
     root = tmp_path_factory.mktemp("mixture")
     parts = {write(root / "large", 12, 0): 3.0, write(root / "small", 5, 12): 1.0}
     write_mixture(root / "both", parts)

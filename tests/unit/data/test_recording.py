@@ -1,4 +1,4 @@
-"""Recordings: what they refuse, and that they are the same after saving and loading."""
+"""Recordings: validation, and equality after saving and loading."""
 
 from dataclasses import replace
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""Records survive bit for bit; other bytes are refused."""
+"""Records are preserved bit for bit; other bytes are refused."""
 
 import json
 

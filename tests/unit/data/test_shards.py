@@ -1,4 +1,4 @@
-"""Shards: records are read in any order, damage is named, and none is half written."""
+"""Shards: random access to records, named damage, and atomic writing."""
 
 import os
 import pickle
@@ -167,7 +167,7 @@ def test_a_shard_that_is_a_link_is_refused(folder):
 
 
 def test_the_old_dataset_is_there_until_the_new_one_takes_its_place(folder, monkeypatch):
-    """Stop at every step on the disk: what is there is the old dataset or the new one."""
+    """Stop at every disk operation: the folder holds the old dataset or the new one."""
     steps, seen, stop = 0, set(), 0
 
     def counted(name):

@@ -1,4 +1,4 @@
-"""Conditions of EgoSim are refused where a model of DWM would take them for its own."""
+"""EgoSim's conditions are refused where a DWM model would accept them as its own."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Bytes of others are bounded before anything is built from them, and never shown in full."""
+"""Untrusted bytes are bounded before anything is built from them, and never shown in full."""
 
 import json
 import os

@@ -80,7 +80,7 @@ def test_the_newest_stay_and_those_of_every_so_many_steps(tmp_path):
 
 
 def saved_twice(folder: Path) -> list[Path]:
-    """Two checkpoints, and the files of values of the second, largest first."""
+    """Two checkpoints, and the second's value files, largest first."""
     data, checkpoints = numbers(), Checkpoints(folder)
     for step in (7, 8):
         checkpoints.save(step, state(1000), data)
@@ -113,7 +113,7 @@ def test_a_damaged_file_is_named_and_the_checkpoint_before_used_only_on_request(
     np.testing.assert_array_equal(loaded["weights"], state(1000)["weights"])
     assert checkpoints.steps == [7]
     assert str(file) in capsys.readouterr().err
-    checkpoints.save(8, state(1000), numbers())  # the run comes to that step again
+    checkpoints.save(8, state(1000), numbers())  # the run reaches that step again
     checkpoints.close()
     assert Checkpoints(folder).steps == [7, 8]
 
@@ -148,8 +148,8 @@ def test_a_checkpoint_that_orbax_cannot_list_is_named(tmp_path):
         Checkpoints(tmp_path)
 
 
-# Orbax closes its event loop after the first array that it cannot open; TensorStore reports the
-# others to that loop, from its threads, at times after it is closed.
+# Orbax closes its event loop after the first array that it cannot open. TensorStore's threads may
+# report further arrays to the closed loop.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_without_hashes_what_orbax_cannot_read_is_named(tmp_path):
     saved_twice(tmp_path)
@@ -172,7 +172,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_saved(tmp_path, monke
 
 
 def test_the_disk_must_have_room_for_what_is_kept_every_so_often(tmp_path, monkeypatch):
-    """Keep 20, 40 and 60 of the steps 10 to 80, the newest two and, meanwhile, one more."""
+    """Keep 20, 40 and 60 of the steps 10 to 80, the newest two and, while saving, one more."""
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=6 * 4004 - 1))
     checkpoints = Checkpoints(tmp_path, keep=2, keep_every=20)
     steps = range(10, 90, 10)

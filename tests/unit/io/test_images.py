@@ -1,4 +1,4 @@
-"""Images are read as RGB, and what is refused."""
+"""Images are read as RGB; invalid ones are refused."""
 
 import struct
 import zlib
@@ -49,7 +49,7 @@ def test_gray_of_16_bits_keeps_its_upper_8(tmp_path):
 
 
 def png(*chunks):
-    """A PNG of these chunks."""
+    """Return a PNG with these chunks."""
     parts = [b"\x89PNG\r\n\x1a\n"]
     for kind, content in chunks:
         crc = zlib.crc32(kind + content)

@@ -1,4 +1,4 @@
-"""Files come back from their parts as they were, or not at all."""
+"""Files are joined from their parts unchanged, or not at all."""
 
 import json
 
@@ -11,7 +11,7 @@ from egosim_jax.types import InputError
 
 @pytest.fixture
 def files(tmp_path):
-    """Files of no bytes, of a few, and of a multiple of the parts' size."""
+    """Files of no bytes, of a few bytes, and of a multiple of the part size."""
     rng, made = np.random.default_rng(0), []
     for name, size in (("none.bin", 0), ("few.bin", 250), ("even.safetensors", 300)):
         made.append(tmp_path / name)

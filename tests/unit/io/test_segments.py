@@ -1,4 +1,4 @@
-"""Segments of videos: the same frames as decoding everything, whatever the codec and its order."""
+"""Segments of videos: the same frames as decoding everything, for any codec and frame order."""
 
 from fractions import Fraction
 

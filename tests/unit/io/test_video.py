@@ -1,4 +1,4 @@
-"""Videos in and out, and what is refused."""
+"""Videos are written and read; damaged and hostile ones are refused."""
 
 import io
 import os
@@ -23,7 +23,7 @@ from egosim_jax.io.video import (
 )
 from egosim_jax.types import InputError
 
-# 4:2:0 halves the color resolution, so only smooth colors come back; x264 at crf 10 and the
+# 4:2:0 halves the color resolution, so it preserves only smooth colors; x264 at crf 10 and the
 # rounding to limited range (219 levels) then stay within this many gray levels.
 LEVELS = 6
 
@@ -304,7 +304,7 @@ def test_official_decoding_is_the_scalers_default():
 
 
 def test_the_groups_of_samples_of_a_phones_video_are_counted():
-    """Its kind of group, four letters, is where other tables have their number of entries."""
+    """Its grouping type, four letters, is at the offset of other tables' entry count."""
     group = b"\0\0\0\0roll" + (1).to_bytes(4, "big") + (48_000).to_bytes(4, "big") + b"\0" * 4
     check_boxes(io.BytesIO((8 + len(group)).to_bytes(4, "big") + b"sbgp" + group), "a.mp4")
     many = group[:8] + (2**30).to_bytes(4, "big") + group[12:]

@@ -1,4 +1,4 @@
-"""A scene, and the import of what is written from it."""
+"""A scene, and a fixture that imports recordings of it."""
 
 import pytest
 

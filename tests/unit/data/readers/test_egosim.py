@@ -55,7 +55,7 @@ def test_poses_of_another_video_are_refused(world, tmp_path, imported):
 
 
 def write_hands(folder, world, **changes):
-    """HaMeR's result for the hands of the scene, by its camera of another focal length."""
+    """HaMeR's result for the scene's hands, in its own camera of another focal length."""
     focal = 5000 / 256 * max(world.width, world.height)
     local = transform(invert(world.poses[:, None]), world.joints)
     frames = []
@@ -77,7 +77,7 @@ def write_hands(folder, world, **changes):
 
 
 def test_hands_of_hamer_are_placed_where_both_cameras_see_them(world, tmp_path, imported):
-    """A weak perspective keeps the pixels to a few percent of a hand, so that the place follows."""
+    """Weak perspective keeps pixels to a few percent of a hand, which gives the position."""
     write_clip(tmp_path / "fold_1", world)
     write_hands(tmp_path / "fold_1", world)
     joints = imported(EgoSimClips(source=tmp_path / "fold_1"))[0]["fold_1"].joints_m

@@ -119,7 +119,7 @@ def test_keypoints_are_where_the_turned_pinhole_projects_them(tmp_path, imported
 
 
 def test_the_image_is_turned_clockwise(tmp_path, imported):
-    """The color camera's x axis points up: what is right of it appears below."""
+    """The color camera's x axis points up: objects to its right appear below."""
     write_clip(tmp_path / "set/clip.tar")
     recording = imported(Hot3D(source=tmp_path / "set"))[0]["clip"]
     np.testing.assert_allclose(recording.world_from_camera[0, :3, 1], [1, 0, 0], atol=1e-9)

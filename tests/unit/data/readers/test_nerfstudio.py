@@ -1,4 +1,4 @@
-"""nerfstudio: axes turned from OpenGL's, per-frame and common intrinsics, depth, hostile paths."""
+"""nerfstudio: OpenGL's axes, per-frame and common intrinsics, depth, and hostile paths."""
 
 import json
 
@@ -51,7 +51,7 @@ def test_cameras_are_those_of_the_scene_in_order_of_names(world, tmp_path, impor
 
 
 def test_the_camera_looks_at_the_scene(world, tmp_path, imported):
-    """The world's origin is before every camera, near the middle of its image."""
+    """The world's origin is in front of every camera, near the image center."""
     write_capture(tmp_path / "desk", world)
     recording = imported(Nerfstudio(source=tmp_path / "desk", fps=10.0))[0]["desk"]
     origin = invert(recording.world_from_camera)[:, :3, 3]

@@ -1,4 +1,4 @@
-"""Record3D: poses turned from OpenGL's axes, intrinsics, depth, and damaged captures."""
+"""Record3D: poses from OpenGL's axes, intrinsics, depth, and damaged captures."""
 
 import io
 import json
@@ -35,7 +35,7 @@ def jpeg(frame):
 
 
 def pack(data):
-    """One block of LZFSE's stream, whose payload is zlib's: only the library below unpacks it."""
+    """One LZFSE block with zlib's payload: only the substitute below decompresses it."""
     payload = zlib.compress(data)
     return b"bvxn" + struct.pack("<II", len(data), len(payload)) + payload + b"bvx$"
 
@@ -66,7 +66,7 @@ def write_capture(path, world, *, per_frame=True, images="rgbd", **changes):
 
 @pytest.fixture
 def unpacker(monkeypatch):
-    """A substitute for the optional library, whose compression is zlib's."""
+    """A substitute for the optional library that compresses with zlib."""
     module = types.ModuleType("liblzfse")
     module.decompress, module.error = lambda data: zlib.decompress(data[12:-4]), zlib.error
     module.__spec__ = types.SimpleNamespace(name="liblzfse")
@@ -116,7 +116,7 @@ def test_depth_that_is_not_what_it_should_be_is_refused(
 
 
 def test_the_size_of_streams_of_the_reference_implementation_is_known():
-    """Packed by Apple's library: 49,152 zeros, and 16 bytes that do not shrink."""
+    """Compressed by Apple's library: 49,152 zeros, and 16 incompressible bytes."""
     zeros = bytes.fromhex(ZEROS)
     assert unpacked_size(zeros) == 49_152
     stored = bytes.fromhex(STORED)

@@ -1,4 +1,4 @@
-"""TASTE-Rob: videos and captions of a table, and a camera that does not move."""
+"""TASTE-Rob: videos and captions from a table, and a fixed camera."""
 
 import numpy as np
 import pytest
