@@ -1,7 +1,7 @@
 """Releases of weights on a model hub, pinned to a commit and to the SHA-256 of every file.
 
-A branch of a hub may move, so the first fetch of a release records its commit and its hashes, and
-later fetches must match them. huggingface_hub downloads, and resumes an interrupted download.
+A branch on a hub may move, so the first fetch of a release records its commit and hashes, and later
+fetches must match them. huggingface_hub downloads the files and resumes interrupted downloads.
 """
 
 from __future__ import annotations
@@ -25,49 +25,49 @@ from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 
 RECORD = "release.json"
-"""Name of the record in a folder of fetched weights."""
+"""File name of the record in a folder of fetched weights."""
 DOWNLOADS = ".download"
-"""Name of the folder of downloaded files in a folder of weights, until they are converted."""
+"""Subfolder of a weights folder that holds downloaded files until they are converted."""
 _SAFE = r"(?!\.)[A-Za-z0-9._-]+(?:/(?!\.)[A-Za-z0-9._-]+)*"
 _COMMIT, _SHA256 = r"[0-9a-f]{40}", r"[0-9a-f]{64}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Release:
-    """Published weights: their repository on the hub and the config that they are for."""
+    """Published weights: their repository on the hub, and their config."""
 
     name: str
     """Name in `egosim models`."""
     about: str
     """Description of the weights in one line."""
     config: str
-    """Name of the config that they are converted for."""
+    """Name of the config for their conversion."""
     repository: str
     """Repository on the hub, `OWNER/NAME`."""
     revision: str | None
-    """Commit to fetch; None if unknown, then the first fetch records it."""
+    """Commit to fetch; if None, the first fetch records it."""
     widen: Literal["copy", "polarity"] | None
-    """Widening of the input channels in the conversion (`egosim convert weights --widen`)."""
+    """Method that adds input channels in the conversion (`egosim convert weights --widen`)."""
     files: Mapping[str, str | None]
-    """Paths, or patterns of them, and their SHA-256; None if unknown, as for the revision."""
+    """SHA-256 by path or path pattern; if None, the first fetch records it."""
 
     def pins(self, path: str) -> list[str | None]:
-        """Return the hash of each entry of `files` that matches a path; none for other files."""
+        """Return the hashes of the entries of `files` that match a path."""
         return [pin for pattern, pin in self.files.items() if fnmatch.fnmatchcase(path, pattern)]
 
 
 def fetched_folder(name: str) -> Path:
-    """Return the folder of a release's converted weights, there or not yet."""
+    """Return the folder for a release's converted weights, which may not exist yet."""
     return cache_folder() / "weights" / name
 
 
 def is_fetched(folder: Path) -> bool:
-    """Return whether a folder has all weights of a release: the record is written last."""
+    """Return True if a folder has all weights of a release: the record is written last."""
     return (folder / RECORD).is_file()
 
 
 def check_fetched(release: Release, folder: Path) -> None:
-    """Raise `InputError` if the weights in a folder are not those of a release, by its record."""
+    """Raise `InputError` if the record in a folder names another release."""
     if differences := _differences(release, _read_record(folder / RECORD)):
         raise InputError(
             f"{folder} holds weights of another release than {release.name}: "
@@ -81,11 +81,11 @@ def record_path(name: str) -> Path:
 
 
 def list_files(release: Release) -> tuple[Release, dict[str, int]]:
-    """Ask the hub for the files of a release; return it pinned to them, and their sizes in bytes.
+    """List a release's files on the hub; return the release pinned to them, and sizes in bytes.
 
-    The commit is the pinned or recorded one, else the newest. The files are paths, each with its
-    SHA-256 if that is known. Raises `InputError` if the hub cannot be reached, a file is missing,
-    or a commit or hash is not the pinned or recorded one.
+    The commit is the pinned or recorded one, else the newest. `files` of the returned release has a
+    path for each file, with its SHA-256 if known. Raises `InputError` if the hub is unreachable, a
+    file is missing, or a commit or hash differs from the pinned or recorded one.
     """
     from huggingface_hub import HfApi
 
@@ -110,9 +110,9 @@ def list_files(release: Release) -> tuple[Release, dict[str, int]]:
 
 
 def download(release: Release, folder: Path) -> Release:
-    """Download the files that a folder lacks of a release from `list_files`; return all SHA-256.
+    """Download the missing files of a release from `list_files`; return it with all SHA-256.
 
-    The returned release is recorded in the cache: all its files are verified. A file with another
+    All files are verified, and the returned release is recorded in the cache. A file with another
     hash is removed and raises `InputError`.
     """
     from huggingface_hub import snapshot_download
@@ -136,20 +136,20 @@ def download(release: Release, folder: Path) -> Release:
 
 
 def bytes_needed(size: int, folder: Path) -> int:
-    """Return the bytes of free disk space that the rest of a download and its conversion need."""
+    """Return the free bytes that the rest of a download and its conversion need."""
     files = [*(folder / DOWNLOADS).rglob("*")]
     for log in folder.glob(f"*{LOG}"):
         target = log.with_name(log.name.removesuffix(LOG))
         part = target.with_name(target.name + PART)
         files.append(part if part.is_file() else target)
     found = [file.stat() for file in files if file.is_file()]
-    # A network that is being written has its full size from the start; its blocks come later.
-    there = sum(min(stat.st_size, 512 * stat.st_blocks) for stat in found)
-    return max(2 * size - there, 0)
+    # An unfinished network is a sparse file of its full size: count allocated blocks (512 bytes).
+    written = sum(min(stat.st_size, 512 * stat.st_blocks) for stat in found)
+    return max(2 * size - written, 0)
 
 
 def remove_leftovers(folder: Path, *, keep_download: bool) -> None:
-    """Remove what a complete fetch no longer needs: logs of the conversion and the download."""
+    """Remove conversion logs and, unless kept, the download of a complete fetch."""
     downloads = folder / DOWNLOADS
     if not any(folder.glob(f"*{LOG}")) and (keep_download or not downloads.exists()):
         return
@@ -172,7 +172,7 @@ def check_space(needed: int, folder: Path) -> None:
 
 
 def free_space(folder: Path) -> int:
-    """Return the free bytes on the disk of a folder, which need not exist yet."""
+    """Return the free bytes on the disk of a folder, which may not exist yet."""
     above = next(f for f in (folder, *folder.absolute().parents) if f.exists())
     return shutil.disk_usage(above).free
 
@@ -188,14 +188,14 @@ def _with_record(release: Release) -> Release:
             f"{path} records a fetch from {quote(record.repository)}; expected "
             f"{release.repository}. Remove it to fetch the new release."
         )
-    # A recorded hash counts for a file of the release that has no pinned one.
+    # Pinned hashes take precedence over recorded ones.
     recorded = {p: pin for p, pin in record.files.items() if {*release.pins(p)} == {None}}
     revision = release.revision or record.revision
     return replace(release, revision=revision, files={**release.files, **recorded})
 
 
 def _read_record(path: Path) -> Release:
-    """Read a release as it was fetched: with its commit, and the path and SHA-256 of each file."""
+    """Read the record of a fetched release, with its commit and the SHA-256 of each file."""
     record = read_json(path)
     with suppress(TypeError, AttributeError):
         found = Release(**record)
@@ -207,7 +207,7 @@ def _read_record(path: Path) -> Release:
 
 
 def _differences(release: Release, found: Release) -> list[str]:
-    """Return a message for each difference in repository, commit, files and known hashes."""
+    """List the differences in repository, commit, files and known hashes."""
     differences = []
     if found.repository != release.repository:
         differences.append(f"repository {quote(found.repository)}; expected {release.repository}")
@@ -220,15 +220,15 @@ def _differences(release: Release, found: Release) -> list[str]:
         if not hashes:
             differences.append(f"no file {pattern}")
         differences += [
-            f"{quote_text(path)} has SHA-256 {quote_text(have)}; expected {quote_text(pin)}"
-            for path, have in hashes.items()
-            if pin and have and have != pin
+            f"{quote_text(path)} has SHA-256 {quote_text(found_hash)}; expected {quote_text(pin)}"
+            for path, found_hash in hashes.items()
+            if pin and found_hash and found_hash != pin
         ]
     return differences
 
 
 def _check(release: Release, found: Release) -> None:
-    """Raise `InputError` if the hub has another release than the expected one."""
+    """Raise `InputError` if the hub's release differs from the expected one."""
     if differences := _differences(release, found):
         raise InputError(
             f"{release.repository} is not {release.name} as expected: {listing(differences)}. Run "
@@ -239,7 +239,7 @@ def _check(release: Release, found: Release) -> None:
 
 @contextmanager
 def _asking(release: Release) -> Iterator[None]:
-    """Turn what the hub's client raises into `InputError`, unless it is of the disk."""
+    """Turn exceptions of the hub's client into `InputError`, except disk errors."""
     try:
         yield
     except Exception as error:

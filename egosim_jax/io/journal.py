@@ -59,9 +59,9 @@ class Journal:
         self._chain, self.done[entry["phase"]] = chain, entry
 
     def require(self, phase: str, made_of: Mapping[str, str]) -> None:
-        """Record the inputs of a run, or of one of its phases, as hashes or short values.
+        """Record the inputs of a run, or of a phase, as hashes or short values.
 
-        Raises `InputError` showing both values where an input differs from the recorded one.
+        Raises `InputError` with both values if an input differs from the recorded one.
         """
         if phase not in self.done:
             self._append({"phase": phase, "made_of": dict(made_of)})

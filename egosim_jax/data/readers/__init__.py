@@ -75,12 +75,12 @@ def require(module: str) -> None:
         )
 
 
-def find_files(source: Path, pattern: str, *, what: str) -> list[Path]:
+def find_files(source: Path, pattern: str, *, kind: str) -> list[Path]:
     """Return the matching files below a folder, or the file itself, in natural order."""
     found = [source] if source.is_file() else sorted(source.rglob(pattern), key=natural_order)
     if not found:
         raise InputError(
-            f"{source} holds no {what}: it must be a folder with {pattern} at any depth, or one "
+            f"{source} holds no {kind}: it must be a folder with {pattern} at any depth, or one "
             "such file."
         )
     return found

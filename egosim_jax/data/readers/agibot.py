@@ -112,7 +112,7 @@ class AgiBot:
         """List the parts of all episodes."""
         require("h5py")
         infos: dict[str, Any] = {}
-        for path in find_files(self.source, "proprio_stats.h5", what="episode of AgiBot-World"):
+        for path in find_files(self.source, "proprio_stats.h5", kind="episode of AgiBot-World"):
             files = _Files.of(path.resolve())
             if files.task not in infos:
                 infos[files.task] = _read_info(files.info)

@@ -59,7 +59,7 @@ class EgoDex:
         """List the .hdf5 files."""
         require("h5py")
         root = self.source if self.source.is_dir() else self.source.parent
-        for path in find_files(self.source, "*.hdf5", what="episode of EgoDex"):
+        for path in find_files(self.source, "*.hdf5", kind="episode of EgoDex"):
             yield Entry(
                 recording_id=make_id(path.relative_to(root).with_suffix("").parts),
                 read=partial(self._read, path),

@@ -65,7 +65,7 @@ class EgoVid:
         videos = {path.stem: path for path in sorted(folder.rglob("*.mp4"))}
         if not videos:
             raise InputError(f"{folder} holds no .mp4 files at any depth. (--videos)")
-        for table in find_files(self.source, "*.csv", what="table of EgoVid-5M"):
+        for table in find_files(self.source, "*.csv", kind="table of EgoVid-5M"):
             for row in _rows(table):
                 video_id = row["video_id"].removesuffix(".mp4")
                 uuid, _, _ = _split(video_id)

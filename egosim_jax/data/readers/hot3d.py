@@ -66,7 +66,7 @@ class Hot3D:
     def find(self) -> Iterator[Entry]:
         """Yield the clips of a HOT3D folder."""
         root = self.source if self.source.is_dir() else self.source.parent
-        for path in find_files(self.source, "*.tar", what="clip of HOT3D"):
+        for path in find_files(self.source, "*.tar", kind="clip of HOT3D"):
             yield Entry(
                 recording_id=make_id(path.relative_to(root).with_suffix("").parts),
                 read=partial(self._read, path),

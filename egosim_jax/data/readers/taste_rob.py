@@ -40,7 +40,7 @@ class TasteRob:
 
     def find(self) -> Iterator[Entry]:
         """List the rows of the tables."""
-        for table in find_files(self.source, "*.csv", what="table of videos and captions"):
+        for table in find_files(self.source, "*.csv", kind="table of videos and captions"):
             for name, caption in read_table(table):
                 video = Path(name)
                 yield Entry(
