@@ -6,10 +6,10 @@ import io
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from egosim_jax.io.bounded import quote_path, read_bytes, refusing
+from egosim_jax.io.bounded import quote_path, quote_text, read_bytes, refusing
 from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.types import InputError
 
