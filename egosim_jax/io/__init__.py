@@ -4,7 +4,7 @@ Readers of a dataset's layout belong to `data`, and conversion of other projects
 `convert`. `io` knows no clip, no model config and no command.
 
 - bounded: open_regular, read_bytes, read_json, read_lines, and quoting for messages
-- untrusted: readers of hdf5, parquet, npz, pickles and `.pth` that run nothing in the file
+- untrusted: readers of HDF5, Parquet, COLMAP, npz, pickles and `.pth`; they run no code in a file
 - atomic: atomic_write, atomic_folder, append_line, lock_folder
 - digest: sha256 of files and folders, fingerprint of values
 - images: read_image, decode_image, read_depth_image

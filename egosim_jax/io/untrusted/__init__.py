@@ -3,7 +3,8 @@
 Each checks sizes and types before it builds anything, and raises `InputError`. Plain bytes, JSON
 and lines are read by `egosim_jax.io.bounded`.
 
-- isolated: read_hdf5, read_parquet, in a child process with limits of memory and time
+- isolated: read_file, which runs a reader in a child process with limits of memory and time
+- hdf5, parquet, colmap: read_hdf5, read_parquet, read_model, each in that child process
 - npz: read_arrays of an npz, read_npy
 - pickled, pickled_arrays, pickled_models: interpreter of pickles, NumPy arrays, MANO's models
 - pth, torch_zip: tensors of PyTorch's files
