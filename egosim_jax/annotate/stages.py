@@ -129,9 +129,9 @@ def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) 
         joints = np.asarray(record.recording.joints_m)[_source_frames(record)]
         moving = hand_silhouette(joints, kind, cameras, HandShape()) >= 0
     else:
-        from egosim_jax.perception.silhouettes import hand_silhouettes
+        from egosim_jax.perception.silhouettes import track_silhouettes
 
-        moving = hand_silhouettes(record.frames, hold_hands(record.hands, record.fps))
+        moving = track_silhouettes(record.frames, hold_hands(record.hands, record.fps))
     ids = np.where(moving, -1, 0).astype(np.int32)
     return record.add("silhouettes", {"masks": "geometry"}, object_ids=ids, names={})
 

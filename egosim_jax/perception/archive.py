@@ -1,4 +1,4 @@
-"""Storage of a `Perceived` as one npz file, without pickle."""
+"""Storage of a `Perceived` in one npz file, without pickle."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DTYPES = {
 
 
 def save(path: Path, perceived: Perceived) -> None:
-    """Write a `Perceived` to a file that ends in .npz, atomically."""
+    """Write a `Perceived` atomically to a file that ends in .npz."""
     tracked, interacted = sorted(perceived.world_from_object), sorted(perceived.interacted_frames)
     about = {
         "step": perceived.step,
@@ -44,7 +44,7 @@ def save(path: Path, perceived: Perceived) -> None:
 
 
 def load(path: Path) -> Perceived:
-    """Read a `Perceived` that `save` wrote. Raises `InputError` for other or damaged files."""
+    """Read a `Perceived` written by `save`. Raises `InputError` for other or damaged files."""
     arrays = read_arrays(path, _DTYPES)
     about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
     try:

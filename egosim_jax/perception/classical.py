@@ -1,13 +1,16 @@
-"""Classical perception: without network weights, by comparing the clip with the state's prediction.
+"""Classical perception: compares the clip with the state's prediction, without network weights.
 
-Cameras and hand joints are those that the generator was given. Hands and arms are drawn from the
-joints (`HandMasks`); the motion of a held object is the one that explains the clip's colors best
-(`object_motion.TrackObjects`); where the object was, the surface that it stood on is extended
-(`RevealedSurfaces`). Depth is set only where the clip differs from the view of the state before;
-elsewhere it is unknown, and the state stays as it was.
+Cameras and hand joints are the generator's inputs. The stages then run in this order:
 
-Limits: objects must be separate instances in the state, and the moving part of an articulated one
-another than the rest; an object is moved by one hand at a time, and does not topple.
+    HandMasks          draws hands and arms from the joints
+    TrackObjects       finds the motion of a held object that best explains the clip's colors
+    RevealedSurfaces   extends the supporting surface to where the object was
+
+Depth is set only where the clip differs from the view of the previous state. Elsewhere depth is
+unknown, and the state does not change.
+
+Limits: each object must be a separate instance in the state, and so must the moving part of an
+articulated object. One hand at a time moves an object, and objects do not topple.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from egosim_jax.types import Action, Cameras, Clip, SceneState, check_counts
 
 
 def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
-    """Set cameras and hand joints to those that the generator was given; no new names."""
+    """Set cameras and hand joints to the generator's inputs, and no new names."""
     return replace(so_far, cameras=action.cameras, joints_m=action.joints_m, names={})
 
 
@@ -48,10 +51,10 @@ class HandMasks(HandShape):
 
 @dataclass(frozen=True, kw_only=True)
 class RevealedSurfaces:
-    """Stage that sets depth and ids of moved objects and of the surfaces they stood on."""
+    """Stage that sets depth and ids of moved objects and of the surfaces that they revealed."""
 
     point_px: int = 2
-    """Size in pixels of the points with which the state is rendered."""
+    """Size of the state's rendered points, in pixels."""
 
     def __post_init__(self) -> None:
         """Check that points have a size."""
@@ -60,7 +63,7 @@ class RevealedSurfaces:
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `depth_m`, infinite where the clip agrees with the state or shows hands, and ids."""
+        """Set `depth_m` (infinite where nothing changed, and at hands) and `object_ids`."""
         cameras, hand_ids, motions, planes = (
             so_far.require(field, "RevealedSurfaces")
             for field in ("cameras", "object_ids", "motions", "support_planes")
@@ -80,7 +83,7 @@ class RevealedSurfaces:
         motions: Mapping[int, Float[np.ndarray, "f 4 4"]],
         planes: Mapping[int, Float[np.ndarray, " 4"]],
     ) -> tuple[Float32[np.ndarray, "f h w"], Int32[np.ndarray, "f h w"]]:
-        """Return depth and object ids of changed pixels; infinite and 0 elsewhere."""
+        """Return depth and object ids of changed pixels, and infinity and 0 elsewhere."""
         shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
         depth, ids = np.full(shape, np.inf, np.float32), np.zeros(shape, np.int32)
         if not motions:
@@ -89,6 +92,7 @@ class RevealedSurfaces:
         rest, _ = splat(state.points_m[~held], cameras, point_px=self.point_px)
         _, index = splat(state.points_m[held], cameras, point_px=self.point_px)
         before = np.append(state.object_ids[held], np.int32(0))[index]
+        # First all revealed surfaces, then all moved objects: an object may end on such a surface.
         for number in motions:
             revealed = (before == number) & ~np.isfinite(rest)
             depth[revealed] = np.minimum(depth, plane_depth(planes[number], cameras))[revealed]
@@ -105,12 +109,12 @@ class RevealedSurfaces:
 @register("classical")
 @dataclass(frozen=True, kw_only=True)
 class ClassicalConfig:
-    """Perception without network weights, for clips whose cameras and hands are known."""
+    """Perception without network weights, for clips with known cameras and hands."""
 
     hands: HandMasks = field(default_factory=HandMasks)
     """Drawing of hands and arms."""
     motion: TrackObjects = field(default_factory=TrackObjects)
-    """Search for the motion of held objects."""
+    """Estimation of the motion of held objects."""
     surfaces: RevealedSurfaces = field(default_factory=RevealedSurfaces)
     """Depth of moved objects and of the surfaces behind them."""
 
@@ -120,7 +124,7 @@ class ClassicalConfig:
 
 
 def plane_depth(plane: Float[np.ndarray, " 4"], cameras: Cameras) -> Float32[np.ndarray, "f h w"]:
-    """Return the depth in meters of a plane (a, b, c, d); infinite where a ray does not meet it."""
+    """Return the depth of a plane (a, b, c, d) in meters; infinite where a ray misses it."""
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     normal, offset = plane[:3], plane[3]
     depths = []

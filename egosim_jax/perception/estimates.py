@@ -1,8 +1,8 @@
-"""Estimates from raw video, and the Protocols of the estimators that make them.
+"""Estimates from raw video, and the Protocols of their estimators.
 
-A method without weights and a network satisfy the same Protocol, so that annotation of recorded
-videos and perception of generated clips are built from the same parts. Videos are uint8 RGB,
-cameras in OpenCV axes. What could not be estimated is NaN, infinite or None, never guessed.
+Networks and methods without weights satisfy the same Protocols, so the annotation of recorded
+videos and the perception of generated clips share them. Videos are uint8 RGB; cameras have OpenCV
+axes. An unknown value is NaN, infinite or None, never a guess.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ LEFT, RIGHT = 0, 1
 Rung = Literal[
     "given", "network", "static", "incremental", "focal", "global", "rotation", "refused"
 ]
-"""Rung of the ladder of camera estimation, from the best known to none; or a network's cameras."""
+"""Method of a camera estimate: a rung of the ladder, best first, or `network`."""
 ChosenRung = Literal["static", "incremental", "focal", "global", "rotation"]
-"""Rung that can be asked for where cameras are not known."""
+"""Rung that a user can choose if the cameras are not known."""
 
 
 @no_type_check
@@ -32,15 +32,15 @@ class HandTracks:
     """Hands of a video: at most one left and one right hand of the wearer in each frame."""
 
     joints_px: Float[np.ndarray, "f 2 21 2"]
-    """Columns and rows of the 21 keypoints in pixels, left then right; NaN where missing."""
+    """Columns and rows of the 21 keypoints in pixels, left hand first; NaN where missing."""
     joints_hand_m: Float[np.ndarray, "f 2 21 3"]
-    """Keypoints of a mean hand in meters, in camera axes, up to a translation."""
+    """Keypoints of a hand of mean size in meters, in camera axes, up to a translation."""
     presence: Float[np.ndarray, "f 2"]
-    """Confidence from 0 to 1 that the hand is in the frame; 0 where it was not seen."""
+    """Confidence from 0 to 1 that the hand is in the frame; 0 where it was not detected."""
     filled: Bool[np.ndarray, "f 2"] | None = None
-    """Hands that were not seen but interpolated between frames near by; None for none at all."""
+    """True for hands interpolated between nearby frames; None if there are no such hands."""
     mirrored: Bool[np.ndarray, "f 2"] | None = None
-    """Hands whose joints seem to be those of the other side; None for none at all."""
+    """True for hands whose joints look like the other side's; None if there are no such hands."""
 
 
 @no_type_check
@@ -49,7 +49,7 @@ class SparsePoints:
     """Triangulated points of a scene and the pixels that observe them."""
 
     points_m: Float[np.ndarray, "p 3"]
-    """Positions in the world of the cameras, in meters or in their unknown unit."""
+    """World positions in the unit of the cameras (meters, or unknown)."""
     error_px: Float[np.ndarray, " p"]
     """Mean reprojection error of each point, in pixels."""
     frames: Int32[np.ndarray, " o"]
@@ -67,9 +67,9 @@ class Verdict:
     rung: Rung
     """Method whose result was accepted, or `refused`."""
     reason: str
-    """Reason in words, for the report."""
+    """Reason, for the report."""
     figures: Mapping[str, float]
-    """Measured figures by name, such as median triangulation angle in degrees."""
+    """Measured figures by name, such as the median triangulation angle in degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,14 +77,14 @@ class Lens:
     """Radial distortion of recorded frames: x (1 + `radial` r²), as COLMAP's SIMPLE_RADIAL."""
 
     focal_px: float
-    """Focal length of the recorded frames in pixels; the principal point is their center."""
+    """Focal length of the recorded frames in pixels; the principal point is the image center."""
     radial: float
     """Coefficient of r², the squared distance from the axis at depth 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraEstimate:
-    """Cameras of a video, or the reason why there are none."""
+    """Cameras of a video, or the reason for their refusal."""
 
     cameras: Cameras | None
     """Camera of every frame; None if refused."""
@@ -96,7 +96,7 @@ class CameraEstimate:
     lens: Lens | None = None
     """Lens of the recorded frames, if it distorts them.
 
-    `cameras` and `points` are then those of undistorted frames (`cameras.lens.undistort`).
+    `cameras` and `points` then describe undistorted frames (`cameras.lens.undistort`).
     """
 
 
@@ -106,15 +106,15 @@ class DepthEstimate:
     """Depth of some frames of a video."""
 
     frames: Int32[np.ndarray, " k"]
-    """Frames that the maps belong to."""
+    """Frame of each map."""
     depth_m: Float32[np.ndarray, "k h w"]
     """Depth along the camera's z axis, in the unit of the cameras; infinite where unknown."""
     confident: Bool[np.ndarray, "k h w"]
-    """Pixels that were measured; the others were completed from them."""
+    """Measured pixels; the others are completed from them."""
     metric: bool
-    """True if the depth is in meters by itself, as of a metric network."""
+    """True if the depth is in meters whatever the cameras' unit, as from a metric network."""
     reason: str = ""
-    """Method in words, for the report: above all that depth was assumed and not measured."""
+    """Method, for the report; it says if depth was assumed instead of measured."""
 
 
 @runtime_checkable
@@ -137,7 +137,7 @@ class CameraEstimator(Protocol):
         *,
         focal_px: float | None = None,
     ) -> CameraEstimate:
-        """Return the cameras of a video; pixels in `moving` (hands, arms) are not used."""
+        """Return the cameras of a video. Pixels in `moving` (hands, arms) are ignored."""
         ...
 
 
@@ -158,7 +158,7 @@ class DepthEstimator(Protocol):
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Segmentation and tracking of what phrases name."""
+    """Segmentation and tracking of objects named by phrases."""
 
     def __call__(
         self,
@@ -166,14 +166,14 @@ class Segmenter(Protocol):
         phrases: Sequence[str],
         hands: HandTracks | None = None,
     ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
-        """Return instance ids of all pixels (0: none, negative: hands and arms) and their names."""
+        """Return the id of each pixel (0: none, negative: hands and arms) and the name of each id."""
         ...
 
 
 @runtime_checkable
 class Captioner(Protocol):
-    """Captions and names of objects."""
+    """Captioning of videos and naming of moved objects."""
 
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> tuple[str, tuple[str, ...]]:
-        """Return the caption of a video and the names of the objects that are moved in it."""
+        """Return the caption of a video and the names of its moved objects."""
         ...

@@ -1,9 +1,9 @@
-"""Grasps read from the joints of a hand: when it held something, what, and how that then moved.
+"""Grasps read from hand joints: when a hand held an object, which one, and how it moved.
 
-Times come from the distance of the fingertips, the object from what is between them, and its motion
-from its coupling to the hand: translation only, translation with rotation about the normal of the
-supporting surface, or the full motion of the palm (`couplings`); or rotation about the axis of the
-arc that the fingertips describe, as of a lid or a door (`hinge_motion`).
+The distance of the fingertips gives the times (`find_holds`), and the points between them give the
+object (`is_between`). The motion of a loose object is one of three couplings to the hand
+(`couplings`): translation only, translation with rotation about the surface normal, or the full
+motion of the palm. A lid or door turns about the axis of the fingertips' arc (`hinge_motion`).
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from egosim_jax.geometry import hinge_rotation, umeyama
 from egosim_jax.types import Kind
 
 TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
-"""Joints that grasp: thumb, index and middle finger; both jaws of a gripper."""
+"""Grasping joints: tips of thumb, index and middle finger; both jaws of a gripper."""
 MIN_HELD = 2
-"""Fewest frames between a grasp and a release."""
+"""Minimum number of frames between a grasp and a release."""
 MIN_ARC_DEG = 25.0
-"""Smallest angle of an arc whose axis is known, in degrees."""
+"""Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
-"""Largest distance of the fingertips from an arc, as a fraction of its radius."""
+"""Maximum distance of the fingertips from an arc, as a fraction of its radius."""
 
 
 def find_holds(
     tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float
 ) -> tuple[list[tuple[int, int]], bool]:
-    """Return pairs of frames between which a hand may have held something, and if it surely did.
+    """Return (grasp, release) frames of possible holds, and True if the hand surely held.
 
-    What is held keeps the fingertips apart: between both frames their distance stays as it is, from
-    a closing of the hand, or the first frame, to an opening, or the last. A hand that does not
-    close may have held something while its opening was steady; one that always is or never is, says
-    nothing, and may have done so between any two frames.
+    A held object keeps the fingertips at a constant distance. A hold begins when the hand closes,
+    or at the first frame, and ends when it opens, or at the last frame. A hand that never closes
+    may have held an object while its opening was steady. If the opening is always or never steady,
+    it is no evidence, and any two frames may be a hold.
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
@@ -43,7 +43,7 @@ def find_holds(
         return pairs, False
     steady = [(g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= tolerance_m]
     longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
-    padded = np.pad(opening, 1, constant_values=np.inf)  # a hand may come with what it holds
+    padded = np.pad(opening, 1, constant_values=np.inf)  # may hold from frame 0 on
     closed = [
         (g, r) for g, r in longest if min(padded[g], padded[r + 2]) > opening[g : r + 1].mean()
     ]
@@ -72,10 +72,10 @@ def couplings(
     normal: Float[np.ndarray, " 3"],
     hold: tuple[int, int],
 ) -> Iterator[Float[np.ndarray, "f 4 4"]]:
-    """Yield the motions in the world of something loose that is held, by each coupling to the hand.
+    """Yield the world motion of a held loose object for each coupling to the hand.
 
-    `rigid` is the `palm_motion` since the grasp. They are relative to the first frame, and constant
-    before the grasp and after the release.
+    `rigid` is the `palm_motion` since the grasp. Each motion is relative to the first frame, and
+    constant before the grasp and after the release.
     """
     grasped, released = hold
     when = np.clip(np.arange(len(palm_m)), grasped, released)
@@ -93,9 +93,9 @@ def couplings(
 def hinge_motion(
     tips_m: Float[np.ndarray, "f j 3"], hold: tuple[int, int]
 ) -> Float[np.ndarray, "f 4 4"] | None:
-    """Return the motion of something on a hinge; None unless the fingertips describe an arc.
+    """Return the motion of an object on a hinge; None unless the fingertips describe an arc.
 
-    It is constant before the grasp and after the release.
+    The motion is constant before the grasp and after the release.
     """
     grasped, released = hold
     path_m = (tips_m[:, 0] + tips_m[:, 1:].mean(axis=1))[grasped : released + 1] / 2
@@ -120,7 +120,7 @@ def hinge_motion(
 def _twist(
     rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Return the part of a rotation that is about an axis (swing-twist decomposition)."""
+    """Return the component of a rotation about an axis (swing-twist decomposition)."""
     import cv2
 
     vector = cv2.Rodrigues(rotation)[0][:, 0]

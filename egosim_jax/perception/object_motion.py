@@ -1,12 +1,11 @@
-"""Motion of held objects, found by analysis by synthesis: the one that explains the colors best.
+"""Motion of held objects by analysis by synthesis.
 
-An object that was grasped moves with the hand. Candidates are every object that a fingertip comes
-near, the pairs of frames between which the fingers may have held something, and the ways in which
-that may have moved (`grasps`). The cost of a candidate is the mean difference between the object's
-colors and those of the clip where it would be visible; the best is the one that most improves on
-the object at rest. Of what was between the closing fingertips a motion counts unless the clip
-clearly shows it at rest. What was let go of falls (`falling`), and the end is refined by
-`pose_refinement`.
+A grasped object moves with the hand. A candidate combines an object near a fingertip, two frames
+of a possible hold, and a motion of the hand that the object may follow (`grasps`). Its cost is the
+mean difference between the object's colors and the clip's colors where the object would be visible.
+The candidate that most improves on the object at rest is accepted. An object between the closing
+fingertips counts as moved unless the clip clearly shows it at rest. A released object falls
+(`fall`), and `pose_refinement` refines its last pose.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import invert, pixels_of, transform
-from egosim_jax.perception.falling import fall
 from egosim_jax.perception.grasps import (
     TIPS,
     couplings,
@@ -40,39 +38,46 @@ from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
 from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
 
+GRAVITY = 9.81
+"""Acceleration of a fall in m/s^2."""
+MIN_LIFT_M = 0.01
+"""Minimum height of a release above the first height, in meters; below it nothing falls."""
+FOOTPRINT_M = 0.006
+"""Horizontal distance within which the state's points are below an object, in meters."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrackObjects:
-    """Stage that sets the motions of held objects, their supporting planes and when they moved."""
+    """Stage that sets motions, supporting planes and interaction frames of held objects."""
 
     reach_m: float = 0.06
-    """An object is a candidate if a fingertip comes this near to it, in meters."""
+    """Maximum distance from a fingertip to a candidate object, in meters."""
     opening_tolerance_m: float = 0.01
-    """Fingertips that hold something change their distance by less than this, in meters."""
+    """Maximum change of the distance between fingertips during a hold, in meters."""
     min_points: int = 30
-    """Fewest points of an object, and of a surface around it."""
+    """Minimum number of points of an object, and of a surface around it."""
     compared_points: int = 150
-    """About how many points of an object are compared in a trial."""
+    """Approximate number of an object's points that a trial compares."""
     min_visible: float = 0.2
-    """Smallest visible fraction of the compared points."""
+    """Minimum visible fraction of the compared points."""
     max_cost_ratio: float = 0.9
-    """A motion is accepted if its cost is at most this fraction of the cost of resting."""
+    """Maximum cost of an accepted motion, as a fraction of the cost at rest."""
     min_improvement: float = 2.0
-    """A motion is accepted if it costs less than resting by this much, in 8-bit levels."""
+    """Minimum reduction of the cost at rest by an accepted motion, in 8-bit levels."""
     grip_radius_m: float = 0.012
-    """An object with a point this near to the line between the fingertips is in their grip."""
+    """Maximum distance of a gripped object from the line between the fingertips, in meters."""
     grip_evidence: float = 8.0
-    """A motion of what is in the grip may cost this much more than resting, in 8-bit levels."""
+    """Maximum cost of a gripped object's motion above the cost at rest, in 8-bit levels."""
     prompt_prior: float = 0.9
-    """Factor on the costs of an object that the prompt names."""
+    """Cost factor of an object that the prompt names."""
     plane_tolerance_m: float = 0.006
-    """Inlier distance of the supporting plane in meters."""
+    """Inlier distance of the supporting plane, in meters."""
     plane_radius_m: float = 0.15
-    """Points within this distance of the object's center determine its plane, in meters."""
+    """Radius around the object's center in which points determine its plane, in meters."""
     blur_px: float = 0.7
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     color: ColorCost = field(default_factory=ColorCost)
-    """Comparison of the clip's colors with those predicted."""
+    """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
         default_factory=partial(Refinement, deviation_m=0.005, deviation_deg=5.0)
     )
@@ -112,17 +117,17 @@ def estimate_object_motion(
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
 ) -> list[ObjectMotion]:
-    """Return the motion of the object that each hand moved, if any.
+    """Return the motions of the objects that hands moved, at most one for each hand.
 
-    An object claimed by two hands goes to the one that explains the colors better. `hidden` are the
-    pixels that hands cover. A hand that is missing in any frame is ignored.
+    If two hands claim an object, the hand that explains the colors better gets it. `hidden` marks
+    the pixels that hands cover. A hand that is missing in any frame is ignored.
     """
     shown = _smooth(clip.frames, config.blur_px)
     found: dict[int, tuple[float, ObjectMotion]] = {}
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
         if np.isfinite(joints).all():
-            best = _best(joints, action, state, shown, hidden, config)
+            best = _best_candidate(joints, action, state, shown, hidden, config)
             if best is not None:
                 change, motion = best
                 others = state.points_m[state.object_ids != motion.model.number]
@@ -136,7 +141,7 @@ def estimate_object_motion(
     return [motion for _, motion in found.values()]
 
 
-def _best(
+def _best_candidate(
     joints_m: Float[np.ndarray, "f j 3"],
     action: Action,
     state: SceneState,
@@ -144,10 +149,10 @@ def _best(
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
 ) -> tuple[float, ObjectMotion] | None:
-    """Return the accepted candidate of one hand that explains most, after the change of its cost.
+    """Return the best accepted candidate of one hand, after its change of cost.
 
-    The change is relative to the object at rest: an object of the color of the table costs little
-    wherever it is. It is 0 where the object cannot be seen, and lowered for what is in the grip.
+    The change is relative to the object at rest, because an object in the table's color costs
+    little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
     """
     best: tuple[float, ObjectMotion] | None = None
     palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
@@ -160,15 +165,15 @@ def _best(
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
         still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
         rest = _cost(model, still, action.cameras, shown, hidden, config)
-        least = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
+        improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
         for hold in holds:
             gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
-            most = config.grip_evidence if gripped else -least
+            max_change = config.grip_evidence if gripped else -improvement
             loose = couplings(palm, rigid[hold[0]], model.plane[:3], hold)
             for motion in _motions(model, hold, loose, hinges[hold]):
                 cost = prior * _cost(model, motion.path, action.cameras, shown, hidden, config)
                 known = np.isfinite(cost) and np.isfinite(rest)
-                change = (cost - rest if known else 0.0) - most
+                change = (cost - rest if known else 0.0) - max_change
                 if change < (0.0 if best is None else best[0]):
                     best = change, motion
     return best
@@ -180,7 +185,7 @@ def _motions(
     loose: Iterable[Float[np.ndarray, "f 4 4"]],
     hinge: Float[np.ndarray, "f 4 4"] | None,
 ) -> Iterator[ObjectMotion]:
-    """Yield the motions that an object may have had in a hand: loose, then on a hinge."""
+    """Yield the possible motions of a held object: loose, then on a hinge."""
     motion = partial(ObjectMotion, model=model, grasped=hold[0], released=hold[1])
     for path in loose:
         yield motion(path=path)
@@ -191,7 +196,7 @@ def _motions(
 def _near_tips(
     joints_m: Float[np.ndarray, "f j 3"], kind: Kind, state: SceneState, config: TrackObjects
 ) -> list[int]:
-    """Return the ids of the objects that a fingertip comes near."""
+    """Return the ids of the objects near a fingertip."""
     tips = joints_m[:, TIPS[kind]].reshape(-1, 3)
     near = []
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
@@ -205,7 +210,7 @@ def _near_tips(
 
 
 def object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
-    """Return the model of an object; without a surface around it, its plane faces up."""
+    """Return the model of an object. Its plane is horizontal if no surface is around it."""
     own = state.object_ids == number
     points = state.points_m[own].astype(float)
     return ObjectModel(
@@ -225,7 +230,7 @@ def _support_plane(
 ) -> Float[np.ndarray, " 4"]:
     """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC).
 
-    Of too few points it is the horizontal plane of unknown height.
+    With too few points, return a horizontal plane of unknown height.
     """
     import open3d as o3d
     from threadpoolctl import threadpool_limits
@@ -236,9 +241,55 @@ def _support_plane(
         return np.array([*UP_AXES[up], np.nan])
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    with threadpool_limits(1, user_api="openmp"):  # else its threads race, and runs differ
+    with threadpool_limits(1, user_api="openmp"):  # its threads race, and runs would differ
         plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
     return np.array(plane)
+
+
+def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:
+    """Return the motion with a fall, after the release, to its first height above the ground.
+
+    `others_m` are the other points of the state. An object does not fall if it was not lifted, if
+    it is on a hinge, or if a hand holds it to the end.
+    """
+    released, last = motion.released, len(motion.path) - 1
+    normal, offset = motion.model.plane[:3], motion.model.plane[3]
+    if motion.hinged or released == last or not np.isfinite(offset):
+        return motion
+    first = motion.model.points_m
+    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
+    up, floor = side * normal, float(-side * offset)
+    end = transform(motion.path[released], first)
+    if ((end - first) @ up).mean() < MIN_LIFT_M:
+        return motion
+    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
+    gap = _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
+    seconds = np.maximum(np.arange(last + 1) - released, 0) / fps
+    drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
+    path = motion.path.copy()
+    path[:, :3, 3] -= drop[:, None] * up
+    return replace(motion, path=path)
+
+
+def _clearance(
+    points_m: Float[np.ndarray, "n 3"],
+    others_m: Float32[np.ndarray, "m 3"],
+    up: Float[np.ndarray, " 3"],
+    floor: float,
+) -> float:
+    """Return the height of an object's lowest points above the highest surface below it."""
+    from scipy.spatial import KDTree
+
+    heights, others = points_m @ up, others_m @ up
+    level = np.eye(3) - np.outer(up, up)
+    below = (others > floor) & (others < heights.mean())
+    near, _ = KDTree(points_m @ level).query(
+        others_m[below] @ level, distance_upper_bound=FOOTPRINT_M
+    )
+    support = others[below][np.isfinite(near)]
+    return float(
+        np.quantile(heights, 0.02) - (np.quantile(support, 0.95) if len(support) else floor)
+    )
 
 
 def _cost(
@@ -251,7 +302,7 @@ def _cost(
 ) -> float:
     """Return the mean difference between the object's colors and the clip's where it projects.
 
-    Points behind a hand are ignored; infinite if too few are visible.
+    Points behind a hand are ignored. The cost is infinite if too few points are visible.
     """
     every = max(1, len(model.points_m) // config.compared_points)
     points, colors = model.points_m[::every], model.colors[::every]

@@ -1,4 +1,4 @@
-"""Perception that returns the ground truth: for tests, and as the upper bound of any other."""
+"""Perception that returns the ground truth, for tests and as an upper bound."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class OracleConfig:
         """Return the oracle's pipeline; raise `InputError` without ground truth."""
         if not ground_truth:
             raise InputError(
-                "Perception pipeline 'oracle' needs ground truth, and there is none here: use "
+                "Perception pipeline 'oracle' needs ground truth, and none is available here: use "
                 "'classical'. (--perception)"
             )
         return Pipeline(stages=(ReadGroundTruth(ground_truth=ground_truth), find_interactions))
@@ -31,15 +31,15 @@ class OracleConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadGroundTruth:
-    """Stage that replaces the observation by the ground truth of the clip."""
+    """Stage that replaces the observation with the ground truth of the clip."""
 
     ground_truth: Mapping[int, Observation]
-    """Ground truth of each clip, by the state's step before it."""
+    """Ground truth of each clip, by the step of the state before it."""
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Return the ground truth of the clip that follows the state."""
+        """Return the ground truth of the clip after the state."""
         if state.step not in self.ground_truth:
             raise InputError(
                 f"There is no ground truth for the clip after step {state.step}, only after "
@@ -51,9 +51,9 @@ class ReadGroundTruth:
 def motions_of(
     world_from_body: Mapping[int, Float[np.ndarray, "f 4 4"]],
 ) -> dict[int, Float[np.ndarray, "f 4 4"]]:
-    """Return the motions, relative to the first frame, of all bodies that move at all.
+    """Return the motion of each moving body, relative to the first frame.
 
-    The poses may be in any coordinates of the body.
+    The result does not depend on the choice of the body's axes.
     """
     return {
         number: path @ invert(path[0])

@@ -1,11 +1,11 @@
 """Perception as a pipeline of stages over one growing record.
 
-A stage is called with the clip, the action, the state before the clip, and the observation so far;
-it returns the observation with its own fields added. So each stage sees the results of the stages
-before it: segmentation feeds tracking, tracking feeds depth. After the last stage the observation
-becomes a `Perceived`, which the state is updated with.
+A stage gets the clip, the action, the state before the clip, and the observation so far. It returns
+the observation with its own fields added, so each stage sees all earlier results: segmentation
+feeds tracking, tracking feeds depth. After the last stage the observation becomes a `Perceived`,
+which updates the state.
 
-A stage knows the generator's inputs and outputs, never the ground truth; the exception is `oracle`,
+A stage sees the generator's inputs and outputs, never the ground truth. The exception is `oracle`,
 for tests and upper bounds.
 """
 
@@ -27,7 +27,7 @@ class Perception(Protocol):
     """Reconstruction of a clip in 3D: any callable, for example a `Pipeline`."""
 
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        """Return everything read from the clip, in world coordinates."""
+        """Return cameras, depth, objects and motions of the clip, in world coordinates."""
         ...
 
 
@@ -39,22 +39,22 @@ class Observation:
     cameras: Cameras | None = None
     """Camera of every frame, in the world."""
     joints_m: Float[np.ndarray, "f n j 3"] | None = None
-    """Hand joints in the world in meters; NaN where a hand is missing."""
+    """World positions of the hand joints in meters; NaN where a hand is missing."""
     object_ids: Int32[np.ndarray, "f h w"] | None = None
-    """Object instance of each pixel: 0 background, negative hands and arms, else the state's id."""
+    """Object id of each pixel: 0 is background, negative a hand or arm, else the state's id."""
     depth_m: Float32[np.ndarray, "f h w"] | None = None
     """Depth along the camera's z axis in meters; infinite where unknown."""
     motions: Mapping[int, Float[np.ndarray, "f 4 4"]] | None = None
     """Rigid motion in the world of each tracked object, relative to its pose before the clip."""
     support_planes: Mapping[int, Float[np.ndarray, " 4"]] | None = None
-    """Plane a x + b y + c z + d = 0 that supported each tracked object; d is NaN without one."""
+    """Plane a x + b y + c z + d = 0 below each tracked object; d is NaN if there is no plane."""
     interacted_frames: Mapping[int, Bool[np.ndarray, " f"]] | None = None
     """Frames in which hands acted on each object; only objects with at least one."""
     names: Mapping[int, str] | None = None
-    """Names of object instances by id; those of the state need not be repeated."""
+    """Object names by id; names that the state has may be omitted."""
 
     def require(self, field: str, needed_by: str) -> Any:
-        """Return a field; raise `InputError` naming it and who needs it where it is None."""
+        """Return a field. Raises `InputError` with the field and its user if no stage has set it."""
         value = getattr(self, field)
         if value is None:
             raise InputError(
@@ -64,7 +64,7 @@ class Observation:
         return value
 
     def finish(self, clip: Clip, state: SceneState) -> Perceived:
-        """Return the `Perceived` of a finished observation.
+        """Return the finished observation as a `Perceived`.
 
         Raises `InputError` naming the first required field that no stage has set.
         """
@@ -104,10 +104,10 @@ class Pipeline:
     stages: tuple[Stage, ...]
 
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        """Run the stages; return what they found, in world coordinates.
+        """Run the stages and return their result in world coordinates.
 
-        Raises `InputError` naming the stage whose depth or ids do not have one value per pixel, and
-        the field that a stage or `Perceived` needs and no stage has set.
+        Raises `InputError` if a stage's depth or ids do not have one value per pixel, and if a stage
+        or `Perceived` needs a field that no stage has set.
         """
         so_far = Observation()
         for stage in self.stages:
@@ -119,7 +119,7 @@ class Pipeline:
 def find_interactions(
     clip: Clip, action: Action, state: SceneState, so_far: Observation
 ) -> Observation:
-    """Set `interacted_frames` from object ids, depth and names: a stage of any pipeline."""
+    """Set `interacted_frames` from object ids, depth and names; a stage that fits any pipeline."""
     ids, depth, names = (
         so_far.require(field, "find_interactions") for field in ("object_ids", "depth_m", "names")
     )

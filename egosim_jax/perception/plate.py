@@ -1,10 +1,10 @@
-"""First frame without hands: hidden pixels are taken from the frames that see them.
+"""Clean plate: the first frame without hands.
 
-A pixel that a hand hides in the first frame shows the scene at its depth there. Each is taken from
-the nearest frame in time whose view of that point is free, and which looks alike around it, so that
-what a hand moves later stays where it was: a temporal median would erase it. What no frame shows is
-filled with patches of the rest of the image (PatchMatch; Barnes et al. 2009), or by Telea's
-method without that library.
+Each pixel behind a hand comes from the nearest frame in time that sees the same scene point. That
+frame must also look alike around the point. So an object that a hand moves later stays at its
+first place; a temporal median would erase it. Pixels that no frame shows are inpainted with patches
+of the rest of the image (PatchMatch; Barnes et al. 2009), or by Telea's method if that library is
+not installed.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from egosim_jax.geometry import invert, pixel_rays, project, transform
 from egosim_jax.types import Cameras
 
 Inpainter = Literal["patchmatch", "telea", "none"]
-"""Method that filled the pixels that no frame shows."""
+"""Inpainting method for the pixels that no frame shows."""
 PATCH = 5
 """Radius of the compared patches in pixels."""
 RING_PX = 7
-"""Width in pixels of the ring around the hidden pixels in which brightness is compared."""
+"""Width of the ring around the hidden pixels that is compared, in pixels."""
 AROUND = 0.08
-"""Reach in images within which visible pixels decide whether another frame shows the same."""
+"""Radius in image widths of the comparison of another frame with the first one."""
 MAX_DIFFERENCE = 40
-"""Largest difference in gray levels of pixels that look alike."""
+"""Maximum difference of pixels that look alike, in 8-bit levels."""
 MIN_AGREEMENT = 0.7
-"""Smallest fraction of pixels that look alike, around one that is taken from another frame."""
+"""Minimum fraction of pixels that look alike around a pixel from another frame."""
 MAX_GAIN = 1.25
-"""Largest factor on the colors of another frame."""
+"""Maximum brightness factor between two frames."""
 
 
 @no_type_check
@@ -41,9 +41,9 @@ class CleanPlate:
 
     image: UInt8[np.ndarray, "h w 3"]
     seen: Bool[np.ndarray, "h w"]
-    """Hidden pixels that were taken from other frames."""
+    """Hidden pixels that other frames show."""
     method: Inpainter
-    """Method that filled the other hidden pixels; `none` if there were none."""
+    """Inpainting method of the other hidden pixels; `none` if there are no others."""
 
 
 def clean_plate(
@@ -54,10 +54,10 @@ def clean_plate(
     *,
     margin_px: int = 3,
 ) -> CleanPlate:
-    """Return the first frame with its `moving` pixels replaced by what they hide.
+    """Return the first frame with its `moving` pixels replaced by the scene behind them.
 
-    `depth_m` is the first frame's, in the unit of the cameras, completed behind the hands; a pixel
-    whose depth is not known is filled by patches. `moving` is widened by a margin.
+    `depth_m` is the first frame's depth in the unit of the cameras, completed behind the hands. A
+    pixel of unknown depth is inpainted. `moving` is widened by a margin.
     """
     import cv2
 
@@ -92,7 +92,7 @@ def _look_up(
     frame: int,
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Return the colors of points in a frame, and which are in view and not hidden."""
+    """Return the colors of points in a frame, and True for those in view and not hidden."""
     import cv2
 
     local = transform(invert(cameras.world_from_camera[frame]), points)
@@ -107,10 +107,10 @@ def _look_up(
 
 
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray, method: int) -> np.ndarray:
-    """Return the values of an image at some pixels; in rows, for OpenCV's limit on their number."""
+    """Return the values of an image at some pixels."""
     import cv2
 
-    width = 1024
+    width = 1024  # in rows: OpenCV limits the length of one side
     missing = -len(u) % width
     u, v = (np.pad(x, (0, missing)).reshape(-1, width) for x in (u, v))
     values = cv2.remap(image, u, v, method, borderMode=cv2.BORDER_REPLICATE)
@@ -118,7 +118,7 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray, method: int) -> np.
 
 
 def _gain(here: np.ndarray, there: np.ndarray) -> Float[np.ndarray, " 3"]:
-    """Return the factor of each channel that equals the brightness of two views of the ring."""
+    """Return the factor of each channel that equalizes the brightness of two views."""
     if len(here) < 50:
         return np.ones(3)
     ratio = np.median(here.astype(float) + 1, axis=0) / np.median(there + 1, axis=0)
@@ -132,9 +132,9 @@ def _agreement(
     columns: Int[np.ndarray, " n"],
     border: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the fraction of the visible pixels around each one that look alike in both frames.
+    """Return the fraction of visible pixels around each pixel that look alike in both frames.
 
-    Where it is low, something has moved: the other frame does not show what was there before.
+    Where it is low, an object has moved, and the other frame does not show the first one's scene.
     """
     import cv2
 
@@ -143,7 +143,7 @@ def _agreement(
     difference = np.abs(colors - image[rows, columns]).max(axis=1)
     counts[0][rows[border], columns[border]] = difference[border] < MAX_DIFFERENCE
     counts[1][rows[border], columns[border]] = 1
-    total = counts.sum(axis=(1, 2)) / max(counts[1].sum(), 1)  # for those far from any
+    total = counts.sum(axis=(1, 2)) / max(counts[1].sum(), 1)  # for pixels far from the border
     counts += 1e-6 * total[:, None, None]
     alike, seen = (cv2.blur(c, (size, size), borderType=cv2.BORDER_CONSTANT) for c in counts)
     return (alike / np.maximum(seen, 1e-9))[rows, columns].astype(float)
@@ -152,7 +152,7 @@ def _agreement(
 def _inpaint(
     image: UInt8[np.ndarray, "h w 3"], missing: Bool[np.ndarray, "h w"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Inpainter]:
-    """Return the image with its missing pixels filled, and the method's name."""
+    """Return the inpainted image and the name of the method."""
     if not missing.any():
         return image, "none"
     try:

@@ -1,8 +1,8 @@
-"""Refinement of an object's pose by comparing a rendering of it with the clip.
+"""Refinement of an object's last pose by comparing its rendering with the clip.
 
-The pose at the end of a motion is changed by small translations, and rotations about the normal of
-the supporting surface, as long as object and background, drawn together, come to look more like
-the clip (coordinate descent with shrinking steps).
+Coordinate descent with shrinking steps translates the object, and rotates it about the normal of
+the supporting surface. A step is kept if the rendering of object and background becomes more like
+the clip.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from egosim_jax.types import Cameras, InputError, SceneState, check_counts
 
 @dataclass(frozen=True, kw_only=True)
 class ColorCost:
-    """Difference of colors under the light that makes it least: a held object may be in shadow."""
+    """Color difference under the best-fitting light, because a held object may be in shadow."""
 
     max_residual: float = 90.0
-    """Larger differences are clipped to this, in 8-bit levels."""
+    """Limit to which differences are clipped, in 8-bit levels."""
     unknown_residual: float = 40.0
-    """Difference that counts where no color is predicted, in 8-bit levels."""
+    """Difference of a pixel without a predicted color, in 8-bit levels."""
     min_light: float = 0.45
-    """Least light on the object relative to the state's."""
+    """Minimum light on the object, relative to the state's."""
     max_light: float = 1.2
-    """Greatest light on the object relative to the state's."""
+    """Maximum light on the object, relative to the state's."""
 
     def mean(
         self, shown: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
@@ -51,18 +51,18 @@ class Refinement:
     steps_deg: tuple[float, ...] = (12.0, 6.0, 3.0)
     """Rotation step of each round in degrees."""
     deviation_m: float | None = None
-    """Translation that must explain 1 level more, in meters, if the path is well known."""
+    """Translation in meters that costs 1 level; None for no such prior on the path."""
     deviation_deg: float | None = None
-    """Rotation that must explain 1 level more, in degrees, if the path is well known."""
+    """Rotation in degrees that costs 1 level; None for no such prior on the path."""
     min_frames: int = 3
-    """Fewest frames at the end of the clip that are compared."""
+    """Minimum number of compared frames at the end of the clip."""
     margin: float = 0.03
-    """Border around the object that is compared, as a fraction of the image width."""
+    """Compared border around the object, as a fraction of the image width."""
     point_px: int = 2
-    """Size of the drawn points in pixels."""
+    """Size of the rendered points in pixels."""
 
     def __post_init__(self) -> None:
-        """Check that each round has both steps, the deviations, and the counts."""
+        """Check that each round has both steps, and that deviations and counts are positive."""
         if len(self.steps_m) != len(self.steps_deg):
             raise InputError(
                 f"steps_m {self.steps_m} and steps_deg {self.steps_deg} must have one step per "
@@ -83,7 +83,7 @@ class ObjectModel:
     points_m: Float[np.ndarray, "n 3"]
     colors: Float32[np.ndarray, "n 3"]
     plane: Float[np.ndarray, " 4"]
-    """Supporting plane a x + b y + c z + d = 0; d is NaN where there is none."""
+    """Supporting plane a x + b y + c z + d = 0; d is NaN if there is no plane."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ class ObjectMotion:
     released: int
     """Frame of the release."""
     path: Float[np.ndarray, "f 4 4"]
-    """Motion in the world relative to the pose before the clip, frame by frame."""
+    """World motion in each frame, relative to the pose before the clip."""
     hinged: bool = False
     """True for a part that turns about an axis and stays on it, such as a lid."""
 
@@ -110,9 +110,9 @@ def refine_pose(
     config: Refinement,
     color: ColorCost,
 ) -> ObjectMotion:
-    """Return the motion with its end changed as far as that explains the clip better.
+    """Return the motion with a last pose that explains the clip better.
 
-    Unchanged where hands cover the object to the end.
+    The motion is unchanged if hands cover the object to the end.
     """
     frames = np.arange(len(best.path))[min(best.released, len(best.path) - config.min_frames) :]
     scene = _Neighborhood.of(best, cameras, state, frames, shown, hidden, config)
@@ -123,7 +123,7 @@ def refine_pose(
     )
     far, turned = config.deviation_m or np.inf, np.radians(config.deviation_deg or np.inf)
     scale = np.array([far, far, far, turned])
-    change, least = np.zeros(4), scene.cost(best.path[frames], color)
+    change, best_cost = np.zeros(4), scene.cost(best.path[frames], color)
     for meters, degrees in zip(config.steps_m, config.steps_deg, strict=True):
         steps = np.diag([meters, meters, meters, np.radians(degrees)])
         improved = True
@@ -132,18 +132,18 @@ def refine_pose(
             for step in (*steps, *-steps):
                 cost = scene.cost(perturb(best, change + step, share)[frames], color)
                 cost += float(np.square((change + step) / scale).sum())
-                if cost < least:
-                    change, least, improved = change + step, cost, True
+                if cost < best_cost:
+                    change, best_cost, improved = change + step, cost, True
     return replace(best, path=perturb(best, change, share))
 
 
 def perturb(
     best: ObjectMotion, change: Float[np.ndarray, " 4"], share: Float[np.ndarray, " f"]
 ) -> Float[np.ndarray, "f 4 4"]:
-    """Return the path with a share of a change applied at each frame.
+    """Return the path with a fraction of a change applied in each frame.
 
-    The change is a translation in meters and an angle about the plane's normal in radians; the
-    rotation is about the object's center.
+    The change is a translation in meters, and a rotation about the plane's normal through the
+    object's center in radians.
     """
     import cv2
 
@@ -157,15 +157,15 @@ def perturb(
 
 @dataclass(frozen=True, kw_only=True)
 class _Neighborhood:
-    """Pixels around an object's end in some frames, and the background behind it."""
+    """Pixels around an object's last pose in some frames, and the background behind it."""
 
     model: ObjectModel
     cameras: Cameras
     shown: Float32[np.ndarray, "f h w 3"]
     background: Float32[np.ndarray, "f h w 3"]
-    """Colors; NaN where the state has none."""
+    """Colors; NaN where the state has no points."""
     background_m: Float32[np.ndarray, "f h w"]
-    """Depth in meters; infinite where the state has none."""
+    """Depth in meters; infinite where the state has no points."""
     compared: Bool[np.ndarray, "f h w"]
     point_px: int
 
@@ -180,7 +180,7 @@ class _Neighborhood:
         hidden: Bool[np.ndarray, "f h w"],
         config: Refinement,
     ) -> _Neighborhood:
-        """Return the neighborhood of an object's end in some frames of the clip."""
+        """Return the neighborhood of an object's last pose in some frames of the clip."""
         cameras = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
         others = state.object_ids != best.model.number
         depth, index = splat(state.points_m[others], cameras, point_px=config.point_px)
@@ -199,7 +199,7 @@ class _Neighborhood:
         )
 
     def cost(self, path: Float[np.ndarray, "f 4 4"], color: ColorCost) -> float:
-        """Return the mean difference between the clip and a rendering with the object there."""
+        """Return the mean difference between the clip and a rendering with the object on a path."""
         local = cameras_in_object_frame(self.cameras, path)
         depth, index = splat(self.model.points_m, local, point_px=self.point_px)
         nearer = (index >= 0) & (depth < self.background_m)

@@ -1,10 +1,10 @@
-"""Perception results of another pipeline, read from the files that EgoSim's release writes.
+"""Perception results of another pipeline, read from files in the format of EgoSim's release.
 
-    pose/NAME.npz         data `f 4 4`, camera to world, OpenCV axes; inds `f`, the frames
+    pose/NAME.npz         data `f 4 4`, world from camera, OpenCV axes; inds `f`, the frames
     intrinsics/NAME.npz   data `f 4`, fx fy cx cy in pixels; inds `f`
     depth/NAME.zip        00000.exr ..., half floats, channel Z, meters; 0 or NaN is unknown
     mask/NAME.zip         00000.png ..., 8 bits, the object id of each pixel; 0 is background
-    mask/NAME.txt         a line per object, `id: phrase`
+    mask/NAME.txt         one line per object, `id: phrase`
 
 Source: EgoSim's `continuous_simulation`, a modified ViPE; see the released `utils/io.py` and
 `reconstruct_from_artifacts`.
@@ -31,30 +31,30 @@ from egosim_jax.state.filter import is_hand
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
 
 IDS_PER_STEP = 1000
-"""Offset between the object ids of successive steps: recorded ids are unique in one clip only."""
+"""Offset between the object ids of successive steps, since recorded ids repeat in each clip."""
 STEP = "{step}"
-"""Placeholder for the number of the step in the name of the files."""
+"""Placeholder for the step number in the file name."""
 FILES = (
     ("pose", "npz"), ("intrinsics", "npz"), ("depth", "zip"), ("mask", "zip"), ("mask", "txt"),
 )  # fmt: skip
 """Folder and suffix of each file of a clip."""
 MAX_FRAME_BYTES = 2**28
-"""Largest unpacked frame in bytes."""
+"""Maximum size of an unpacked frame in bytes."""
 MAX_FRAME_PIXELS = 2**25
-"""Largest frame in pixels."""
+"""Maximum size of a frame in pixels."""
 MAX_TEXT_BYTES = 2**20
-"""Largest list of phrases in bytes."""
+"""Maximum size of a list of phrases in bytes."""
 
 
 @register("recorded")
 @dataclass(frozen=True, kw_only=True)
 class RecordedConfig:
-    """Perception results read from files, of one clip or of one per step."""
+    """Perception results read from the files of one clip, or of one clip per step."""
 
     folder: Path
     """Folder with pose/, intrinsics/, depth/ and mask/."""
     name: str
-    """Name of the clip's files, without suffix; {step} in it is the number of the step, from 1."""
+    """Name of the clip's files, without suffix. {step} in it is the step number, from 1."""
     alignment: CameraMethod = "orientations"
     """Method that aligns the recorded cameras with the action's."""
 
@@ -67,17 +67,17 @@ class RecordedConfig:
         """Raise `InputError` if several clips would be read from the same files."""
         if count > 1 and STEP not in self.name:
             raise InputError(
-                f"recorded --name {quote_text(self.name)} names the files of one clip, and "
-                f"{count} clips are simulated: the name must contain {STEP}, the number of the "
-                f"step. Use a name such as clip_{STEP}, or --clips 1. (--perception)"
+                f"recorded --name {quote_text(self.name)} names the files of one clip, but "
+                f"{count} clips are simulated: the name must contain {STEP}, the step number. "
+                f"Use a name such as clip_{STEP}, or --clips 1. (--perception)"
             )
 
     def path(self, kind: str, suffix: str, step: int | str) -> Path:
-        """Return the path of a file of a step."""
+        """Return the path of a step's file."""
         return self.folder / kind / f"{self.name.replace(STEP, str(step))}.{suffix}"
 
     def _hashes(self) -> dict[str, str]:
-        """Return the SHA-256 of every file that exists, by its path in the folder."""
+        """Return the SHA-256 of each existing file, by its path in the folder."""
         config = replace(self, folder=Path(escape(str(self.folder))), name=escape(self.name))
         patterns = (str(config.path(kind, suffix, "*")) for kind, suffix in FILES)
         paths = (Path(path) for pattern in patterns for path in sorted(glob(pattern)))
@@ -86,17 +86,17 @@ class RecordedConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadRecording:
-    """Stage that sets cameras, depth, object ids and names from files, each of them read once."""
+    """Stage that sets cameras, depth, object ids and names from files, each read once."""
 
     config: RecordedConfig
     """Location of the files."""
     files: Mapping[str, str] = field(default_factory=dict)
-    """SHA-256 of each file, which identifies the recording in the fingerprint of a run."""
+    """SHA-256 of each file; it enters the fingerprint of a run."""
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set everything but hand joints and interactions; no object is tracked."""
+        """Set all fields except hand joints and interactions. No object is tracked."""
         cameras, scale = self._cameras(clip, action, state.step + 1)
         phrases = self._phrases(state.step + 1)
         first_id = IDS_PER_STEP * (state.step + 1)
@@ -135,7 +135,7 @@ class ReadRecording:
     def _object_ids(
         self, clip: Clip, phrases: Mapping[int, str], step: int
     ) -> Int32[np.ndarray, "f h w"]:
-        """Return recorded object ids in the state's numbering, those of hands and arms negative."""
+        """Return the recorded object ids in the state's numbering; hands and arms are negative."""
         recorded = self._images("mask", step, clip).astype(np.int32)
         ids = np.where(recorded > 0, recorded + IDS_PER_STEP * step, 0)
         for number, phrase in phrases.items():
@@ -152,12 +152,12 @@ class ReadRecording:
         for line in text.splitlines():
             number, colon, phrase = line.partition(":")
             if not colon or not (number.strip().isascii() and number.strip().isdigit()):
-                raise InputError(f"{path}: each line must be `id: phrase`, one is {quote(line)}.")
+                raise InputError(f"{path}: each line must be `id: phrase`, not {quote(line)}.")
             found[int(number[:18])] = phrase.strip()
         return found
 
     def _frames(self, kind: str, step: int, clip: Clip, *size: int) -> Float[np.ndarray, "f ..."]:
-        """Return the rows of an npz, one of the given size for each frame of the clip."""
+        """Return the rows of an npz file: one of the given size for each frame of the clip."""
         path = self._path(kind, "npz", step)
         arrays = read_arrays(path, {}, others=("data", "inds"), packed=True)
         data, numbers, count = arrays["data"].astype(float), arrays["inds"], len(clip.frames)
@@ -185,15 +185,17 @@ class ReadRecording:
     def _path(self, kind: str, suffix: str, step: int) -> Path:
         path = self.config.path(kind, suffix, step)
         if not path.is_file():
-            raise InputError(f"{path} is missing: the recorded perception of a clip needs it.")
+            raise InputError(
+                f"{path} is missing: recorded perception needs this file for each clip."
+            )
         return path
 
 
-def _unpack(path: Path, most: int) -> Iterator[np.ndarray]:
-    """Yield the images of an archive, sorted by name, and at most one more than `most`."""
+def _unpack(path: Path, count: int) -> Iterator[np.ndarray]:
+    """Yield the images of an archive, sorted by name, and at most one more than `count`."""
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            for entry in sorted(archive.infolist(), key=lambda entry: entry.filename)[: most + 1]:
+            for entry in sorted(archive.infolist(), key=lambda entry: entry.filename)[: count + 1]:
                 name = quote_text(entry.filename)
                 if entry.file_size > MAX_FRAME_BYTES:
                     raise InputError(f"{path}: {name} unpacks to {entry.file_size} bytes.")
@@ -212,7 +214,7 @@ def _png(data: bytes, name: str) -> np.ndarray:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2:
         raise InputError(
-            f"{name} must be a PNG of one channel and at most {MAX_FRAME_PIXELS} pixels."
+            f"{name} must be a PNG with one channel and at most {MAX_FRAME_PIXELS} pixels."
         )
     return image
 

@@ -1,7 +1,7 @@
-"""Perception pipelines by name: each one a frozen dataclass that configures and builds it.
+"""Perception pipelines by name. A frozen dataclass configures and builds each one.
 
-Every field of a config is an option on the command line (`parse`), and its content is hashed into
-the run it is used in, so that a run is not resumed with other parameters. A config of your own:
+Every field of a config is a command-line option (`parse`). A run hashes the config into its
+fingerprint, so it does not resume with other parameters. To add your own config:
 
     @register("mine")
     @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ _MODULES = {
     "oracle": "egosim_jax.perception.oracle",
     "recorded": "egosim_jax.perception.recorded",
 }
-"""Modules that register the pipelines of this package, imported when first asked for."""
+"""Modules that register the built-in pipelines. They are imported on first use."""
 _CONFIGS: dict[str, type] = {}
 
 
@@ -39,7 +39,7 @@ class PipelineConfig(Protocol):
     """Parameters of a perception pipeline: a frozen dataclass."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Perception:
-        """Return the perception pipeline; `ground_truth` has one observation per step of the state.
+        """Return the perception pipeline; `ground_truth` has one observation per state step.
 
         Only `oracle` reads the ground truth.
         """
@@ -47,7 +47,7 @@ class PipelineConfig(Protocol):
 
 
 def register(name: str) -> Callable[[C], C]:
-    """Register a perception config class under a name, as a decorator; later ones replace it."""
+    """Return a decorator that registers a config class under a name; the last one wins."""
 
     def add(config: C) -> C:
         _CONFIGS[name] = config
@@ -62,10 +62,10 @@ def names() -> tuple[str, ...]:
 
 
 def get(name: str) -> type[PipelineConfig]:
-    """Return the config class of the perception pipeline with a name.
+    """Return the config class of a named perception pipeline.
 
-    `my_package.module:mine` imports the module first, for a pipeline that it registers as `mine`.
-    Raises `InputError` naming the closest name if there is none.
+    `my_package.module:mine` imports the module, which registers `mine`. Raises `InputError` with
+    the closest name if the name is unknown.
     """
     module, _, name = name.rpartition(":")
     if module.startswith("."):
@@ -91,10 +91,9 @@ def get(name: str) -> type[PipelineConfig]:
 
 
 def parse(text: str) -> PipelineConfig:
-    """Return the perception config that a command line specifies: a name and options.
+    """Return the perception config for a command line, such as `classical --motion.reach-m 0.05`.
 
-    `classical` has the defaults; `classical --motion.reach-m 0.05` changes one; `NAME --help` lists
-    all.
+    `NAME --help` lists the options of a pipeline.
     """
     import tyro
 

@@ -1,9 +1,9 @@
-"""Meters per unit of estimated cameras, with the source and the uncertainty of that scale.
+"""Scale of estimated cameras in meters per unit, with its source and uncertainty.
 
-Cameras from one moving camera have an unknown unit. A hand gives the meter: the size of its mean
-skeleton gives its depth, a hand is never behind the surface that is seen at its fingertips, and it
-touches that surface now and then. So z_hand / z_scene, over fingertips and frames, is at most the
-scale, apart from errors, and near it at contact: its 90th percentile is taken.
+Structure from motion by one camera has an unknown unit. Hands give the scale: the mean size of a
+hand gives its depth in meters, and a hand in view is in front of the scene or touches it. So
+z_hand / z_scene, over fingertips and frames, is at most the scale, and near it at contact. The
+estimate is the 90th percentile of that ratio, because errors exceed the maximum.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from egosim_jax.types import Cameras, InputError
 Source = Literal["given", "cameras", "camera height", "metric depth", "hands", "median depth"]
 """Origin of a scale, from the most to the least certain."""
 TIPS = (4, 8, 12, 16, 20)
-"""Keypoints at the tips of thumb, index, middle, ring and little finger."""
+"""Keypoints of the tips of thumb, index, middle, ring and little finger."""
 CONTACT_PERCENTILE = 90
-"""Percentile of z_hand / z_scene that is taken for contact."""
+"""Percentile of z_hand / z_scene that counts as contact."""
 HAND_SIZE_ERROR = 0.1
 """Relative standard deviation of the size of human hands around their mean."""
 ASSUMED_MEDIAN_M = 0.6
-"""Median depth in meters that is assumed where nothing gives a scale."""
+"""Assumed median depth in meters if there is no source of scale."""
 ASSUMED_ERROR = 0.5
 """Relative uncertainty of a scale from the assumed median depth."""
 MIN_TIPS = 20
-"""Fewest fingertips over all frames that give a scale."""
+"""Minimum number of samples (fingertips or pixels) for a scale."""
 REDUCTION = 2
-"""Factor by which the scene's depth is reduced for the comparison with fingertips."""
+"""Downscaling factor of the scene's depth for the comparison with fingertips."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +42,13 @@ class Scale:
     """Meters per unit of cameras and depth."""
 
     meters_per_unit: float
-    """Factor on positions and depths that gives meters."""
+    """Factor from camera units to meters, for positions and depths."""
     uncertainty: float
     """Relative standard deviation of the factor."""
     source: Source
     """Origin of the scale."""
     reason: str
-    """Explanation in words, for the report."""
+    """Explanation for the report."""
 
     def __post_init__(self) -> None:
         """Check that the scale is positive and finite."""
@@ -69,13 +69,18 @@ def estimate_scale(
     camera_height_m: float | None = None,
     metric_depth: DepthEstimate | None = None,
 ) -> Scale:
-    """Return the scale of estimated cameras from the best source at hand.
+    """Return the scale of estimated cameras from the best available source.
 
-    In this order: given, cameras that are metric, the height of the camera above the surface in the
-    lower half of the first frame, a metric depth map of some of the same frames, hands, and an
-    assumed median depth, which is flagged by its source and its uncertainty. `joints_camera_m` are
-    the joints of the hands in meters in the camera of each frame. Pixels in `moving` do not count
-    as scene.
+    The sources in order of preference:
+
+    1. the given `meters_per_unit`
+    2. metric cameras
+    3. the camera's height above the surface in the lower half of the first frame
+    4. a metric depth map of some of the same frames
+    5. hands: `joints_camera_m` has their joints in meters in the camera of each frame
+    6. an assumed median depth; `source` and `uncertainty` report the assumption
+
+    Pixels in `moving` do not count as scene.
     """
     if meters_per_unit is not None:
         return Scale(
@@ -84,8 +89,8 @@ def estimate_scale(
     cameras = estimate.cameras
     if cameras is None:
         raise InputError(
-            "Cameras were refused, so that they have no scale: it needs estimated cameras. Give "
-            f"them, or another clip. Reason of the refusal: {estimate.verdict.reason}"
+            "Refused cameras have no scale: it needs estimated cameras. Give cameras, or another "
+            f"clip. Reason of the refusal: {estimate.verdict.reason}"
         )
     if estimate.metric:
         return Scale(
@@ -101,13 +106,13 @@ def estimate_scale(
         if found is not None:
             return found
     known = scene.depth_m[np.isfinite(scene.depth_m)]
-    _require(known.size > 0, "no depth is known")
+    _require(known.size > 0, "all depth is unknown")
     return Scale(
         meters_per_unit=ASSUMED_MEDIAN_M / float(np.median(known)),
         uncertainty=ASSUMED_ERROR,
         source="median depth",
-        reason=f"assumed: no hand, camera height or metric depth gives the scale, so that the "
-        f"median depth is set to {ASSUMED_MEDIAN_M} m",
+        reason=f"assumed: no hand, camera height or metric depth gives the scale, so the median "
+        f"depth is set to {ASSUMED_MEDIAN_M} m",
     )
 
 
@@ -128,7 +133,7 @@ def scale_cameras(estimate: CameraEstimate, scale: Scale) -> CameraEstimate:
 
 
 def scale_depth(depth: DepthEstimate, scale: Scale) -> DepthEstimate:
-    """Return depth in meters; a map that is metric by itself is returned as it is."""
+    """Return depth in meters. Metric depth is returned unchanged."""
     if depth.metric:
         return depth
     depth_m = (depth.depth_m * scale.meters_per_unit).astype(np.float32)
@@ -164,7 +169,7 @@ def _from_hands(
 def _scene_depth(
     cameras: Cameras, scene: DepthEstimate
 ) -> tuple[Cameras, Float32[np.ndarray, "f h w"]]:
-    """Return reduced cameras, and the depth of the static scene in the view of each."""
+    """Return downscaled cameras, and the depth of the static scene that each of them sees."""
     step = REDUCTION
     matrix = cameras.intrinsics_px.astype(float).copy()
     matrix[:2] /= step
@@ -210,10 +215,10 @@ def _from_height(cameras: Cameras, scene: DepthEstimate, height_m: float) -> Sca
 
 
 def _plane_distance(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, float]:
-    """Return distance of the largest plane from the origin, its share of points, its error.
+    """Return the largest plane's distance from the origin, its inlier fraction, and its error.
 
-    By random sample consensus with a fixed seed, in units of the points, and refined on its
-    inliers. The error is the deviation of the inliers relative to the distance.
+    RANSAC with a fixed seed, in units of the points, refined on the inliers. The error is the
+    standard deviation of the inliers, relative to the distance.
     """
     rng = np.random.default_rng(0)
     tolerance = 0.02 * np.median(points[:, 2])
@@ -267,6 +272,8 @@ def _without(depth: DepthEstimate, moving: Bool[np.ndarray, "f h w"] | None) -> 
     )
 
 
-def _require(fits: bool, what: str) -> None:
+def _require(fits: bool, problem: str) -> None:
     if not fits:
-        raise InputError(f"The scale cannot be estimated: {what}. Give meters per unit. (--scale)")
+        raise InputError(
+            f"The scale cannot be estimated: {problem}. Give meters per unit. (--scale)"
+        )

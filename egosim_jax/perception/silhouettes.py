@@ -1,8 +1,8 @@
 """Silhouettes of hands and forearms, drawn from their joints.
 
-A hand is its bones with soft tissue around them, the palm between its knuckles, and a forearm from
-the wrist towards the wearer. Without a segmentation network this is the mask of what moves with
-the wearer; a wide sleeve is wider than the drawn forearm.
+A hand consists of capsules around its bones, the palm between its knuckles, and a forearm from the
+wrist towards the wearer. Without a segmentation network, this is the mask of the wearer's moving
+pixels. A wide sleeve is wider than the drawn forearm.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import Cameras, Kind, check_counts
 
 PALM: dict[Kind, list[int]] = {"human": [0, 1, 5, 9, 13, 17], "robot": [0, 1, 2]}
-"""Joints that move as one rigid body: wrist and knuckles; all of a gripper."""
+"""Joints that move as one rigid body: wrist and knuckles, or all of a gripper."""
 ASSUMED_FOCAL = 0.45
-"""Focal length that silhouettes of tracks are drawn with, in widths of the image.
+"""Focal length for drawing tracks of an uncalibrated video, in image widths.
 
-Depth is in proportion to it, and so the image of a hand does not depend on it; that of a forearm
+The lifted depth is proportional to it, so the drawn hand does not depend on it, and the forearm
 hardly does."""
 
 
@@ -36,25 +36,25 @@ class HandShape:
     arm_radius_m: float = 0.05
     """Radius of a forearm in meters."""
     shoulder_offset_m: tuple[float, float, float] = (0.0, 0.35, 0.05)
-    """Origin of an arm in camera axes in meters; x is relative to the wrist's."""
+    """Origin of an arm in camera axes in meters; its x is an offset from the wrist."""
     arm_fraction: float = 0.8
-    """Fraction of the way from the wrist to the arm's origin that is drawn."""
+    """Drawn fraction of the way from the wrist to the arm's origin."""
     near_m: float = 0.05
-    """Parts nearer to the camera than this are not drawn, in meters."""
+    """Near limit of drawing, in meters from the camera."""
     discs: int = 25
-    """Number of discs that a capsule is drawn with."""
+    """Number of discs of a drawn capsule."""
 
     def __post_init__(self) -> None:
-        """Check that a capsule is drawn with at least one disc."""
+        """Check that a capsule has at least one disc."""
         check_counts({"discs": self.discs})
 
 
-def hand_silhouettes(
+def track_silhouettes(
     frames: UInt8[np.ndarray, "f h w 3"], tracks: HandTracks
 ) -> Bool[np.ndarray, "f h w"]:
-    """Return the pixels of hands and forearms of tracked hands, by geometry.
+    """Return the pixels of tracked hands and their forearms. Cameras need not be known.
 
-    Cameras need not be known. A hand that is missing from a frame covers nothing there.
+    A hand that is missing from a frame covers nothing there.
     """
     height, width = frames.shape[1:3]
     focal = ASSUMED_FOCAL * width
@@ -72,10 +72,9 @@ def hand_silhouettes(
 def hand_silhouette(
     joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, cameras: Cameras, shape: HandShape
 ) -> Int32[np.ndarray, "f h w"]:
-    """Return the number of the hand that covers each pixel, arm included; -1 for none.
+    """Return the index of the hand (forearm included) that covers each pixel; -1 for no hand.
 
-    A hand is its bones with flesh around them, the palm between its knuckles, and an arm from the
-    wrist towards the wearer. One with a joint that is not finite is missing.
+    A hand with a joint that is not finite is not drawn.
     """
     import cv2
 
@@ -111,12 +110,12 @@ def draw_capsule(
     cameras: Cameras,
     shape: HandShape,
 ) -> None:
-    """Draw a capsule between two points in camera coordinates, as discs of its radius."""
+    """Draw a capsule between two points in camera coordinates, as a row of discs."""
     import cv2
 
     centers_m = start + np.linspace(0, 1, shape.discs)[:, None] * (end - start)
     centers_m = centers_m[centers_m[:, 2] > shape.near_m]
-    limit = 10 * cameras.width  # beyond it a disc is outside the image, and OpenCV's range
+    limit = 10 * cameras.width  # outside the image, but within the range of OpenCV's integers
     centers = np.clip(np.stack(project(cameras.intrinsics_px, centers_m), axis=1), -limit, limit)
     radii = cameras.intrinsics_px[0, 0] * radius_m / centers_m[:, 2]
     for (column, row), radius in zip(np.rint(centers).astype(int), radii, strict=True):

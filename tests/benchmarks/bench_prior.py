@@ -30,7 +30,7 @@ from egosim_jax.perception.depth import SweptDepth, points_per_pixel
 from egosim_jax.perception.hands import LandmarkHands, lift
 from egosim_jax.perception.plate import clean_plate
 from egosim_jax.perception.scale import estimate_scale, scale_cameras, scale_depth
-from egosim_jax.perception.silhouettes import hand_silhouettes
+from egosim_jax.perception.silhouettes import track_silhouettes
 from egosim_jax.state.depth import state_from_depth
 from tests.benchmarks.bench_cameras import CLIPS, load
 
@@ -66,7 +66,7 @@ def measure(name: str, frames: np.ndarray, hands: np.ndarray, sheets: Path | Non
     """Print a clip's figures. `hands` are the pixels that are not compared."""
     times = [time.monotonic()]
     tracks = LandmarkHands()(frames)
-    moving = hand_silhouettes(frames, tracks)
+    moving = track_silhouettes(frames, tracks)
     times.append(time.monotonic())
     estimate = CameraLadder()(frames, moving)
     if estimate.cameras is None:

@@ -1,4 +1,4 @@
-"""Parts of the object tracker, each on its own."""
+"""Parts of the object tracker: supporting planes, and the fall after a release."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,42 @@ import pytest
 from egosim_jax.perception.object_motion import (
     TrackObjects,
     _support_plane,
+    fall,
     object_model,
 )
+from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion
 from egosim_jax.types import SceneState
+
+FPS = 8
+TABLE = np.array([0, 0, 1, -0.7])
+AXIS = np.linspace(0, 1, 21)
+
+
+def grid(low, high):
+    """Return points on the top and the front of a box."""
+    low, high = np.array(low), np.array(high)
+    u, v = (x.ravel() for x in np.meshgrid(AXIS, AXIS))
+    top = np.stack([u, v, np.ones_like(u)], axis=1)
+    front = np.stack([u, np.zeros_like(u), v], axis=1)
+    return low + np.concatenate([top, front]) * (high - low)
+
+
+CUBE = grid([-0.02, -0.02, 0.705], [0.02, 0.02, 0.75])
+SURFACE = np.stack([x.ravel() for x in np.meshgrid(8 * AXIS - 4, 8 * AXIS - 4)], axis=1) / 10
+TOP = np.concatenate([SURFACE, np.full((len(SURFACE), 1), 0.7)], axis=1)
+BLOCK = grid([0.25, -0.05, 0.7], [0.35, 0.05, 0.8])
+OTHERS = np.concatenate([TOP, BLOCK]).astype(np.float32)
+
+
+def carried(end_m, released=12, hinged=False, plane=TABLE):
+    """Return the motion of a cube to a place where a hand releases it."""
+    path = np.repeat(np.eye(4)[None], 17, axis=0)
+    share = np.clip((np.arange(17) - 4) / (released - 4), 0, 1)
+    path[:, :3, 3] = share[:, None] * end_m
+    model = ObjectModel(
+        number=1, points_m=CUBE, colors=np.zeros((len(CUBE), 3), np.float32), plane=plane
+    )
+    return ObjectMotion(model=model, grasped=4, released=released, path=path, hinged=hinged)
 
 
 def test_the_supporting_plane_is_the_same_in_every_run():
@@ -39,3 +72,39 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
     plane = object_model(1, state, TrackObjects()).plane
     np.testing.assert_array_equal(plane[:3], up)
     assert np.isnan(plane[3])
+
+
+@pytest.mark.parametrize("plane", [TABLE, -TABLE])
+@pytest.mark.parametrize(
+    ("end_m", "height_m"),
+    [([0.1, 0, 0.04], 0.0), ([0.3, 0, 0.13], 0.1), ([0.3, 0, 0.1], 0.1)],
+    ids=["onto the table", "onto a block", "put down on a block"],
+)
+def test_a_released_object_comes_to_rest_at_its_first_height_above_the_support(
+    end_m, height_m, plane
+):
+    fallen = fall(carried(end_m, plane=plane), OTHERS, FPS)
+    np.testing.assert_allclose(fallen.path[-1, :3, 3], [*end_m[:2], height_m], atol=1e-6)
+    np.testing.assert_array_equal(fallen.path[:13], carried(end_m).path[:13])
+
+
+def test_a_released_object_falls_with_the_acceleration_of_gravity():
+    fallen = fall(carried([0.1, 0, 0.2]), OTHERS, FPS)
+    np.testing.assert_allclose(0.2 - fallen.path[13, 2, 3], 9.81 / 2 / FPS**2)
+    np.testing.assert_allclose(fallen.path[-1, 2, 3], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"end_m": [0.1, 0, 0.04], "released": 16},
+        {"end_m": [0.1, 0, 0.04], "hinged": True},
+        {"end_m": [0.1, 0, 0.04], "plane": np.array([0, 0, 1, np.nan])},
+        {"end_m": [0.1, 0, 0.005]},
+    ],
+    ids=["held to the end", "on a hinge", "no surface known", "not lifted"],
+)
+def test_nothing_else_falls(options):
+    np.testing.assert_array_equal(
+        fall(carried(**options), OTHERS, FPS).path, carried(**options).path
+    )

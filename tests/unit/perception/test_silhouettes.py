@@ -5,7 +5,7 @@ import pytest
 
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.perception.estimates import HandTracks
-from egosim_jax.perception.silhouettes import hand_silhouettes
+from egosim_jax.perception.silhouettes import track_silhouettes
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 from tests.unit.perception.posed import make_clip
 
@@ -28,7 +28,7 @@ def tracks(clip):
 
 
 def test_they_cover_the_hands_and_little_else(clip, tracks):
-    covered = hand_silhouettes(clip.frames, tracks)
+    covered = track_silhouettes(clip.frames, tracks)
     hands = clip.ids >= FIRST_HAND
     assert (covered & hands).sum() / hands.sum() > 0.9
     assert covered.mean() < 3 * hands.mean()
@@ -40,4 +40,4 @@ def test_a_missing_hand_covers_nothing(clip, tracks):
         joints_hand_m=tracks.joints_hand_m,
         presence=np.zeros_like(tracks.presence),
     )
-    assert not hand_silhouettes(clip.frames, nothing).any()
+    assert not track_silhouettes(clip.frames, nothing).any()
