@@ -1,4 +1,4 @@
-"""Painted hands, and networks that see them: a disc for each joint, whose color has its number."""
+"""Painted hands and networks that detect them; each joint is a disc whose color is its index."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ _VISIBLE, _HIDDEN = 250, 150
 
 
 def hand_px(*, center, angle=0.0, size=1.0):
-    """Return 21 joints of a hand around a center, turned clockwise; its fingers point up at 0."""
+    """Return a hand's 21 joints around a center, turned clockwise; at 0 the fingers point up."""
     joints = [(0.0, 40.0)]
     joints += [(-14 - 9 * i, 26 - 11 * i) for i in range(4)]
     joints += [(x, 2 - 13 * i) for x in (-12, 0, 12, 24) for i in range(4)]
@@ -21,7 +21,7 @@ def hand_px(*, center, angle=0.0, size=1.0):
 
 
 def paint(hands, *, right=True, hidden=(), shape=(240, 320)):
-    """Return frames with a list of hands each; palms of `hidden` frames are not detected."""
+    """Return frames with the given hands; palms in `hidden` frames are not detected."""
     frames = np.zeros((len(hands), *shape, 3), np.uint8)
     for number, (frame, joints) in enumerate(zip(frames, hands, strict=True)):
         for hand in joints:
@@ -37,7 +37,7 @@ def paint(hands, *, right=True, hidden=(), shape=(240, 320)):
 
 
 def _joints(image):
-    """Return the joints that an image shows, in pixels from edge to edge, or None."""
+    """Return the joints in an image, in pixels from edge to edge, or None."""
     red, green, blue = image.astype(int).transpose(2, 0, 1)
     sure = np.isin(green, (_HIDDEN, _VISIBLE)) & np.isin(blue, (150, 250))
     joints = []
@@ -50,7 +50,7 @@ def _joints(image):
 
 
 class PaintedHands(HandNetworks):
-    """Networks that see one painted hand in an image."""
+    """Networks that detect one painted hand in an image."""
 
     def __init__(self):
         pass

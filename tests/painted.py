@@ -1,8 +1,8 @@
-"""A small world whose clips are its views with the hands painted over them, and a server of it.
+"""A small world whose clips are rendered views with painted hands, and its server.
 
     python -m tests.painted FOLDER [--pause S] [--batch N]
 
-serves it on a free port and prints the address.
+This serves the world on a free port and prints the address.
 """
 
 import argparse
@@ -25,7 +25,7 @@ VIDEO = VideoSpec(frames=5, height=32, width=48, fps=8)
 
 @dataclass(frozen=True)
 class Painter:
-    """Generator that paints the hands over the view, and a little noise of the seed."""
+    """Generator that paints hands and a little seeded noise over the view."""
 
     pause: float = 0.0
     renderer = reference
@@ -45,7 +45,7 @@ class Painter:
 
 
 class BatchPainter(Painter):
-    """Painter of several clips together, of which all take as long as one."""
+    """Painter of a batch of clips in the time of one clip."""
 
     def condition(self, view, action, first_frame):
         return view, action
@@ -61,7 +61,7 @@ class BatchPainter(Painter):
 
 
 class PaintedWorld(GeneratedWorld):
-    """World of a painter, whose scenes are rendered once."""
+    """World of a painter, with cached start scenes."""
 
     def start(self, seed, spec):
         return _start(seed, spec.kind, spec.sides)
@@ -74,7 +74,7 @@ def _start(seed, kind, sides):
 
 
 def painted(perception=None, pause=0.0, batch=None):
-    """World of the painter, by default without perception, which takes longest."""
+    """Return the painter's world, by default without perception, which is the slowest part."""
     painter = Painter(pause) if batch is None else Batcher(BatchPainter(pause), max_batch=batch)
     return PaintedWorld(generator=painter, video=VIDEO, perception=perception)
 
@@ -89,9 +89,9 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pause", type=float, default=0.0)
     parser.add_argument("--batch", type=int)
-    given = parser.parse_args()
-    backend = painted("classical", given.pause, given.batch)
-    service = Service(Store(given.folder, backend, Limits()), world="painted")
+    args = parser.parse_args()
+    backend = painted("classical", args.pause, args.batch)
+    service = Service(Store(args.folder, backend, Limits()), world="painted")
 
     def ready(port):
         print(f"http://127.0.0.1:{port}", flush=True)

@@ -166,7 +166,7 @@ class Segmenter(Protocol):
         phrases: Sequence[str],
         hands: HandTracks | None = None,
     ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
-        """Return the id of each pixel (0: none, negative: hands and arms) and the name of each id."""
+        """Return the id of each pixel (0: none, negative: hands and arms) and each id's name."""
         ...
 
 

@@ -54,7 +54,7 @@ class Observation:
     """Object names by id; names that the state has may be omitted."""
 
     def require(self, field: str, needed_by: str) -> Any:
-        """Return a field. Raises `InputError` with the field and its user if no stage has set it."""
+        """Return a field. Raises `InputError` with both names if no stage has set it."""
         value = getattr(self, field)
         if value is None:
             raise InputError(
@@ -106,8 +106,8 @@ class Pipeline:
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
         """Run the stages and return their result in world coordinates.
 
-        Raises `InputError` if a stage's depth or ids do not have one value per pixel, and if a stage
-        or `Perceived` needs a field that no stage has set.
+        Raises `InputError` if a stage's depth or ids do not have one value per pixel, and if a
+        stage or `Perceived` needs a field that no stage has set.
         """
         so_far = Observation()
         for stage in self.stages:

@@ -1,4 +1,12 @@
-"""Cameras of recorded videos: a ladder of methods, a gate for their results, and lenses."""
+"""Estimation of the cameras of a recorded video, and undistortion of its frames.
+
+Cameras from networks are in `networks`; alignment with a state is in `state.align`.
+
+    CameraLadder:                 the estimator, a ladder of methods
+    GateConfig:                   thresholds for accepting a reconstruction
+    ColmapConfig, ColmapError:    structure from motion by COLMAP, and its failure
+    undistort, undistort_pixels:  removal of the lens's radial distortion
+"""
 
 from egosim_jax.perception.cameras.colmap import ColmapConfig, ColmapError
 from egosim_jax.perception.cameras.gate import GateConfig

@@ -1,4 +1,7 @@
-"""Sparse optical flow of the background: pyramidal Lucas-Kanade, checked forward and backward."""
+"""Sparse optical flow of the background, with tests for cuts and for a still camera.
+
+The flow is pyramidal Lucas-Kanade with a forward-backward check.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 WORKING_PX = 960
-"""Longest side of the images that are tracked; larger ones are reduced."""
+"""Maximum side of a tracked image; larger images are downscaled to it."""
 MIN_CORNERS = 20
-"""Fewest background corners of an image with enough texture."""
+"""Minimum number of background corners of an image with enough texture."""
 MAX_RETURN_PX = 0.7
-"""Largest distance from a corner to where its track returns when followed backward."""
+"""Maximum forward-backward error of a track, in pixels."""
+MIN_TRACKED = 0.15
+"""Minimum fraction of frame 0's corners that a frame must show for the test of stillness."""
 MARGIN = 0.015
-"""Width of the border around what moves that is not background, in image widths."""
+"""Width of the border around moving pixels that is not background, in image widths."""
 MIN_SURVIVAL = 0.1
-"""Minimum share of corners that are found again in a connected frame."""
+"""Minimum fraction of corners that a connected frame shows again."""
 _CORNERS, _QUALITY, _APART_PX = 600, 0.003, 8
 _WINDOW, _LEVELS = (21, 21), 4
 
@@ -26,17 +31,17 @@ _WINDOW, _LEVELS = (21, 21), 4
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Background:
-    """Gray frames of a video at working size, and the pixels of them that do not move."""
+    """Gray frames of a video at working size, with masks of their static pixels."""
 
     gray: Sequence[UInt8[np.ndarray, "h w"]]
     """Gray frames with equalized contrast."""
     still: Sequence[UInt8[np.ndarray, "h w"]]
-    """Masks: 255 where the background may be seen, 0 at hands, arms and their surroundings."""
+    """Masks: 255 at the background, 0 at hands, arms and a margin around them."""
     reduction: float
     """Input pixels per working pixel."""
 
     def corners(self, frame: int) -> Float32[np.ndarray, "n 2"]:
-        """Return corners of the background of a frame; few if it is black, blurred or blank."""
+        """Return background corners of a frame: few if it is black, blurred or blank."""
         import cv2
 
         found = cv2.goodFeaturesToTrack(
@@ -53,7 +58,7 @@ class Background:
         points: Float32[np.ndarray, "n 2"],
         guess: Float[np.ndarray, "n 2"] | None = None,
     ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-        """Return where points of one frame are in another, and which were found there."""
+        """Return the places of one frame's points in another, and True for the points found."""
         import cv2
 
         if not len(points):
@@ -80,7 +85,7 @@ class Background:
 def background(
     frames: UInt8[np.ndarray, "f h w 3"], moving: Bool[np.ndarray, "f h w"]
 ) -> Background:
-    """Return the background of a video: all but what moves and a margin."""
+    """Return a video's background, without moving pixels and a margin around them."""
     import cv2
 
     height, width = frames.shape[1:3]
@@ -103,18 +108,18 @@ def background(
 
 @dataclass(frozen=True)
 class Breaks:
-    """Frames of a video that are not connected to those before them."""
+    """Frames of a video that are not connected to the frames before them."""
 
     blank: tuple[int, ...]
     """Frames without texture: black, blurred or covered."""
     cuts: tuple[int, ...]
     """Frames that share no background with the frames before them."""
     survival: tuple[float, ...]
-    """Share of the corners of each frame, but the last, that are found in the next."""
+    """Fraction of each frame's corners that the next frame shows, except for the last frame."""
 
 
 def find_breaks(video: Background, *, bridge: int) -> Breaks:
-    """Find blank frames and cuts; at most `bridge` bad frames between connected ones are no cut."""
+    """Find blank frames and cuts. A gap of at most `bridge` bad frames is not a cut."""
     count = len(video.gray)
     corners = [video.corners(frame) for frame in range(count)]
     blank = [frame for frame in range(count) if len(corners[frame]) < MIN_CORNERS]
@@ -124,11 +129,11 @@ def find_breaks(video: Background, *, bridge: int) -> Breaks:
             return 0.0
         return float(np.mean(video.follow(first, second, corners[first])[1]))
 
-    shares = [survival(frame, frame + 1) for frame in range(count - 1)]
+    fractions = [survival(frame, frame + 1) for frame in range(count - 1)]
     cuts: list[int] = []
     reached = 0
     for frame in range(1, count):
-        if shares[frame - 1] >= MIN_SURVIVAL and reached == frame - 1:
+        if fractions[frame - 1] >= MIN_SURVIVAL and reached == frame - 1:
             reached = frame
             continue
         if survival(reached, frame) >= MIN_SURVIVAL:
@@ -138,4 +143,30 @@ def find_breaks(video: Background, *, bridge: int) -> Breaks:
             reached = frame
     if after := [frame for frame in range(reached + 1, count) if frame not in blank]:
         cuts.append(after[0])
-    return Breaks(tuple(blank), tuple(cuts), tuple(shares))
+    return Breaks(tuple(blank), tuple(cuts), tuple(fractions))
+
+
+def still_fraction(
+    video: Background, *, max_shift_px: float, stop_below: float
+) -> tuple[float, float]:
+    """Return the fraction of still frames, and the median shift over frames in pixels.
+
+    The shift of a frame is the median distance of the background's corners from their places in
+    frame 0, at working size. A frame that shows too few corners is not still. The test stops once
+    the fraction must end below `stop_below`.
+    """
+    corners = video.corners(0)
+    count = len(video.gray)
+    if len(corners) < MIN_CORNERS:
+        return 0.0, float("inf")
+    shifts = [0.0]
+    for frame in range(1, count):
+        there, good = video.follow(0, frame, corners, corners)
+        enough = good.sum() >= max(MIN_CORNERS / 2, MIN_TRACKED * len(corners))
+        moved = np.linalg.norm((there - corners)[good], axis=1) if enough else [np.inf]
+        shifts.append(float(np.median(moved)))
+        failed = sum(shift >= max_shift_px for shift in shifts)
+        if failed > (1 - stop_below) * count:
+            break
+    fraction = sum(shift < max_shift_px for shift in shifts) / count
+    return fraction, float(np.median(shifts))

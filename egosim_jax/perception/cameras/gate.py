@@ -1,9 +1,9 @@
-"""Gate of reconstructions: figures that separate true camera paths from degenerate ones.
+"""Gate that separates correct reconstructions from degenerate ones.
 
-Registered frames and the reprojection error alone do not: a camera that barely moves can be
-reconstructed in all frames, at an error of a pixel, with depths that spread over many orders of
-magnitude. So the gate also asks for depths, angles, steps and a lens as a head-mounted or
-hand-held camera has them.
+Registered frames and the reprojection error are not enough. Structure from motion can register all
+frames of a camera that barely moves, at an error of one pixel, with depths over many orders of
+magnitude. So the gate also checks that depths, angles, steps and lens are plausible for a
+head-mounted or hand-held camera.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from jaxtyping import Float, Int32
 from egosim_jax.types import InputError
 
 UNBOUNDED = 1e12
-"""Figure for ratios that are larger, or infinite."""
+"""Upper limit of reported ratios, which may be infinite."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Reconstruction:
-    """Cameras and points of structure from motion, with pixel centers at integer coordinates."""
+    """Cameras and points from structure from motion; pixel centers have integer coordinates."""
 
     frames: Int32[np.ndarray, " r"]
-    """Frames that the reconstruction registered, ascending."""
+    """Registered frames, ascending."""
     camera_from_world: Float[np.ndarray, "r 3 4"]
     """Pose of each registered frame, in an unknown unit."""
     focal_px: float
     radial: float
-    """Radial coefficient of the lens, as in `estimates.Lens`."""
+    """Radial coefficient of the lens (`estimates.Lens`)."""
     points: Float[np.ndarray, "p 3"]
     """Triangulated points, in the same unit."""
     error_px: Float[np.ndarray, " p"]
@@ -42,38 +42,38 @@ class Reconstruction:
     observed: Int32[np.ndarray, " o"]
     """Point of each observation."""
     pixels_px: Float[np.ndarray, "o 2"]
-    """Recorded column and row of each observation."""
+    """Column and row of each observation in the recorded frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GateConfig:
-    """Thresholds that the rungs of the ladder must meet."""
+    """Thresholds for accepting a rung of the ladder."""
 
     max_shift_px: float = 1.0
-    """Largest median shift of the background in a still frame, in pixels at working size."""
+    """Maximum median shift of the background in a still frame, in pixels at working size."""
     min_still: float = 0.9
-    """Least share of still frames of a static camera."""
+    """Minimum fraction of still frames of a static camera."""
     max_residual_px: float = 1.5
-    """Largest median residual of a camera that only turns, in pixels at working size."""
+    """Maximum median residual of a camera that only turns, in pixels at working size."""
 
     max_depth_spread: float = 20.0
-    """Largest ratio of the 95th to the 5th percentile of depth."""
+    """Maximum ratio of the 95th to the 5th percentile of depth."""
     max_radial: float = 0.1
-    """Largest absolute radial coefficient."""
+    """Maximum absolute radial coefficient."""
     min_angle_deg: float = 1.0
-    """Least median triangulation angle, in degrees."""
+    """Minimum median triangulation angle, in degrees."""
     max_step: float = 20.0
-    """Longest step between frames, in median steps."""
+    """Maximum step between frames, in median steps."""
     min_view_deg: float = 50.0
-    """Narrowest self-calibrated view along the longer side, in degrees."""
+    """Minimum self-calibrated field of view along the longer side, in degrees."""
     max_view_deg: float = 115.0
-    """Widest self-calibrated view along the longer side, in degrees."""
+    """Maximum self-calibrated field of view along the longer side, in degrees."""
     min_registered: float = 0.9
-    """Least share of the frames that are registered."""
+    """Minimum fraction of registered frames."""
     max_gap: int = 5
-    """Most missing frames in a row between registered ones; they are interpolated."""
+    """Maximum number of consecutive unregistered frames; they are interpolated."""
     min_shared: int = 15
-    """Fewest points that two neighboring registered frames share."""
+    """Minimum number of points that two neighboring registered frames share."""
 
     def __post_init__(self) -> None:
         """Check that no threshold refuses or accepts everything."""
@@ -91,16 +91,16 @@ class GateConfig:
         ):
             raise InputError(
                 f"The gate's thresholds contradict each other: {self}. Ratios must be above 1, "
-                "angles within 0 and 180 degrees, shares within 0 and 1."
+                "angles within 0 and 180 degrees, fractions within 0 and 1."
             )
 
 
 def measure(
     found: Reconstruction, *, frames: int, images: int, height: int, width: int
 ) -> dict[str, float]:
-    """Return the figures that the gate compares.
+    """Return the figures that the gate compares with its thresholds.
 
-    The reconstruction is of `images` among the `frames` of a video.
+    The reconstruction uses `images` of the `frames` of a video.
     """
     registered = len(found.frames)
     figures = {
@@ -124,7 +124,7 @@ def measure(
         "depth_spread": float(min(far / near, UNBOUNDED)) if near > 0 else UNBOUNDED,
         "angle_deg": float(np.median(_angles_deg(found, centers))),
         "step": float(min(steps.max() / max(np.median(steps), 1e-12), UNBOUNDED)),
-        "shared": float(_least_shared(found)),
+        "shared": float(_min_shared(found)),
     }
     return figures
 
@@ -132,9 +132,9 @@ def measure(
 def refusals(
     figures: Mapping[str, float], config: GateConfig, *, calibrated: bool = False
 ) -> tuple[str, ...]:
-    """Return why figures of `measure` do not pass the gate; nothing if they do.
+    """Return the reasons why figures of `measure` fail the gate; empty if they pass.
 
-    The field of view of a camera that was `calibrated` by other means is not judged.
+    The field of view is not judged if the camera was `calibrated` by other means.
     """
     if "angle_deg" not in figures:
         return (f"only {figures['registered']:.0%} of the frames were registered",)
@@ -165,7 +165,7 @@ def refusals(
 
 
 def _longest_gap(registered: Int32[np.ndarray, " r"], frames: int) -> int:
-    """Return the most missing frames in a row; `frames` if the first or last one is missing."""
+    """Return the longest gap in frames; `frames` if the first or last one is missing."""
     if not len(registered) or registered[0] != 0 or registered[-1] != frames - 1:
         return frames
     return int(np.diff(registered).max(initial=1)) - 1
@@ -174,18 +174,18 @@ def _longest_gap(registered: Int32[np.ndarray, " r"], frames: int) -> int:
 def _angles_deg(
     found: Reconstruction, centers: Float[np.ndarray, "r 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Return the largest angle between two rays to each point, in degrees."""
+    """Return the maximum angle between two rays to each point, in degrees."""
     rays = centers[found.observed_in] - found.points[found.observed]
     rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
     order = np.argsort(found.observed, kind="stable")
     ends = np.cumsum(np.bincount(found.observed, minlength=len(found.points)))
     groups = np.split(rays[order], ends[:-1])
-    least = [float((group @ group.T).min()) if len(group) else 1.0 for group in groups]
-    return np.degrees(np.arccos(np.clip(least, -1, 1)))
+    cosine = [float((group @ group.T).min()) if len(group) else 1.0 for group in groups]
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def _least_shared(found: Reconstruction) -> int:
-    """Return the fewest points that two neighboring registered frames both observe."""
+def _min_shared(found: Reconstruction) -> int:
+    """Return the minimum number of points shared by two neighboring registered frames."""
     seen = np.zeros((len(found.frames), len(found.points)), bool)
     seen[found.observed_in, found.observed] = True
     return int((seen[1:] & seen[:-1]).sum(axis=1).min())

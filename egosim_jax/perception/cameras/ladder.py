@@ -1,16 +1,16 @@
-"""Cameras of a recorded video by the first method of a ladder whose result can be trusted.
+"""Cameras of a recorded video by a ladder of methods. The first trusted result is accepted.
 
-    given        cameras of the data set, or from elsewhere
+    given        known cameras, for example from a dataset
     static       the background does not move
     incremental  structure from motion, self-calibrated
     focal        the same with the focal length of the device
     global       global structure from motion
-    rotation     the camera turns without moving: there is no depth from parallax then
-    refused      none of them, with the reasons
+    rotation     the camera turns without moving, so there is no parallax
+    refused      no method gives a trusted result; the verdict has the reasons
 
-What structure from motion finds must pass the gate (`gate.py`), whichever rung was asked for. The
-first frame's camera is the frame of the world; the unit is unknown, and the median depth in the
-first frame is 1 where there are points. Given cameras stay as they are.
+Structure from motion must always pass the gate (`gate.py`). The first camera is the world frame.
+The unit is unknown; the median depth in the first frame is 1 if there are points. Given cameras are
+returned unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from egosim_jax.perception.cameras.colmap import ColmapConfig, ColmapError, Scene, open_scene
-from egosim_jax.perception.cameras.flow import Background, Breaks, background, find_breaks
+from egosim_jax.perception.cameras.flow import (
+    Background,
+    Breaks,
+    background,
+    find_breaks,
+    still_fraction,
+)
 from egosim_jax.perception.cameras.gate import GateConfig, measure, refusals
 from egosim_jax.perception.cameras.path import complete_path, estimate_from, pinhole
 from egosim_jax.perception.cameras.rotation import (
@@ -33,7 +39,6 @@ from egosim_jax.perception.cameras.rotation import (
     follow_corners,
     solve_rotations,
 )
-from egosim_jax.perception.cameras.static import still_share
 from egosim_jax.perception.estimates import CameraEstimate, Rung, Verdict
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import Cameras, InputError, check_video
@@ -43,20 +48,20 @@ _LADDER: tuple[Rung, ...] = ("static", "incremental", "focal", "global", "rotati
 
 @dataclass(frozen=True, kw_only=True)
 class CameraLadder:
-    """Estimator of cameras that climbs down from the best known method to refusal."""
+    """Estimator of cameras that tries methods from the most certain one down to refusal."""
 
     cameras: Cameras | None = None
-    """Known cameras of the video; nothing is estimated then."""
+    """Known cameras of the video, which replace estimation."""
     metric: bool = True
     """True if the known cameras are in meters."""
     focal_px: float | None = None
-    """Known focal length in pixels, which replaces self-calibration and the device's."""
+    """Known focal length in pixels; it replaces self-calibration and the device's value."""
     rung: Rung | None = None
-    """Only this method is tried, None: all. A static or turning camera is then taken as given."""
+    """Only method to try, or None for all. A static or turning camera is then assumed."""
     assumed_view_deg: float = 90.0
-    """Width of the view if nothing gives the focal length of a static or turning camera."""
+    """Assumed field of view if the focal length of a static or turning camera is unknown."""
     max_images: int = 240
-    """Most frames that are matched; of longer videos every second to sixth frame is."""
+    """Maximum number of matched frames; longer videos are subsampled by 2 to 6."""
     gate: GateConfig = field(default_factory=GateConfig)
     colmap: ColmapConfig = field(default_factory=ColmapConfig)
 
@@ -64,9 +69,9 @@ class CameraLadder:
         """Check that the options fit together."""
         problem = None
         if self.rung in ("refused", "network"):
-            problem = f"the rung {self.rung} cannot be forced. Choose another one"
+            problem = f"the rung {self.rung} cannot be forced. Choose another"
         elif (self.rung == "given") != (self.cameras is not None) and self.rung is not None:
-            problem = "the rung given, and no other, goes with known cameras. Give both or neither"
+            problem = "the rung given, and only it, needs known cameras. Give both or neither"
         elif not 10 <= self.assumed_view_deg <= 150:
             problem = f"the assumed view must be 10 to 150 degrees, not {self.assumed_view_deg:g}"
         elif self.max_images < 3:
@@ -81,21 +86,21 @@ class CameraLadder:
         *,
         focal_px: float | None = None,
     ) -> CameraEstimate:
-        """Return the cameras of a video; `focal_px` is the focal length of its device, if known.
+        """Return the cameras of a video. `focal_px` is the device's focal length, if known.
 
         Raises `InputError` for bad input, and if pycolmap is needed but not installed.
         """
         check_video("The video", frames)
         if moving.shape != frames.shape[:3] or moving.dtype != bool:
             raise InputError(
-                f"The mask of what moves is {moving.dtype} {moving.shape}: it must be bool "
-                f"{frames.shape[:3]}, as the video."
+                f"The mask of moving pixels is {moving.dtype} {moving.shape}: it must be bool "
+                f"{frames.shape[:3]}, like the video."
             )
         if self.cameras is not None:
             return _given(self.cameras, frames, metric=self.metric)
         if self.rung == "focal" and self.focal_px is None and focal_px is None:
             raise InputError(
-                "The rung focal needs a focal length, and none is known. Give one. (focal_px)"
+                "The rung focal needs a focal length, but it is unknown. Give one. (focal_px)"
             )
         for known in (self.focal_px, focal_px):
             _check_focal(known, frames)
@@ -104,20 +109,20 @@ class CameraLadder:
 
 
 def _given(cameras: Cameras, frames: np.ndarray, *, metric: bool) -> CameraEstimate:
-    """Return known cameras. Raises `InputError` unless they are those of the video."""
-    have = (len(cameras.world_from_camera), cameras.height, cameras.width)
-    if have != frames.shape[:3]:
+    """Return known cameras. Raises `InputError` unless they fit the video."""
+    count, height, width = (len(cameras.world_from_camera), cameras.height, cameras.width)
+    if (count, height, width) != frames.shape[:3]:
         raise InputError(
-            f"The given cameras have {have[0]} frames of {have[2]} x {have[1]} pixels, and the "
-            f"video {frames.shape[0]} of {frames.shape[2]} x {frames.shape[1]}: they must be the "
-            "same. Cut and scale the cameras as the video."
+            f"The given cameras have {count} frames of {width} x {height} pixels, but the "
+            f"video has {frames.shape[0]} of {frames.shape[2]} x {frames.shape[1]}: they must be "
+            "the same. Cut and scale the cameras like the video."
         )
     verdict = Verdict(rung="given", reason="the cameras were given", figures={})
     return CameraEstimate(cameras=cameras, metric=metric, verdict=verdict)
 
 
 def _check_focal(focal_px: float | None, frames: np.ndarray) -> None:
-    """Raise `InputError` for a focal length that no camera of this video has."""
+    """Raise `InputError` for an implausible focal length."""
     if focal_px is None:
         return
     size = max(frames.shape[1:3])
@@ -132,7 +137,7 @@ def _check_focal(focal_px: float | None, frames: np.ndarray) -> None:
 @no_type_check
 @dataclass
 class _Climb:
-    """One video's way down the ladder: figures and reasons are collected on the way."""
+    """One video's descent of the ladder, which collects figures and reasons."""
 
     config: CameraLadder
     frames: UInt8[np.ndarray, "f h w 3"]
@@ -143,7 +148,7 @@ class _Climb:
     reasons: list[str] = field(default_factory=list)
 
     def run(self) -> CameraEstimate:
-        """Return the result of the first rung that is accepted."""
+        """Return the result of the first accepted rung."""
         if problem := self._unusable():
             self.reasons.append(problem)
             return self._refused()
@@ -167,7 +172,7 @@ class _Climb:
 
     @property
     def known_focal_px(self) -> float | None:
-        """Focal length from the user, else from the device."""
+        """User's focal length, or else the device's."""
         return self.config.focal_px or self.device_focal_px
 
     @cached_property
@@ -182,7 +187,7 @@ class _Climb:
 
     @cached_property
     def scene(self) -> Scene:
-        """Images with matched features; raises `ColmapError`."""
+        """Images with matched features. Raises `ColmapError`."""
         scene = self.stack.enter_context(
             open_scene(self.video, self._images(), config=self.config.colmap)
         )
@@ -190,13 +195,13 @@ class _Climb:
         return scene
 
     def _images(self) -> tuple[int, ...]:
-        """Return the frames that are matched, with the first and the last one."""
+        """Return the matched frames, which include the first and the last one."""
         last = len(self.frames) - 1
         number = min(last + 1, self.config.max_images)
         return tuple(int(i) for i in np.rint(np.linspace(0, last, number)))
 
     def _unusable(self) -> str | None:
-        """Return why nothing can be estimated, or None."""
+        """Return the reason why no method can work, or None."""
         count = len(self.frames)
         blank, cuts = self.breaks.blank, self.breaks.cuts
         self.figures |= {"blank_frames": float(len(blank)), "cuts": float(len(cuts))}
@@ -218,18 +223,18 @@ class _Climb:
     def _static(self) -> CameraEstimate | None:
         gate = self.config.gate
         forced = self.config.rung == "static"
-        share, shift = still_share(
+        still, shift = still_fraction(
             self.video, max_shift_px=gate.max_shift_px, stop_below=0.0 if forced else gate.min_still
         )
-        self.figures |= {"static_still": share, "static_shift_px": min(shift, 1e12)}
-        reason = f"the background is where frame 0 has it in {share:.0%} of the frames"
-        if forced or share >= gate.min_still:
+        self.figures |= {"static_still": still, "static_shift_px": min(shift, 1e12)}
+        reason = f"the background is where frame 0 has it in {still:.0%} of the frames"
+        if forced or still >= gate.min_still:
             poses = np.tile(np.eye(4), (len(self.frames), 1, 1))
             return self._pinhole("static", poses, self._focal("static"), reason)
         return self._fail("static", "the background moves")
 
     def _reconstruct(self, rung: Rung) -> CameraEstimate | None:
-        """Return the reconstruction of a rung if it passes the gate."""
+        """Return a rung's reconstruction if it passes the gate."""
         if len(self.frames) < 3:
             return self._fail(rung, "it needs at least 3 frames")
         if len(self.frames) > (self.config.gate.max_gap + 1) * self.config.max_images:
@@ -291,7 +296,7 @@ class _Climb:
         return self._pinhole("rotation", poses, focal, reason)
 
     def _focal(self, rung: str, tracks: Tracks | None = None) -> float:
-        """Return the known focal length, that found by turning, or the assumed; record which."""
+        """Return the known, estimated or assumed focal length; record the latter two."""
         if self.known_focal_px is not None:
             return self.known_focal_px
         if tracks is not None:
@@ -322,11 +327,11 @@ class _Climb:
         return CameraEstimate(cameras=cameras, metric=False, verdict=verdict)
 
     def _fail(self, rung: str, reason: str) -> None:
-        """Record why a rung was not accepted."""
+        """Record why a rung was rejected."""
         self.reasons.append(f"{rung}: {reason}")
 
     def _verdict(self, rung: Rung, reason: str) -> Verdict:
-        """Return a verdict with the reasons of the rungs before it."""
+        """Return a verdict with the reasons of the earlier rungs."""
         return Verdict(rung=rung, reason="; ".join([reason, *self.reasons]), figures=self.figures)
 
     def _refused(self) -> CameraEstimate:

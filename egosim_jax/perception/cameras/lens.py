@@ -1,10 +1,10 @@
-"""Radial distortion: undistorted frames, masks and pixels of a `CameraEstimate`.
+"""Undistortion of frames, masks and pixels by the radial lens of a `CameraEstimate`.
 
-A lens takes a point at (x, y, 1) to the recorded pixel c + f (1 + k r²) (x, y), with r² = x² + y²,
-f its focal length, k its radial coefficient and c the center of the image. The undistorted
-image has the same size and center, and the least focal length F that shows no pixel which was
-not recorded: with R the distance from the center to the corner (k > 0) or to the nearest border
-(k < 0), F = f (1 + k R² / F²).
+A lens with focal length f and radial coefficient k maps a point (x, y, 1) to the recorded pixel
+c + f (1 + k r²) (x, y), with r² = x² + y² and c the image center. The undistorted image has the
+same size and center. Its focal length F is the smallest at which every pixel was recorded:
+F = f (1 + k R² / F²), where R is the distance from the center to the corner (k > 0) or to the
+nearest border (k < 0).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def pinhole_focal(lens: Lens, *, height: int, width: int) -> float:
     """Return the focal length of the undistorted frames, in pixels."""
     reach = np.hypot(height, width) / 2 if lens.radial > 0 else min(height, width) / 2
     focal = lens.focal_px
-    for _ in range(60):
+    for _ in range(60):  # fixed-point iteration for F
         focal = lens.focal_px * (1 + lens.radial * (reach / focal) ** 2)
     return float(focal)
 
@@ -29,9 +29,9 @@ def pinhole_focal(lens: Lens, *, height: int, width: int) -> float:
 def undistort(
     frames: Shaped[np.ndarray, "f h w *c"], estimate: CameraEstimate
 ) -> Shaped[np.ndarray, "f h w *c"]:
-    """Return the frames that the cameras of an estimate show; masks by their nearest pixels.
+    """Return undistorted frames, as the cameras of an estimate see them.
 
-    Frames of an estimate without a lens are returned as they are.
+    Masks are resampled by nearest pixel. Frames are unchanged if the estimate has no lens.
     """
     if estimate.lens is None or estimate.cameras is None:
         return frames
@@ -60,7 +60,7 @@ def undistort(
 def undistort_pixels(
     pixels_px: Float[np.ndarray, "*b 2"], estimate: CameraEstimate
 ) -> Float[np.ndarray, "*b 2"]:
-    """Return where recorded pixels are in the frames that `undistort` makes; NaN stays NaN."""
+    """Return the places of recorded pixels in undistorted frames; NaN stays NaN."""
     if estimate.lens is None or estimate.cameras is None:
         return pixels_px
     return to_pinhole(pixels_px, estimate.lens, estimate.cameras.intrinsics_px)
@@ -69,13 +69,13 @@ def undistort_pixels(
 def to_pinhole(
     pixels_px: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "*b 2"]:
-    """Return recorded pixels as a pinhole camera with the same center sees them."""
+    """Return the places of recorded pixels in a pinhole camera with the same center."""
     rays = _model(lens, intrinsics_px).unproject(pixels_px.reshape(-1, 2))
     return rays.reshape(pixels_px.shape) * intrinsics_px[0, 0] + intrinsics_px[:2, 2]
 
 
 def _model(lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]) -> lenses.Lens:
-    """Return the lens of the recorded frames, whose center is that of the pinhole camera."""
+    """Return the lens of the recorded frames; it shares the pinhole camera's center."""
     recorded = intrinsics_px.astype(float).copy()
     recorded[[0, 1], [0, 1]] = lens.focal_px
     height, width = (round(2 * center + 1) for center in intrinsics_px[[1, 0], 2])

@@ -1,4 +1,4 @@
-"""Camera paths of all frames, from poses of some of them."""
+"""Camera estimates for all frames of a video, from the poses of some frames."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from egosim_jax.types import Cameras
 
 
 def pinhole(focal_px: float, *, height: int, width: int) -> Float[np.ndarray, "3 3"]:
-    """Return intrinsics with the principal point in the center of the image."""
+    """Return intrinsics with the principal point at the image center."""
     return np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1.0]])
 
 
 def complete_path(
     frames: Int[np.ndarray, " r"], poses: Float[np.ndarray, "r 4 4"], count: int
 ) -> Float[np.ndarray, "f 4 4"]:
-    """Return a pose for each of `count` frames: missing ones between two others by slerp.
+    """Return a pose for each of `count` frames; missing poses are interpolated (slerp).
 
     `frames` ascends from 0 to `count` - 1.
     """
@@ -41,9 +41,9 @@ def complete_path(
 def estimate_from(
     found: Reconstruction, verdict: Verdict, *, frames: int, height: int, width: int
 ) -> CameraEstimate:
-    """Return the estimate of an accepted reconstruction: undistorted, from the first frame's view.
+    """Return an accepted reconstruction as a `CameraEstimate` of undistorted frames.
 
-    The unit is the median depth in the first frame.
+    The first camera is the world frame, and the median depth in the first frame is the unit.
     """
     rotation, offset = found.camera_from_world[:, :, :3], found.camera_from_world[:, :, 3]
     points = found.points @ rotation[0].T + offset[0]
@@ -76,7 +76,7 @@ def estimate_from(
 
 
 def _orthonormal(poses: Float[np.ndarray, "f 4 4"]) -> Float[np.ndarray, "f 4 4"]:
-    """Return poses with rotations that are orthonormal to rounding."""
+    """Return poses whose rotations are orthonormal up to rounding."""
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     exact = poses.copy()
     exact[:, :3, :3] = u @ vt

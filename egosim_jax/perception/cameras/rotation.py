@@ -1,9 +1,9 @@
-"""Cameras that turn without moving: rotations by robust least squares on tracked corners.
+"""Rotations of a camera that turns without moving, by robust least squares on tracked corners.
 
-The corners of a key frame are followed through the frames after it, from where the last rotation
-sends them, until too few are left; then the next key frame begins. The rotation R of a frame
-minimizes the soft L1 loss of K R K⁻¹ x - y over the tracks (x, y), by Gauss-Newton steps with
-weights 1 / sqrt(1 + r²). If the camera moves, parallax remains: the residual is the evidence.
+The corners of a key frame are tracked through the following frames until too few remain; then a new
+key frame begins. The rotation R of a frame minimizes the soft L1 loss of K R K⁻¹ x - y over the
+tracks (x, y), by Gauss-Newton steps with weights 1 / sqrt(1 + r²). If the camera also moves,
+parallax remains as a residual.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from jaxtyping import Float, Float32
 from egosim_jax.perception.cameras.flow import MIN_CORNERS, Background
 from egosim_jax.perception.cameras.path import pinhole
 
-MIN_SHARE = 0.4
-"""Share of a key frame's corners below which the next key frame begins."""
+MIN_KEPT = 0.4
+"""Minimum fraction of a key frame's corners; below it, a new key frame begins."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """Corners of key frames and where later frames show them, at working size."""
+    """Corners of key frames and their places in later frames, at working size."""
 
     keys: tuple[int, ...]
     """Key frame of each frame; itself in the first frame, -1 where tracking failed."""
@@ -37,24 +37,24 @@ class Tracks:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Rotations:
-    """Rotations of a camera, and how well they explain the tracks."""
+    """Rotations of a camera, and their residuals."""
 
     world_from_camera: Float[np.ndarray, "f 3 3"]
     """Rotation of each frame; NaN where tracking failed."""
     residual_px: Float[np.ndarray, " f"]
     """Median residual of each frame, in pixels at working size."""
     turn_deg: float
-    """Largest angle between the first frame and another."""
+    """Maximum angle between the first and another frame, in degrees."""
 
 
 def follow_corners(video: Background, *, bridge: int = 5) -> Tracks:
-    """Follow corners through a video; at most `bridge` frames in a row may fail."""
+    """Track corners through a video; at most `bridge` consecutive frames may fail."""
     keys, starts, ends = [0], [video.corners(0)], [video.corners(0)]
     key, corners = 0, starts[0]
     guess, last = corners, 0
     for frame in range(1, len(video.gray)):
         there, good = video.follow(key, frame, corners, guess)
-        if good.sum() < max(MIN_CORNERS / 2, MIN_SHARE * len(corners)) and last != key:
+        if good.sum() < max(MIN_CORNERS / 2, MIN_KEPT * len(corners)) and last != key:
             key, corners = last, video.corners(last)
             guess = corners
             there, good = video.follow(key, frame, corners, guess)
@@ -65,12 +65,13 @@ def follow_corners(video: Background, *, bridge: int = 5) -> Tracks:
         if keep:
             last = frame
             shift = np.median(there[good] - guess[good], axis=0)
+            # Lost corners may return: guess that they move as the others do.
             guess = np.where(good[:, None], there, guess + shift).astype(np.float32)
     return Tracks(keys=tuple(keys), starts=tuple(starts), ends=tuple(ends))
 
 
 def solve_rotations(tracks: Tracks, intrinsics_px: Float[np.ndarray, "3 3"]) -> Rotations:
-    """Return the rotations that explain the tracks best, for known intrinsics at working size."""
+    """Return the rotations that best explain the tracks, for intrinsics at working size."""
     count = len(tracks.keys)
     poses = np.full((count, 3, 3), np.nan)
     poses[0] = np.eye(3)
@@ -95,10 +96,10 @@ def solve_rotations(tracks: Tracks, intrinsics_px: Float[np.ndarray, "3 3"]) -> 
 def find_focal(
     tracks: Tracks, *, height: int, width: int, views_deg: tuple[float, float]
 ) -> float | None:
-    """Return the focal length in pixels at working size that explains turning best, or None.
+    """Return the focal length that best explains the turns, in pixels at working size, or None.
 
-    None unless the residual falls by a third, and by half a pixel, from either end of the range of
-    views to its least: a turn of a few degrees says nothing about the focal length.
+    The minimum residual must be a third, and half a pixel, below the residuals at both ends of the
+    range of views. Otherwise the turn is too small to determine the focal length.
     """
     views = np.radians(np.linspace(*views_deg, 14))
     focals = max(height, width) / 2 / np.tan(views / 2)
@@ -107,10 +108,11 @@ def find_focal(
         intrinsics = pinhole(float(focal), height=height, width=width)
         costs.append(float(np.nanmean(solve_rotations(tracks, intrinsics).residual_px)))
     best = int(np.argmin(costs))
-    least, ends = costs[best], min(costs[0], costs[-1])
-    if best in (0, len(costs) - 1) or least > min(0.67 * ends, ends - 0.5):
+    lowest, ends = costs[best], min(costs[0], costs[-1])
+    if best in (0, len(costs) - 1) or lowest > min(0.67 * ends, ends - 0.5):
         return None
     around = slice(best - 1, best + 2)
+    # The views are coarse: take the minimum of a parabola through the three around the best.
     a, b, _ = np.polyfit(np.log(focals[around]), costs[around], 2)
     return float(np.exp(-b / (2 * a)))
 
@@ -127,7 +129,7 @@ def _solve(
     focal, center = intrinsics_px[0, 0], intrinsics_px[:2, 2]
     rays = np.concatenate([(starts - center) / focal, np.ones((len(starts), 1))], axis=1)
     for _ in range(20):
-        u, v = _shown(rays, rotation)
+        u, v = _project(rays, rotation)
         gap = np.stack([u, v], axis=1) * focal + center - ends
         weight = (1 + (gap**2).sum(axis=1)) ** -0.25
         columns = np.stack([-u * v, 1 + u * u, -v], axis=1)
@@ -138,14 +140,14 @@ def _solve(
         rotation = cv2.Rodrigues(step)[0] @ rotation
         if np.abs(step).max() < 1e-8:
             break
-    gap = np.stack(_shown(rays, rotation), axis=1) * focal + center - ends
+    gap = np.stack(_project(rays, rotation), axis=1) * focal + center - ends
     return rotation, float(np.median(np.linalg.norm(gap, axis=1)))
 
 
-def _shown(
+def _project(
     rays: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "3 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the rays' image coordinates, at focal length 1, after a rotation."""
+    """Return the image coordinates of rotated rays at focal length 1."""
     x, y, z = rotation @ rays.T
     z = np.maximum(z, 1e-6)
     return x / z, y / z

@@ -1,10 +1,12 @@
-"""Depth of recorded videos without network weights, and the scene state that is made from it.
+"""Depth of recorded videos without network weights.
 
-    depth = SweptDepth()(frames, moving, camera_estimate, wanted=[0])
+Depth from networks is in `networks`; the state made from depth is in `state.depth`.
 
-`sweep` measures depth from posed frames, `sparse` selects triangulated points to be trusted,
-`triangulate` finds such points where cameras are known without them, `complete` fills in what
-neither knows, `planes` is for cameras that do not move, and `density` for the state's points.
+    SweptDepth:        the estimator, `SweptDepth()(frames, moving, cameras, wanted=[0])`
+    points_per_pixel:  density of the state's points for a camera path
+
+`SweptDepth` calls `triangulate` for sparse points, `sweep` for depth from posed frames, and
+`complete` for all other pixels.
 """
 
 from egosim_jax.perception.depth.density import points_per_pixel

@@ -1,13 +1,13 @@
-"""Completion of sparse inverse depth by diffusion that the image guides.
+"""Completion of sparse inverse depth by image-guided diffusion.
 
 The completed map d minimizes
 
     sum_i c_i (d_i - m_i)^2 + lambda sum_(i,j) w_ij (d_i - d_j)^2,   w_ij = exp(-|I_i - I_j|/sigma)
 
 over measured pixels i with confidence c and neighboring pixels (i, j), with colors I in CIE Lab.
-The minimum solves a sparse symmetric linear system, found by conjugate gradients from a coarser
-solution. Inverse depth is affine in the pixel coordinates on any plane of the scene.
-Source: Levin, Lischinski, Weiss 2004, whose colors are depths here.
+The minimum is the solution of a sparse symmetric linear system. Conjugate gradients find it,
+starting from a coarser solution. Inverse depth is used because it is affine in the pixel
+coordinates on any plane of the scene. Source: Levin, Lischinski, Weiss 2004, who complete colors.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Diffusion:
     """Parameters of the completion."""
 
     smoothness: float = 0.3
-    """Weight lambda of the smoothness, versus a measurement of confidence 1."""
+    """Weight lambda of the smoothness; a measurement of confidence 1 has weight 1."""
     sigma: float = 0.03
-    """Difference in Lab color, in units of the range of L, at which smoothness falls to 1/e."""
+    """Lab color difference at which smoothness falls to 1/e, in units of the range of L."""
     floor: float = 1e-4
-    """Smallest weight between neighbors, so that every pixel is reached."""
+    """Minimum weight between neighbors; above 0, so every pixel gets a value."""
     tolerance: float = 1e-5
     """Relative residual at which conjugate gradients stop."""
     max_iterations: int = 400
-    """Largest number of iterations on each level."""
+    """Maximum number of iterations on each level."""
 
     def __call__(
         self,
@@ -39,7 +39,7 @@ class Diffusion:
         measured: Float[np.ndarray, "h w"],
         confidence: Float[np.ndarray, "h w"],
     ) -> Float32[np.ndarray, "h w"]:
-        """Return the completed map; `measured` is not read where the confidence is 0."""
+        """Return the completed map. `measured` is ignored where the confidence is 0."""
         import cv2
 
         height, width = measured.shape
@@ -88,7 +88,7 @@ class Diffusion:
     def _weights(
         self, image: UInt8[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "h w-1"], Float[np.ndarray, "h-1 w"]]:
-        """Return lambda w_ij between a pixel and its neighbors to the right and below."""
+        """Return lambda w_ij between each pixel and its neighbors to the right and below."""
         import cv2
 
         lab = cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB) / 100

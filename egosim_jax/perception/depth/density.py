@@ -1,4 +1,4 @@
-"""Density of the points of a scene that cameras come near to."""
+"""Density of a scene's points for cameras that move towards it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.types import Cameras
 
 STEP_PX = 8
-"""Distance in pixels of the points that are looked at."""
-SHARE = 0.02
-"""Least share of the views of points that counts."""
+"""Spacing of the sampled points in pixels."""
+MIN_FRACTION = 0.02
+"""Minimum fraction of magnified points, over all views, for a higher density."""
 POINT_PX = 2
-"""Size in pixels at which points are drawn, and so the magnification that opens gaps."""
+"""Size of drawn points in pixels, and so the magnification that opens gaps."""
 
 
 def points_per_pixel(depth_m: Float[np.ndarray, "h w"], cameras: Cameras) -> int:
-    """Return how many points along each side of a pixel of the first frame later frames need.
+    """Return the number of points along each side of a first-frame pixel: 1 or 2.
 
-    One, unless some frame sees a part of the scene from less than half the first frame's distance:
-    then two. Denser points are drawn less sharply where nothing is magnified.
+    2 is for clips that see a part of the scene from less than half the first frame's distance. It
+    is not the default because denser points look less sharp where nothing is magnified.
     """
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     known = np.isfinite(depth_m[::STEP_PX, ::STEP_PX])
@@ -34,4 +34,4 @@ def points_per_pixel(depth_m: Float[np.ndarray, "h w"], cameras: Cameras) -> int
     )
     _, _, inside = pixels_of(cameras, local)
     nearer = (local[..., 2] * POINT_PX < depth) & inside
-    return 2 if nearer.sum() > SHARE * inside.sum() else 1
+    return 2 if nearer.sum() > MIN_FRACTION * inside.sum() else 1

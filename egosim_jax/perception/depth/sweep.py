@@ -1,10 +1,10 @@
-"""Plane sweep: depth of a frame from posed frames around it, by the correlation of their colors.
+"""Plane sweep: depth of a frame by correlation with other posed frames.
 
-For planes z = d of the reference camera, the other frames are warped onto the reference with the
-plane's homography K (R + t n^T / d) K^-1 and compared by zero-mean normalized cross-correlation
-(ZNCC) of small windows. A pixel's depth is the plane with the best mean over the better half of the
-views, which sees past what is hidden in the others. Sources: Collins 1996; Kang, Szeliski, Chai
-2001 (temporal selection of views); Hosni et al. 2013 (guided filter of the costs).
+For each plane z = d of the reference camera, the homography K (R + t n^T / d) K^-1 warps the other
+frames onto the reference. Small windows are compared by zero-mean normalized cross-correlation
+(ZNCC). A pixel's depth is the plane with the best mean score over the better half of the views; the
+other half may be occluded. Sources: Collins 1996; Kang, Szeliski, Chai 2001 (temporal selection of
+views); Hosni et al. 2013 (guided filter of the costs).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from egosim_jax.types import Cameras, check_counts
 PARALLAX = 0.12
 """Best baseline of a view, in median depths."""
 TURN = 0.35
-"""Turn of a view in radians that counts as much as half the best baseline."""
+"""Turn of a view in radians that costs as much as half or twice the best baseline."""
 
 
 @no_type_check
@@ -44,19 +44,19 @@ class PlaneSweep:
     planes: int = 72
     """Number of planes, evenly spaced in inverse depth."""
     views: int = 6
-    """Number of other frames that a frame is compared with."""
+    """Number of other frames to compare a frame with."""
     window: int = 7
-    """Side of the correlation's window in pixels of the sweep's resolution."""
+    """Side of the correlation window, in pixels of the sweep's resolution."""
     guide_radius: int = 4
     """Radius of the guided filter of the scores in pixels; 0 for none."""
     guide_epsilon: float = 1e-3
     """Regularization of the guided filter, in squared gray levels from 0 to 1."""
     min_score: float = 0.6
-    """Smallest correlation of a confident pixel."""
+    """Minimum correlation of a confident pixel."""
     min_texture: float = 0.01
-    """Smallest standard deviation of gray levels from 0 to 1 in a confident pixel's window."""
+    """Minimum standard deviation of a confident pixel's window, in gray levels from 0 to 1."""
     second_peak: float = 0.02
-    """Smallest lead of the best plane over those more than three planes away, in correlation."""
+    """Minimum lead in correlation over all planes more than three planes away."""
 
     def __post_init__(self) -> None:
         """Check that all counts are positive."""
@@ -71,7 +71,7 @@ class PlaneSweep:
         views: list[int],
         inverse_range: tuple[float, float],
     ) -> SweptFrame:
-        """Sweep planes between two inverse depths through a frame, compared with the given views.
+        """Sweep planes between two inverse depths through a frame, and compare it with the views.
 
         All arrays are at the sweep's resolution.
         """
@@ -89,7 +89,7 @@ class PlaneSweep:
                 ]
             )
             best = np.partition(each, len(views) - keep, axis=0)[len(views) - keep :]
-            scores[number] = best.mean(axis=0)
+            scores[number] = best.mean(axis=0)  # occluded views are in the worse half
         if self.guide_radius:
             scores = guided_filter(gray, scores, self.guide_radius, self.guide_epsilon)
         return self._choose(scores, inverses, moments.deviation, hidden)
@@ -104,7 +104,7 @@ class PlaneSweep:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         warped, seen = cv2.split(cv2.warpPerspective(other, matrix, (width, height), flags=flags))
         score = reference.correlate(warped)
-        # The plane behind the other camera is mirrored into view by the homography.
+        # The homography mirrors the part of the plane behind the other camera into view.
         bottom = matrix[2] @ np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]])
         if bottom.min() <= 0:
             rows, columns = np.mgrid[:height, :width]
@@ -118,7 +118,7 @@ class PlaneSweep:
         deviation: Float32[np.ndarray, "h w"],
         hidden: Bool[np.ndarray, "h w"],
     ) -> SweptFrame:
-        """Return the best plane of each pixel, between planes by a parabola."""
+        """Return the best depth of each pixel, interpolated between planes by a parabola."""
         count = len(inverses)
         best = scores.argmax(axis=0)
         inner = np.clip(best, 1, count - 2)
@@ -167,10 +167,10 @@ class _Moments:
 
 
 def choose_views(cameras: Cameras, frame: int, depth: float, views: int) -> list[int]:
-    """Return the frames to compare a frame with, in order of time.
+    """Return the frames to compare a frame with, in temporal order.
 
-    Best is a baseline of `PARALLAX` times the median depth; twice or half of it counts as much as a
-    turn by `TURN` radians. The best are spread over time, so that a passing hand hides few of them.
+    The best baseline is `PARALLAX` times the median depth. Half or twice as much costs the same as
+    a turn by `TURN` radians. The chosen frames are spread over time, so a passing hand hides few.
     """
     poses = cameras.world_from_camera
     others = np.array([f for f in range(len(poses)) if f != frame])
@@ -200,7 +200,7 @@ def guided_filter(
 
 
 def _homography(cameras: Cameras, frame: int, view: int, inverse: float) -> np.ndarray:
-    """Return the matrix from the pixels of a frame to a view's, by the plane z = 1 / `inverse`."""
+    """Return the matrix from a frame's to a view's pixels by the plane z = 1 / `inverse`."""
     matrix = cameras.intrinsics_px
     motion = invert(cameras.world_from_camera[view]) @ cameras.world_from_camera[frame]
     plane = motion[:3, :3].copy()

@@ -1,9 +1,9 @@
-"""Sparse points of a frame whose cameras are known: corners tracked and triangulated.
+"""Sparse points of frames with known cameras: triangulation, and selection of trusted points.
 
-Corners are followed by Lucas-Kanade optical flow forwards and backwards in time as long as the way
-back ends where it began. A point X that is seen at normalized (x, y) by a camera with rotation R
-and translation t satisfies (R_1 - x R_3) X = x t_3 - t_1 and the same for y: least squares over its
-frames, weighted by 1 / depth in a second pass, which makes it the error in the image.
+Lucas-Kanade optical flow tracks corners forward and backward in time, with a forward-backward
+check. A point X at normalized image coordinates (x, y), seen by a camera with rotation R and
+translation t, satisfies (R_1 - x R_3) X = x t_3 - t_1, and the same for y. Least squares over its
+frames gives X. A second pass weights each equation by 1 / depth, so it minimizes the image error.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from egosim_jax.geometry import invert
+from egosim_jax.geometry import invert, transform
 from egosim_jax.perception.estimates import SparsePoints
 from egosim_jax.types import Cameras, check_counts
 
@@ -24,17 +24,17 @@ class Triangulation:
     """Parameters of tracking and triangulation."""
 
     corners: int = 1500
-    """Largest number of corners."""
+    """Maximum number of corners."""
     spacing_px: int = 5
-    """Smallest distance between two corners, in pixels."""
+    """Minimum distance between two corners, in pixels."""
     quality: float = 0.005
-    """Least strength of a corner, relative to the strongest."""
+    """Minimum strength of a corner, relative to the strongest one."""
     max_return_px: float = 0.7
-    """Largest distance by which the way back of the flow misses its start, in pixels."""
+    """Maximum forward-backward error of the flow, in pixels."""
     min_angle_deg: float = 1.0
-    """Least angle between two rays to a point, in degrees."""
+    """Minimum angle between two rays to a point, in degrees."""
     max_angle_deg: float = 60.0
-    """Largest angle; what does not move with the scene is triangulated amid the cameras."""
+    """Maximum angle in degrees; a larger one indicates a point that moves with the camera."""
 
     def __post_init__(self) -> None:
         """Check that all counts are positive."""
@@ -47,7 +47,7 @@ class Triangulation:
         cameras: Cameras,
         frame: int,
     ) -> SparsePoints:
-        """Return the points of a frame's corners, in the world; maybe none."""
+        """Return the world points of a frame's corners; there may be no points."""
         import cv2
 
         gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in frames]
@@ -70,8 +70,7 @@ class Triangulation:
         frame: int,
         step: int,
     ) -> None:
-        """Fill in the pixels of the corners in the frames before or after theirs."""
-
+        """Fill in the pixels of a frame's corners in the frames after it, or before it."""
         (alive,) = np.nonzero(np.isfinite(pixels[frame, :, 0]))
         height, width = gray[frame].shape
         stop = len(gray) if step > 0 else -1
@@ -91,7 +90,7 @@ class Triangulation:
     def _solve(
         self, pixels: Float[np.ndarray, "f n 2"], cameras: Cameras, frame: int
     ) -> SparsePoints:
-        """Triangulate tracks; those at wrong angles or behind a camera are dropped."""
+        """Triangulate tracks. Points at wrong angles or behind a camera are dropped."""
         matrix = cameras.intrinsics_px
         seen = np.isfinite(pixels[..., 0])
         homogeneous = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
@@ -134,12 +133,73 @@ class Triangulation:
         cameras: Cameras,
         frame: int,
     ) -> Float[np.ndarray, " n"]:
-        """Return the largest angle between a point's ray in its frame and in any other."""
+        """Return the maximum angle between a point's ray in its frame and in any other."""
         rays = points - cameras.world_from_camera[:, None, :3, 3]
         rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
         cosine = np.einsum("fnc,nc->fn", rays, rays[frame])
         smallest = np.where(seen, cosine, 1).min(axis=0)
         return np.degrees(np.arccos(np.clip(smallest, -1, 1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseFilter:
+    """Selection of the triangulated points that can be trusted as depths of a frame."""
+
+    min_track: int = 4
+    """Minimum number of frames that observe a point."""
+    max_error_px: float = 2.0
+    """Maximum mean reprojection error in pixels."""
+    neighbors: int = 8
+    """Number of nearest points in the image to compare a depth with."""
+    tolerance: float = 0.08
+    """Accepted relative difference of 1/z from the neighbors' median."""
+    deviations: float = 3.0
+    """Accepted difference from the neighbors' median, in median absolute deviations."""
+
+    def __post_init__(self) -> None:
+        """Check that all counts are positive."""
+        check_counts({"min_track": self.min_track, "neighbors": self.neighbors})
+
+    def __call__(
+        self,
+        points: SparsePoints,
+        cameras: Cameras,
+        frame: int,
+        moving: Bool[np.ndarray, "h w"],
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+        """Return pixels (column, row) and depths of the trusted points of a frame.
+
+        Points in `moving` do not count. A point whose depth differs from its neighbors' is a false
+        match.
+        """
+        track = np.bincount(points.indices, minlength=len(points.points_m))
+        kept = (track >= self.min_track) & (points.error_px < self.max_error_px)
+        seen = (points.frames == frame) & kept[points.indices]
+        pixels, indices = points.pixels_px[seen], points.indices[seen]
+        pose = invert(cameras.world_from_camera[frame])
+        depth = transform(pose, points.points_m[indices])[:, 2]
+        column, row = np.rint(pixels).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (depth > 0)
+        inside &= (column < cameras.width) & (row < cameras.height)
+        inside[inside] &= ~moving[row[inside], column[inside]]
+        pixels, depth = pixels[inside], depth[inside]
+        agrees = self._agrees(pixels, 1 / depth)
+        return pixels[agrees], depth[agrees]
+
+    def _agrees(
+        self, pixels: Float[np.ndarray, "n 2"], inverse: Float[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Return True for inverse depths that agree with their neighbors in the image."""
+        from scipy.spatial import KDTree
+
+        if len(pixels) <= self.neighbors:
+            return np.ones(len(pixels), bool)
+        near = np.asarray(KDTree(pixels).query(pixels, k=self.neighbors + 1)[1])
+        around = inverse[near[:, 1:]]
+        median = np.median(around, axis=1)
+        spread = np.median(np.abs(around - median[:, None]), axis=1)
+        allowed = np.maximum(self.tolerance * median, self.deviations * spread)
+        return np.abs(inverse - median) <= allowed
 
 
 def triangulate_frames(
@@ -148,7 +208,7 @@ def triangulate_frames(
     cameras: Cameras,
     wanted: Sequence[int],
 ) -> SparsePoints | None:
-    """Return the points of the corners of some frames; None if no corner shows parallax."""
+    """Return the corner points of some frames; None if no corner shows parallax."""
     parts = [Triangulation()(frames, moving, cameras, frame) for frame in wanted]
     first = np.cumsum([0, *(len(part.points_m) for part in parts)])
     if not first[-1]:
@@ -166,7 +226,7 @@ def triangulate_frames(
 def _flow(
     start: UInt8[np.ndarray, "h w"], end: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Return where pixels have moved, and which were found."""
+    """Return the new places of pixels, and True for the pixels found."""
     import cv2
 
     moved, found, _ = cv2.calcOpticalFlowPyrLK(start, end, pixels, pixels.copy())

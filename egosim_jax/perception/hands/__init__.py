@@ -1,4 +1,10 @@
-"""Hands of the wearer in a video: detected, tracked per side, and lifted to meters."""
+"""The wearer's hands in a video: detected, tracked per side, and lifted to meters.
+
+Drawing of hands is in `silhouettes` and `rendering`.
+
+    LandmarkHands:  the estimator, by MediaPipe's networks
+    lift:           metric joints in the camera from hand tracks
+"""
 
 from egosim_jax.perception.hands.estimator import LandmarkHands
 from egosim_jax.perception.hands.lift import lift

@@ -1,10 +1,10 @@
-"""Candidates of hands in every frame: detected palms, and hands followed from frame to frame.
+"""Candidate hands in every frame, by palm detection and by following hands between frames.
 
-The first round over all frames detects the palms in all tiles, the second one the keypoints in the
-regions of these palms. Each further round follows new hands into the frames before and after
-theirs, where the keypoints predict a region, until it finds no hand. A hand is thus also found in
-frames that do not show its palm. Finally, each hand is seen again in the region that its keypoints
-predict, which is narrower than a palm's.
+1. Detect palms in all tiles of all frames.
+2. Find keypoints in the palms' regions.
+3. Search for each new hand in the previous and the next frame, in the region that its keypoints
+   predict. Repeat until there are no new hands. This finds hands in frames without a visible palm.
+4. Find the keypoints of each hand again in its own region, which is narrower than a palm's.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from egosim_jax.perception.hands.regions import (
     joints_in_image,
     regions_of_joints,
     regions_of_palms,
-    turned_back,
+    unrotate,
 )
 
 _PALM = [0, 1, 2, 5, 9, 13, 17]
 _KNUCKLES = [5, 9, 13, 17]
 _BENT = [7, 8, 11, 12, 15, 16, 19, 20]
 _FOREARM_NATS = 10
-"""Log odds of a right hand per image width that a forearm enters to the right of the middle."""
+"""Log odds of a right hand per image width from the middle to where the forearm enters."""
 _BEND_NATS = 10
-"""Log odds of a right hand per length of the palm that its fingers bend to their side of it."""
+"""Log odds of a right hand per palm length of the fingers' bend along the palm's normal."""
 _OTHER_REGIONS = [(turn, scale) for turn in (-0.5, -0.25, 0.25, 0.5) for scale in (1.0, 1.4)]
-"""Turns in radians, and scales, of the regions in which a hand of the other side is searched."""
+"""Turns in radians and scales of the regions to search for a hand of the other side."""
 
 
 @no_type_check
@@ -47,26 +47,26 @@ class Candidates:
     joints_px: Float[np.ndarray, "n 21 2"]
     """Columns and rows of the keypoints in pixels."""
     joints_hand_m: Float[np.ndarray, "n 21 3"]
-    """Keypoints of a mean hand in meters, in camera axes, up to a translation."""
+    """Keypoints of a hand of mean size in meters, in camera axes, up to a translation."""
     presence: Float[np.ndarray, " n"]
-    """Confidence from 0 to 1 that there is a hand."""
+    """Confidence from 0 to 1 in the presence of a hand."""
     right: Float[np.ndarray, " n"]
-    """Probability that it is a right hand, as the network says."""
+    """Probability of a right hand, from the network."""
     bend_right: Float[np.ndarray, " n"]
-    """Probability that its joints are a right hand's, by how its fingers bend."""
+    """Probability of a right hand, from the bend of the fingers."""
     forearm_right: Float[np.ndarray, " n"]
-    """Probability that it is a right hand, by where its forearm enters the image."""
+    """Probability of a right hand, from where the forearm enters the image."""
     palm: Float[np.ndarray, " n"]
-    """Confidence from 0 to 1 that its palm was detected where its joints say."""
+    """Confidence from 0 to 1 of a detected palm at the joints."""
     again: Bool[np.ndarray, " n"]
-    """True for other joints of a hand that was found already (`find_other_side`)."""
+    """True for alternative joints of a hand already found (`find_other_side`)."""
 
     def __len__(self) -> int:
         """Return the number of candidates."""
         return len(self.frame)
 
     def take(self, index: np.ndarray) -> Candidates:
-        """Return some of the candidates, by indices or a mask."""
+        """Return the candidates selected by indices or a mask."""
         return Candidates(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def join(self, other: Candidates) -> Candidates:
@@ -80,12 +80,12 @@ class Candidates:
 
     @property
     def seems_right(self) -> Bool[np.ndarray, " n"]:
-        """True for hands whose joints are more likely a right hand's."""
+        """True for hands whose joints look like a right hand's."""
         return (self.right + self.bend_right) / 2 > 0.5
 
     @property
     def size_px(self) -> Float[np.ndarray, " n"]:
-        """Size of each hand in pixels: the root mean square distance of its joints, times two."""
+        """Size of each hand in pixels (`spread`)."""
         return spread(self.joints_px)
 
 
@@ -98,7 +98,7 @@ def spread(joints_px: Float[np.ndarray, "*n 21 2"]) -> Float[np.ndarray, "*n"]:
 def relative_distance(
     one: Float[np.ndarray, "*#n 21 2"], other: Float[np.ndarray, "*#n 21 2"]
 ) -> Float[np.ndarray, ...]:
-    """Return the mean distance of the joints of two hands, in sizes of the larger one."""
+    """Return the mean distance between two hands' joints, in sizes of the larger hand."""
     distance = np.linalg.norm(one - other, axis=-1).mean(-1)
     return distance / np.maximum(np.maximum(spread(one), spread(other)), 1e-6)
 
@@ -106,10 +106,10 @@ def relative_distance(
 def right_by_forearm(
     joints_px: Float[np.ndarray, "n 21 2"], height: int, width: int
 ) -> Float[np.ndarray, " n"]:
-    """Return the probability of right hands by where their forearms enter the wearer's image.
+    """Return the probability of right hands from where their forearms enter the image.
 
-    A forearm continues the line from the knuckles to the wrist. A right forearm crosses the edge of
-    the image to the right of the middle. One that crosses the upper edge gives no evidence.
+    A forearm continues the line from the knuckles to the wrist. A right forearm crosses the image
+    border to the right of the middle. A forearm that crosses the upper border is no evidence.
     """
     wrist, size = joints_px[:, 0], np.array([width, height])
     along = wrist - joints_px[:, _KNUCKLES].mean(1)
@@ -121,7 +121,7 @@ def right_by_forearm(
 
 
 def right_by_bend(joints_m: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, " n"]:
-    """Return the probability of right hands by the side of the palm to which fingers bend."""
+    """Return the probability of right hands from the side of the palm to which fingers bend."""
     palm = joints_m[:, _KNUCKLES] - joints_m[:, :1]
     normal = np.cross(palm[:, 0], palm[:, -1])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
@@ -139,10 +139,10 @@ def find_other_side(
     min_presence: float,
     same_hand: float,
 ) -> Candidates:
-    """Return hands of a side in the places of candidates that were taken for the other one.
+    """Return hands of one side at the places of candidates that look like the other side.
 
-    With hidden fingers, the network takes a hand for a left or a right one as its region happens
-    to be: regions turned and enlarged often show the other one, whose joints are not mirrored.
+    With hidden fingers, the network's side depends on the exact region. In a turned and enlarged
+    region it often finds the correct side, and so joints that are not mirrored.
     """
     seen = hands.take(np.zeros(0, int))
     own = regions_of_joints(hands.joints_px)
@@ -169,10 +169,10 @@ def find_candidates(
     same_hand: float,
     wanted: np.ndarray | None = None,
 ) -> Candidates:
-    """Return the candidates of all frames, each hand of a frame once.
+    """Return the candidates of all frames, without duplicates.
 
-    `same_hand` is the relative distance below which two candidates of a frame are one hand. Palms
-    are detected in `wanted` frames only, and their hands followed through all of them.
+    `same_hand` is the relative distance below which two candidates of a frame are one hand. Only
+    the `wanted` frames are searched, all if None.
     """
     searched = np.arange(len(frames)) if wanted is None else np.flatnonzero(wanted)
     palms = _find_palms(frames, networks, searched, min_palm)
@@ -203,7 +203,7 @@ def find_candidates(
 
 
 def _support(joints_px: np.ndarray, palms: Palms) -> float:
-    """Return the score of the best palm that is where a hand's joints say, and of its size."""
+    """Return the score of the best palm with the place and size of a hand's joints."""
     size = float(spread(joints_px[None])[0])
     away = np.linalg.norm(palms.boxes_px[:, :2] - joints_px[_PALM].mean(0), axis=-1)
     ratio = palms.boxes_px[:, 2:].max(1) / max(size, 1e-6)
@@ -214,7 +214,7 @@ def _support(joints_px: np.ndarray, palms: Palms) -> float:
 def _find_palms(
     frames: np.ndarray, networks: HandNetworks, searched: np.ndarray, min_palm: float
 ) -> list[Palms]:
-    """Return the palms of the frames that are searched."""
+    """Return the palms of each searched frame."""
     tiles = make_tiles(*frames.shape[1:3])
     palms = []
     for frame in searched:
@@ -231,7 +231,7 @@ def _find_joints(
     regions: Regions,
     min_presence: float,
 ) -> Candidates:
-    """Return the hands that the network is confident to see in regions of frames."""
+    """Return the confident detections of the landmark network in regions of frames."""
     crop, meters = np.zeros((2, len(numbers), 21, 3))
     presence, right = np.zeros((2, len(numbers)))
     for i, frame in enumerate(numbers):
@@ -240,7 +240,7 @@ def _find_joints(
     found = Candidates(
         frame=numbers,
         joints_px=joints_in_image(regions, crop[..., :2]),
-        joints_hand_m=turned_back(regions, meters),
+        joints_hand_m=unrotate(regions, meters),
         presence=presence,
         right=right,
         bend_right=right_by_bend(meters),
@@ -258,7 +258,7 @@ def _refined(
     min_presence: float,
     same_hand: float,
 ) -> Candidates:
-    """Return candidates averaged with the same hand as found in the region of its keypoints."""
+    """Return candidates averaged with a second detection in the region of their keypoints."""
     own = _find_joints(frames, networks, found.frame, regions_of_joints(found.joints_px), 0.0)
     same = relative_distance(own.joints_px, found.joints_px) <= same_hand
     sure = np.flatnonzero(same & (own.presence >= min_presence))
@@ -272,7 +272,7 @@ def _refined(
 def _followed(
     fresh: Candidates, found: Candidates, allowed: np.ndarray, same_hand: float
 ) -> Candidates:
-    """Return fresh candidates moved to the frames next to theirs, where no hand is near them."""
+    """Return fresh candidates moved to adjacent frames, where no hand is near them yet."""
     both = fresh.join(fresh)
     frame = np.concatenate([fresh.frame - 1, fresh.frame + 1])
     inside = (frame >= 0) & (frame < len(allowed))
@@ -282,7 +282,7 @@ def _followed(
 
 
 def _once(candidates: Candidates, same_hand: float) -> Candidates:
-    """Return candidates without those that are the same hand as a more confident one."""
+    """Return candidates without duplicates of a more confident one (non-maximum suppression)."""
     order = np.argsort(-candidates.presence, kind="stable")
     kept: list[int] = []
     by_frame: dict[int, list[int]] = {}
@@ -296,7 +296,7 @@ def _once(candidates: Candidates, same_hand: float) -> Candidates:
 
 
 def _new_ones(candidates: Candidates, found: Candidates, same_hand: float) -> Candidates:
-    """Return the candidates that are no hand that was found in the same frame."""
+    """Return the candidates that are not a hand already found in their frame."""
     order = np.argsort(found.frame, kind="stable")
     starts = np.searchsorted(found.frame[order], candidates.frame)
     stops = np.searchsorted(found.frame[order], candidates.frame, side="right")

@@ -1,4 +1,4 @@
-"""Hands of a video by MediaPipe's networks, tracked over all of it."""
+"""Estimator of hands by MediaPipe's networks, with tracking over the video."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from egosim_jax.perception.hands.track import (
 from egosim_jax.types import check_video
 
 SKIN_RGB = (224, 172, 140)
-"""Color that luminance is painted in to find hands in gloves."""
+"""Color for painting the luminance, to detect hands in gloves."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,28 +33,28 @@ class LandmarkHands:
     """Estimator of hands (`estimates.HandEstimator`) by palm detection and landmarks."""
 
     weights: Path | None = None
-    """Folder of the two tflite files; None for those in the user's cache, fetched if need be."""
+    """Folder of the two tflite files; None for the user's cache, downloaded on first use."""
     offline: bool = False
-    """True to refuse instead of fetching weights."""
+    """True to raise an error instead of downloading weights."""
     threads: int = 2
     """Number of threads of each network on the CPU."""
     min_palm: float = 0.3
     """Minimum confidence of a detected palm."""
     min_presence: float = 0.4
-    """Minimum confidence of the landmark network that there is a hand."""
+    """Minimum confidence of the landmark network in the presence of a hand."""
     same_hand: float = 0.4
-    """Distance in hand sizes below which two hands of a frame are the same one."""
+    """Distance in hand sizes below which two detections in a frame are one hand."""
     gloves: bool = True
-    """True to search frames without a hand again, painted in the color of skin."""
+    """True to search frames without a hand again, painted in skin color."""
     min_gloved: float = 0.7
     """Minimum confidence of the landmark network in a painted frame."""
     max_side: int = 1280
-    """Longest side in pixels of the frames that are searched; larger ones are made smaller."""
+    """Maximum side of a searched frame in pixels; larger frames are downscaled."""
     max_gap: int = 3
-    """Maximum number of frames of a gap that is interpolated, and marked as such."""
+    """Maximum length of an interpolated gap in frames; `filled` marks its frames."""
     tracking: TrackConfig = field(default_factory=TrackConfig)
     networks: HandNetworks | None = None
-    """Networks to use; None for those of `weights`."""
+    """Loaded networks; None to load them from `weights`."""
 
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
         """Return the hands of a video."""
@@ -64,10 +64,10 @@ class LandmarkHands:
         return replace(tracks, joints_px=(tracks.joints_px + 0.5) / scale - 0.5)
 
     def candidates(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Candidates:
-        """Return the possible hands of all frames, searched at the size they have.
+        """Return the possible hands of all frames, searched at the frames' size.
 
-        Frames without a hand are searched again for gloves. Chosen hands whose joints seem to be of
-        the other side are searched again for their own side.
+        Frames without a hand are searched again for gloves. A tracked hand whose joints look like
+        the other side's is searched again for its own side.
         """
         search = partial(
             find_candidates,
@@ -95,7 +95,7 @@ class LandmarkHands:
         return found.take(np.argsort(found.frame, kind="stable"))
 
     def tracks(self, found: Candidates, frames: int) -> HandTracks:
-        """Return the tracks among the candidates of a number of frames."""
+        """Return the best tracks among the candidates of a video."""
         path = self._choose(found, frames)
         return _as_tracks(found, path, max_gap=self.max_gap, max_motion=self.tracking.max_motion)
 
@@ -111,7 +111,7 @@ class LandmarkHands:
 
 
 def _shrunk(frames: np.ndarray, max_side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return frames of at most a size, and the scale of their columns and rows."""
+    """Return frames of at most `max_side`, and the scales of their columns and rows."""
     height, width = frames.shape[1:3]
     factor = min(1.0, max_side / max(height, width))
     if factor == 1:
@@ -122,7 +122,7 @@ def _shrunk(frames: np.ndarray, max_side: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w 3"]:
-    """Return frames whose luminance is painted in the color of skin."""
+    """Return frames with their luminance in skin color."""
     gray = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames])
     table = np.round(np.arange(256)[:, None] * np.array(SKIN_RGB) / max(SKIN_RGB)).astype(np.uint8)
     return table[gray]
@@ -131,7 +131,7 @@ def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w
 def _as_tracks(
     found: Candidates, path: np.ndarray, *, max_gap: int, max_motion: float
 ) -> HandTracks:
-    """Return the chosen candidates, smoothed, with short gaps filled; NaN where one is missing."""
+    """Return the chosen candidates, smoothed, with short gaps filled; NaN where missing."""
     there = path >= 0
 
     def along_path(values: np.ndarray, missing: Any) -> np.ndarray:
@@ -141,7 +141,7 @@ def _as_tracks(
 
     joints_px = along_path(found.joints_px, np.nan)
     joints_hand_m = along_path(found.joints_hand_m, np.nan)
-    gaps = find_gaps(joints_px, most=max_gap, max_motion=max_motion)
+    gaps = find_gaps(joints_px, max_gap=max_gap, max_motion=max_motion)
     joints_px = fill_gaps(joints_px, gaps)
     weights = smoothing(joints_px, max_motion=max_motion / 2)
     right = np.arange(2) == RIGHT

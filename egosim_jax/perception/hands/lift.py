@@ -1,9 +1,9 @@
-"""Metric hands in the camera from keypoints in pixels and the shape of a mean hand.
+"""Metric hands in the camera, from keypoints in pixels and the shape of a hand of mean size.
 
-With keypoints w of the hand up to a translation T, and rays (x, y, 1) through its pixels, each
-keypoint gives two equations that are linear in T: x (T_z + w_z) = T_x + w_x, and the same for y.
-The least squares solution gives every keypoint its depth T_z + w_z. The keypoint is then put on its
-ray at that depth, so that a drawn skeleton coincides with the observed hand.
+Let w be a keypoint up to the hand's translation T, and (x, y, 1) the ray through its pixel. Each
+keypoint gives two linear equations in T: x (T_z + w_z) = T_x + w_x, and the same for y. Least
+squares gives T, and so the depth T_z + w_z of each keypoint. The lifted keypoint is on its ray at
+that depth, so a drawn skeleton coincides with the observed hand.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from egosim_jax.perception.estimates import HandTracks
 def lift(
     tracks: HandTracks, intrinsics_px: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "f 2 21 3"]:
-    """Return the keypoints of the hands in meters, in the camera of each frame; NaN if missing.
+    """Return the hands' keypoints in meters, in the camera of each frame; NaN if missing.
 
-    A hand whose fit has a keypoint behind the camera is missing, too.
+    A hand also counts as missing if its fit has a keypoint behind the camera.
     """
     pixels = np.concatenate([tracks.joints_px, np.ones_like(tracks.joints_px[..., :1])], axis=-1)
     rays = pixels @ np.linalg.inv(intrinsics_px).T
@@ -39,7 +39,7 @@ def lift(
 def _depths(
     rays: Float[np.ndarray, "n 21 2"], joints_hand_m: Float[np.ndarray, "n 21 3"]
 ) -> Float[np.ndarray, "n 21"]:
-    """Return the depth of the keypoints of hands by least squares."""
+    """Return the depth of each hand's keypoints by least squares."""
     matrix = np.zeros((*rays.shape, 3))
     matrix[..., 0, 0] = matrix[..., 1, 1] = 1
     matrix[..., 2] = -rays

@@ -1,6 +1,6 @@
-"""MediaPipe's hand networks: their weights, out of a pinned wheel, and LiteRT, which runs them.
+"""MediaPipe's hand networks: weights from a pinned wheel, run by LiteRT.
 
-The license of the weights (Apache-2.0) is kept with them.
+The license of the weights (Apache-2.0) is stored with them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MEDIAPIPE = WheelFiles(
 def fetch_weights(folder: Path | None = None, *, offline: bool = False) -> tuple[Path, Path]:
     """Return the verified files of the palm detector and the landmark network.
 
-    They are in `folder` or, if None, in the user's cache. The first use fetches them to the cache.
+    They are in `folder`, or in the user's cache if None. The first use downloads them to the cache.
     """
     if folder is None:
         folder = fetch_wheel_files(MEDIAPIPE, offline=offline)
@@ -55,7 +55,7 @@ def fetch_weights(folder: Path | None = None, *, offline: bool = False) -> tuple
 
 
 class HandNetworks:
-    """Palm detector and landmark network on the CPU, one image at a time."""
+    """Palm detector and landmark network on the CPU, for one image at a time."""
 
     def __init__(self, palms: Path, landmarks: Path, *, threads: int):
         self._palms = _load(palms, threads)
@@ -77,12 +77,12 @@ class HandNetworks:
 
 
 def _load(path: Path, threads: int) -> Any:
-    """Return LiteRT's interpreter of a file."""
+    """Return LiteRT's interpreter for a model file."""
     try:
         from ai_edge_litert.interpreter import Interpreter
     except ModuleNotFoundError as error:
         raise InputError(
-            "Hands cannot be estimated: LiteRT is not installed. It is in the extra `video`: "
+            "Hands cannot be estimated: LiteRT is not installed. The extra `video` has it: "
             "pip install 'egosim-jax[video]'."
         ) from error
     try:
@@ -94,7 +94,7 @@ def _load(path: Path, threads: int) -> Any:
 
 
 def _run(interpreter: Any, image: np.ndarray) -> list[np.ndarray]:
-    """Return the outputs for an image in uint8, in the order of the model's outputs."""
+    """Return the model's outputs for a uint8 image, in order."""
     inputs, outputs = interpreter.get_input_details(), interpreter.get_output_details()
     interpreter.set_tensor(inputs[0]["index"], image[None].astype(np.float32) / 255)
     interpreter.invoke()

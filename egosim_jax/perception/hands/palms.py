@@ -1,7 +1,7 @@
-"""Palms of hands: tiles of a frame, anchors, decoding and weighted suppression of duplicates.
+"""Palm detection: tiles of a frame, anchors, decoding, and weighted non-maximum suppression.
 
-The detector sees 192 x 192 pixels. Its outputs are relative to 2016 anchors: two at each cell of a
-24 x 24 grid and six at each of a 12 x 12 grid, all at the cells' centers (MediaPipe's SSD).
+The detector's input is 192 x 192 pixels. Its outputs are relative to 2016 anchors at cell centers:
+two per cell of a 24 x 24 grid, and six per cell of a 12 x 12 grid (MediaPipe's SSD).
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from jaxtyping import Float, Float32, UInt8
 INPUT = 192
 """Height and width of the detector's input in pixels."""
 PALM_KEYPOINTS = 7
-"""Number of keypoints of a detected palm: wrist, four knuckles, two of the thumb."""
+"""Number of keypoints of a palm: wrist, four knuckles, two of the thumb."""
 MAX_IOU = 0.3
-"""Maximum intersection over union of detections of different palms."""
+"""Maximum intersection over union (IoU) of detections of different palms."""
 _GRIDS = ((24, 2), (12, 6))
 _POSITIONS = [0, *range(2, 2 + PALM_KEYPOINTS)]
-"""Rows of a detection that are positions: its center and keypoints. Row 1 is its size."""
+"""Rows of a detection with positions (center and keypoints); row 1 is the size."""
 _MAX_LOGIT = 100.0
 
 
 @dataclass(frozen=True)
 class Tile:
-    """Square part of a frame that the detector sees at once."""
+    """Square part of a frame for one run of the detector."""
 
     left_px: int
-    """Column of its left edge; negative if the tile is wider than the frame."""
+    """Column of the left edge; negative if the tile is wider than the frame."""
     top_px: int
-    """Row of its upper edge."""
+    """Row of the upper edge."""
     size_px: int
-    """Length of its side in pixels."""
+    """Length of the sides in pixels."""
 
 
 @no_type_check
@@ -61,7 +61,7 @@ def make_anchors() -> Float32[np.ndarray, "2016 2"]:
 
 
 def make_tiles(height: int, width: int) -> list[Tile]:
-    """Return the tiles of a frame: one around all of it, and squares along its longer side."""
+    """Return the tiles of a frame: one around the frame, and squares along its longer side."""
     long, short = max(height, width), min(height, width)
     tiles = [Tile((width - long) // 2, (height - long) // 2, long)]
     if long > 1.2 * short:
@@ -107,15 +107,15 @@ def decode_palms(
         values[:, _POSITIONS] += np.array([tile.left_px, tile.top_px]) - 0.5
         found_boxes.append(values)
         found_scores.append(tile_score[kept])
-    return suppress_duplicates(np.concatenate(found_boxes), np.concatenate(found_scores))
+    return merge_overlapping(np.concatenate(found_boxes), np.concatenate(found_scores))
 
 
-def suppress_duplicates(
+def merge_overlapping(
     values: Float[np.ndarray, "n 9 2"], score: Float[np.ndarray, " n"]
 ) -> Palms:
     """Merge overlapping detections into their mean, weighted by score.
 
-    `values` has center, size and keypoints. A merged detection has the score of its best one.
+    `values` has center, size and keypoints. A merged detection keeps the highest score.
     """
     merged, scores = [], []
     order = np.argsort(-score, kind="stable")
@@ -133,7 +133,7 @@ def suppress_duplicates(
 
 
 def _iou(one: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return intersection over union of one box with others."""
+    """Return the intersection over union (IoU) of one box with others."""
     low = np.maximum(one[0] - one[1] / 2, others[:, 0] - others[:, 1] / 2)
     high = np.minimum(one[0] + one[1] / 2, others[:, 0] + others[:, 1] / 2)
     shared = np.clip(high - low, 0, None).prod(-1)

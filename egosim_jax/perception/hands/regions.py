@@ -1,7 +1,8 @@
-"""Square regions of hands: from a palm or from earlier keypoints, their crops and the way back.
+"""Square regions of hands, their crops, and the mapping of keypoints back to the image.
 
-A region is turned so that the middle finger points up in its crop, as the landmark network was
-trained (MediaPipe Hands, Zhang et al. 2020). Pixel centers are at integer coordinates.
+A region comes from a palm or from keypoints. Its rotation makes the middle finger point up in the
+crop, as in the landmark network's training (MediaPipe Hands, Zhang et al. 2020). Pixel centers are
+at integer coordinates.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ class Regions:
 def regions_of_palms(
     boxes_px: Float[np.ndarray, "n 4"], keypoints_px: Float[np.ndarray, "n 7 2"]
 ) -> Regions:
-    """Return the regions of hands whose palms were detected; boxes are center and size."""
+    """Return the hand regions of detected palms; boxes are center and size."""
     angle = _upright(keypoints_px[:, 0], keypoints_px[:, 2])
     return _enlarged(boxes_px[:, :2], boxes_px[:, 2:], angle, shift=-0.5, scale=2.6)
 
 
 def regions_of_joints(joints_px: Float[np.ndarray, "n 21 2"]) -> Regions:
-    """Return the regions of hands from their keypoints, in this frame or in the one next to it."""
+    """Return the hand regions of keypoints, for the same or an adjacent frame."""
     knuckles = (joints_px[:, 5] + joints_px[:, 13] + 2 * joints_px[:, 9]) / 4
     angle = _upright(joints_px[:, 0], knuckles)
     palm = joints_px[:, _SIZED_BY]
@@ -54,7 +55,7 @@ def regions_of_joints(joints_px: Float[np.ndarray, "n 21 2"]) -> Regions:
 def crop_region(
     frame: UInt8[np.ndarray, "h w 3"], regions: Regions, index: int
 ) -> UInt8[np.ndarray, "224 224 3"]:
-    """Cut one region out of a frame, upright; zero outside the image."""
+    """Return the upright crop of one region; zero outside the image."""
     to_image = regions.size_px[index] / CROP * _turn(regions.angle[index : index + 1])[0]
     center = regions.center_px[index] - to_image @ np.full(2, (CROP - 1) / 2)
     matrix = np.concatenate([to_image, center[:, None]], axis=1)
@@ -70,27 +71,27 @@ def crop_region(
 def joints_in_image(
     regions: Regions, joints_crop: Float[np.ndarray, "n 21 2"]
 ) -> Float[np.ndarray, "n 21 2"]:
-    """Return keypoints in image pixels from crop pixels, which are 0 to 224 from edge to edge."""
+    """Return image pixels of keypoints from crop pixels, which span 0 to 224 edge to edge."""
     inside = (joints_crop / CROP - 0.5) * regions.size_px[:, None, None]
     return regions.center_px[:, None] + np.einsum("nij,nkj->nki", _turn(regions.angle), inside)
 
 
-def turned_back(
+def unrotate(
     regions: Regions, joints_m: Float[np.ndarray, "n 21 3"]
 ) -> Float[np.ndarray, "n 21 3"]:
-    """Return keypoints in camera axes from keypoints in the axes of the upright crop."""
+    """Return keypoints in camera axes from keypoints in the crop's axes."""
     turned = np.einsum("nij,nkj->nki", _turn(regions.angle), joints_m[..., :2])
     return np.concatenate([turned, joints_m[..., 2:]], axis=-1)
 
 
 def _upright(wrist_px: np.ndarray, knuckle_px: np.ndarray) -> np.ndarray:
-    """Return the clockwise angle in the image from up to the direction wrist to knuckle."""
+    """Return the clockwise angle in the image from up to the wrist-knuckle direction."""
     right, down = (knuckle_px - wrist_px).T
     return np.arctan2(right, -down)
 
 
 def _turn(angle: np.ndarray) -> np.ndarray:
-    """Return matrices `n 2 2` that rotate clockwise in an image, whose rows go down."""
+    """Return matrices `n 2 2` that rotate clockwise in an image with rows downward."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
 

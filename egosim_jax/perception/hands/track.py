@@ -1,14 +1,16 @@
 """Tracks of at most one left and one right hand, chosen among the candidates of all frames.
 
-A state of a frame is a pair: the candidate of the left hand and that of the right one, either of
-which may be missing, and which are not the same hand. A dynamic program finds the sequence of
-states of least cost. The cost of a frame is that of the network's doubt in presence and side, of a
-missing hand, and of two hands that are nearly in the same place; from frame to frame, that of the
-distance a hand has moved, in hand sizes, or of its appearance or disappearance.
+A state of a frame is a pair of different candidates, one for the left and one for the right hand;
+either may be missing. Dynamic programming finds the sequence of states with minimum cost:
 
-The network's side is often wrong, and surely so, while fingers are hidden. Hence a second program
-decides which hand is which: its candidates are those in the places of the hands that the first one
-found, and its cost has the doubt in the side that the forearm enters from, too.
+    in each frame         the network's doubt in presence and side, a missing hand, and two hands
+                          at nearly the same place
+    from frame to frame   the distance of a hand's motion in hand sizes, or its appearance or
+                          disappearance
+
+While fingers are hidden, the network's side is often wrong at high confidence. So a second pass
+assigns the sides. Its candidates are at the places of the hands that the first pass found. Its cost
+also has the doubt in the side from which the forearm enters, and in the bend of the fingers.
 """
 
 from __future__ import annotations
@@ -25,63 +27,63 @@ from egosim_jax.perception.hands.detect import Candidates, relative_distance
 
 @dataclass(frozen=True, kw_only=True)
 class TrackConfig:
-    """Costs of tracking, in nats where a probability is behind them."""
+    """Costs of tracking; costs from probabilities are in nats."""
 
     side: float = 0.5
-    """Weight of the network's doubt in the side."""
+    """Weight of the network's doubt in the side (left or right)."""
     forearm: float = 1.0
-    """Weight of the doubt in the side that the forearm enters from, once hands are found."""
+    """Weight of the doubt in the side from which the forearm enters, in the second pass."""
     bend: float = 0.5
-    """Weight of the doubt in the side whose joints bend like the candidate's, then, too."""
-    least_side: float = 0.05
-    """Least probability of a side: the network is as sure where it is wrong."""
+    """Weight of the doubt in the side by the bend of the fingers, in the second pass."""
+    min_side: float = 0.05
+    """Minimum probability of a side, because the network is also confident when wrong."""
     presence: float = 1.0
     """Weight of the doubt in presence."""
     palm: float = 0.5
-    """Weight of the doubt in the palm, which the detector need not see in every frame."""
+    """Weight of the doubt in the palm, which need not be detected in every frame."""
     missing: float = 3.5
-    """Cost of a frame without the hand of a side."""
+    """Cost of a missing hand in a frame."""
     change: float = 2.0
     """Cost of the appearance or disappearance of a hand."""
     overlap: float = 8.0
-    """Cost of two hands in the same place."""
+    """Cost of two hands at the same place."""
     apart: float = 0.8
-    """Distance of two hands, in hand sizes, at which that cost has fallen to zero."""
+    """Distance of two hands, in hand sizes, at which `overlap` has fallen to zero."""
     motion: float = 3.0
-    """Cost of a motion by one hand size from one frame to the next."""
+    """Cost of a motion by one hand size between two frames."""
     max_break: int = 3
-    """Maximum number of missing frames after which a hand near by is the same one."""
+    """Maximum number of missing frames after which a nearby hand is the same one."""
     max_motion: float = 1.0
-    """Largest motion in hand sizes; beyond it a hand disappears and another one appears."""
+    """Maximum motion in hand sizes; beyond it, one hand disappears and another appears."""
     min_frames: int = 3
-    """Minimum number of frames of a track; shorter ones are false detections."""
+    """Minimum number of frames of a track; shorter tracks are false detections."""
     min_palms: float = 0.2
-    """Minimum share of a track's frames in which its palm was detected."""
-    most: int = 6
-    """Maximum number of candidates of a frame, the most confident ones."""
+    """Minimum fraction of a track's frames with a detected palm."""
+    max_candidates: int = 6
+    """Maximum number of candidates in a frame; the most confident ones are kept."""
 
 
 def choose_tracks(
     candidates: Candidates, frames: int, config: TrackConfig, *, same_hand: float
 ) -> Int[np.ndarray, "f 2"]:
-    """Return the index of the candidate of the left and right hand in each frame, or -1."""
+    """Return the candidate indices of the left and right hand in each frame, or -1."""
     first = replace(config, forearm=0.0, bend=0.0)
-    path = _of_chosen(candidates, ~candidates.again, frames, first, same_hand)
+    path = _choose(candidates, ~candidates.again, frames, first, same_hand)
     path = _without_false(candidates, path, config)
     near = _near_chosen(candidates, path, config)
-    return _of_chosen(candidates, near, frames, config, same_hand, (path >= 0).sum(1))
+    return _choose(candidates, near, frames, config, same_hand, (path >= 0).sum(1))
 
 
-def _of_chosen(
+def _choose(
     candidates: Candidates,
-    some: np.ndarray,
+    allowed: np.ndarray,
     frames: int,
     config: TrackConfig,
     same_hand: float,
     hands: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the path of least cost among some of the candidates, each hand on one side."""
-    index = np.flatnonzero(some)
+    """Return the path of minimum cost among the allowed candidates, each hand on one side."""
+    index = np.flatnonzero(allowed)
     path = _cheapest(candidates.take(index), frames, config, same_hand, hands)
     return _of_one_side(candidates, np.where(path >= 0, np.append(index, -1)[path], -1), config)
 
@@ -93,8 +95,8 @@ def _cheapest(
     same_hand: float,
     hands: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the states of least cost, by dynamic programming; `hands`: how many each frame has."""
-    per_frame = [_best(candidates, frame, config.most) for frame in range(frames)]
+    """Return the states of minimum cost; `hands` is the number of hands in each frame, if known."""
+    per_frame = [_best(candidates, frame, config.max_candidates) for frame in range(frames)]
     states = [_pairs(candidates, there, same_hand) for there in per_frame]
     if hands is not None:
         states = [s[(s >= 0).sum(1) == n] for s, n in zip(states, hands, strict=True)]
@@ -114,7 +116,7 @@ def _cheapest(
 
 
 def _near_chosen(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
-    """Return the candidates that are in the place of a chosen one of their frame."""
+    """Return True for candidates at the place of a chosen candidate of their frame."""
     near = np.zeros(len(candidates), bool)
     for side in (LEFT, RIGHT):
         pairs = np.stack([np.arange(len(candidates)), path[candidates.frame, side]], axis=-1)
@@ -123,9 +125,9 @@ def _near_chosen(candidates: Candidates, path: np.ndarray, config: TrackConfig) 
     return near
 
 
-def _best(candidates: Candidates, frame: int, most: int) -> np.ndarray:
+def _best(candidates: Candidates, frame: int, count: int) -> np.ndarray:
     there = np.flatnonzero(candidates.frame == frame)
-    return there[np.argsort(-candidates.presence[there], kind="stable")][:most]
+    return there[np.argsort(-candidates.presence[there], kind="stable")][:count]
 
 
 def _pairs(candidates: Candidates, there: np.ndarray, same_hand: float) -> np.ndarray:
@@ -155,10 +157,10 @@ def _state_cost(candidates: Candidates, states: np.ndarray, config: TrackConfig)
 
 
 def _side_doubt(candidates: Candidates, side: int, config: TrackConfig) -> np.ndarray:
-    """Return the cost of each candidate's being a hand of a side."""
+    """Return the cost of assigning each candidate to a side."""
     doubt = np.zeros(len(candidates))
     for weight, right in (
-        (config.side, np.clip(candidates.right, config.least_side, 1 - config.least_side)),
+        (config.side, np.clip(candidates.right, config.min_side, 1 - config.min_side)),
         (config.forearm, candidates.forearm_right),
         (config.bend, candidates.bend_right),
     ):
@@ -167,7 +169,7 @@ def _side_doubt(candidates: Candidates, side: int, config: TrackConfig) -> np.nd
 
 
 def _apart(candidates: Candidates, pairs: np.ndarray) -> np.ndarray:
-    """Return the distance of the means of two hands, in sizes of the larger one."""
+    """Return the distance of two hands' mean joints, in sizes of the larger hand."""
     middle = candidates.joints_px.mean(1)
     apart = np.linalg.norm(middle[pairs[:, LEFT]] - middle[pairs[:, RIGHT]], axis=-1)
     size = candidates.size_px[pairs].max(1)
@@ -177,7 +179,7 @@ def _apart(candidates: Candidates, pairs: np.ndarray) -> np.ndarray:
 def _step_cost(
     candidates: Candidates, before: np.ndarray, now: np.ndarray, config: TrackConfig
 ) -> np.ndarray:
-    """Return the cost of each step from a state to a state of the next frame, of one side."""
+    """Return one side's cost of each step from a state to a state of the next frame."""
     earlier, place = np.unique(before, return_inverse=True)
     later, place_now = np.unique(now, return_inverse=True)
     cost = config.change * ((earlier >= 0)[:, None] != (later >= 0)[None]).astype(float)
@@ -197,8 +199,8 @@ def _nats(probability: np.ndarray) -> np.ndarray:
 def _of_one_side(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
     """Return the path with each hand on one side.
 
-    Where a hand of one side ends and one of the other side begins in the same place, both are one
-    hand, of the side of least doubt over all of its frames.
+    If a left hand ends where a right hand begins, or the reverse, both are one hand. Its side is
+    the one with less doubt over all of its frames.
     """
     path = path.copy()
     odds = _side_doubt(candidates, LEFT, config) - _side_doubt(candidates, RIGHT, config)
@@ -221,14 +223,14 @@ def _of_one_side(candidates: Candidates, path: np.ndarray, config: TrackConfig) 
 
 
 def _in_one_place(candidates: Candidates, one: int, other: int, config: TrackConfig) -> bool:
-    """Return whether the means of two hands are near, whatever side the network took them for."""
+    """Return True if two hands have nearby mean joints, whatever their sides."""
     pair = candidates.take(np.array([one, other]))
     apart = np.linalg.norm(np.diff(pair.joints_px.mean(1), axis=0))
     return bool(apart < config.max_motion * pair.size_px.max())
 
 
 def _without_false(candidates: Candidates, path: np.ndarray, config: TrackConfig) -> np.ndarray:
-    """Return the path without tracks that are too short, or too rarely seen as a palm."""
+    """Return the path without tracks that are too short or whose palm is rarely detected."""
     path = path.copy()
     for side in (LEFT, RIGHT):
         for start, stop in runs(path[:, side] >= 0):
@@ -245,7 +247,7 @@ def _without_false(candidates: Candidates, path: np.ndarray, config: TrackConfig
 def fill_gaps(
     joints: Float[np.ndarray, "f 2 21 c"], gaps: Bool[np.ndarray, "f 2"]
 ) -> Float[np.ndarray, "f 2 21 c"]:
-    """Return tracks with straight motion through some gaps, of which both ends are known."""
+    """Return tracks with straight motion through gaps; both ends of each gap must be known."""
     result = joints.copy()
     for side in (LEFT, RIGHT):
         for start, stop in runs(gaps[:, side]):
@@ -256,14 +258,14 @@ def fill_gaps(
 
 
 def find_gaps(
-    joints_px: Float[np.ndarray, "f 2 21 2"], *, most: int, max_motion: float
+    joints_px: Float[np.ndarray, "f 2 21 2"], *, max_gap: int, max_motion: float
 ) -> Bool[np.ndarray, "f 2"]:
-    """Return the frames of gaps between two hands that are near by in time and in the image."""
+    """Return True in gaps between two hands that are close in time and in the image."""
     missing = np.any(np.isnan(joints_px), axis=(2, 3))
     gaps = np.zeros_like(missing)
     for side in (LEFT, RIGHT):
         for start, stop in runs(missing[:, side]):
-            if start == 0 or stop == len(missing) or stop - start > most:
+            if start == 0 or stop == len(missing) or stop - start > max_gap:
                 continue
             moved = relative_distance(joints_px[start - 1 : start, side], joints_px[[stop], side])
             gaps[start:stop, side] = moved[0] <= max_motion
@@ -271,7 +273,7 @@ def find_gaps(
 
 
 def runs(mask: Bool[np.ndarray, " f"]) -> list[tuple[int, int]]:
-    """Return start and stop of each run of True."""
+    """Return start and stop index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -279,10 +281,10 @@ def runs(mask: Bool[np.ndarray, " f"]) -> list[tuple[int, int]]:
 def smoothing(
     joints_px: Float[np.ndarray, "f 2 21 2"], *, max_motion: float
 ) -> Float[np.ndarray, "f 2 3"]:
-    """Return the weights, up to 1 2 1, of the frame before, of each frame and of the one after.
+    """Return the weights of the previous, current and next frame, at most in the ratio 1 2 1.
 
-    A frame whose hand is missing or farther away than `max_motion` hand sizes has no weight, so
-    that no hand is mixed with one whose joints were mirrored.
+    A neighbor has no weight if its hand is missing or more than `max_motion` hand sizes away. So
+    no hand is mixed with one that has mirrored joints.
     """
     weights = np.zeros((*joints_px.shape[:2], 3))
     weights[..., 1] = 2

@@ -1,10 +1,20 @@
-"""Networks of perception, each of them in a worker process, so that torch is never imported here.
+"""Networks of perception, each in a worker process, so the calling process never imports torch.
 
-A module holds one network from both sides: a frozen dataclass of its parameters, which satisfies a
-Protocol of `perception.estimates`, and the function `load`, which runs in the worker and may import
-torch or jax. `worker` has the processes, `checkpoint` the folders of weights, and `closed_loop` the
-pipeline that is made of networks. A network's `fingerprint` has the SHA-256 of its files and not
-their path: a run is resumed when the folder has moved, and refused with other weights.
+Methods without weights do not belong here. Each module has both sides of one network: a frozen
+dataclass of its parameters, which satisfies a Protocol of `perception.estimates`, and a function
+`load`, which runs in the worker and may import torch or jax. A network's `fingerprint` contains the
+SHA-256 of its files but not their path: a run resumes if the folder has moved, and does not resume
+with other weights.
+
+    DepthAnything, DepthPro, DepthAnything3, DepthFiles:                depth
+    DepthAnything3Cameras:                                              cameras
+    GroundedSam2, GroundedSam3, GroundedEdgeTam, GroundingDino, Sam3:   masks and boxes
+    Qwen3VL:                                                            captions
+    VideoMae:                                                           video features
+    NetworkError, close_workers:                                        worker processes
+
+`worker` and `child` are the two sides of the process, `checkpoint` reads folders of weights, and
+`closed_loop` is the pipeline `networks`.
 """
 
 from egosim_jax.perception.networks.depth_anything import DepthAnything

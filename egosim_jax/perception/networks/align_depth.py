@@ -1,9 +1,9 @@
-"""Alignment of a network's depth with that of a scene, where nothing has moved.
+"""Alignment of a network's depth with the scene's depth at static pixels.
 
-Monocular networks err mostly by a scale and a shift of inverse depth, others in each frame:
-1 / aligned = scale / depth + shift. Both are those of the pair of pixels that most pixels agree
-with (RANSAC; Fischler and Bolles, 1981), fitted again to all that agree. Source of the model:
-Ranftl et al., Towards Robust Monocular Depth Estimation, 2020, section 5.
+The error of monocular networks is mostly a scale and a shift of inverse depth, different in each
+frame: 1 / aligned = scale / depth + shift. RANSAC (Fischler and Bolles, 1981) fits both to pairs of
+pixels and refits them to the inliers. Source of the model: Ranftl et al., Towards Robust Monocular
+Depth Estimation, 2020, section 5.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32
 from egosim_jax.types import InputError, check_counts
 
 MAX_COMPARED = 5000
-"""Most pixels that are compared in a trial."""
+"""Approximate maximum number of pixels compared in a trial."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,16 +24,16 @@ class DepthAlignment:
     """Parameters of the alignment of one depth map with another."""
 
     min_pixels: int = 200
-    """Fewest pixels that are compared; with fewer, depth is unknown."""
+    """Minimum number of compared pixels; with fewer, depth is unknown."""
     tolerance: float = 0.05
-    """Relative difference up to which a pixel agrees."""
+    """Maximum relative difference of inverse depth at a pixel that agrees."""
     min_agreement: float = 0.5
-    """Least share of the compared pixels that agree; with a smaller one, depth is unknown."""
+    """Minimum fraction of compared pixels that agree; below it, depth is unknown."""
     trials: int = 200
-    """Pairs of pixels that are tried."""
+    """Number of pixel pairs to try."""
 
     def __post_init__(self) -> None:
-        """Check that the numbers are positive and the shares at most 1."""
+        """Check that numbers are positive and fractions at most 1."""
         check_counts({"min_pixels": self.min_pixels, "trials": self.trials})
         if not (self.tolerance > 0 and 0 <= self.min_agreement <= 1):
             raise InputError(
@@ -49,8 +49,8 @@ class DepthAlignment:
     ) -> Float32[np.ndarray, "h w"]:
         """Return a depth map aligned with the scene's at static pixels.
 
-        All of it is infinite where too few pixels can be compared or agree: no depth is better
-        than a wrong one.
+        The whole map is infinite if too few pixels can be compared or agree, because unknown depth
+        does less harm than wrong depth.
         """
         unknown = np.full_like(depth_m, np.inf)
         compared = static & np.isfinite(scene_m) & np.isfinite(depth_m) & (depth_m > 0)
@@ -67,13 +67,13 @@ class DepthAlignment:
             return np.where(inverse > 0, 1 / inverse, np.inf).astype(np.float32)
 
     def _fit(self, here: np.ndarray, there: np.ndarray) -> tuple[float, float, float]:
-        """Return scale, shift, and the share of the inverse depths that agree with them."""
+        """Return scale, shift, and the fraction of inverse depths that agree with them."""
         pairs = np.random.default_rng(0).integers(0, len(here), (2, self.trials))
         run = here[pairs[1]] - here[pairs[0]]
         usable = np.abs(run) > 1e-3 * here[pairs[0]]
         scales = (there[pairs[1]] - there[pairs[0]])[usable] / run[usable]
         shifts = there[pairs[0]][usable] - scales * here[pairs[0]][usable]
-        # A scale alone, too: a plane at one depth has no other.
+        # Also try a scale alone: a plane at constant depth does not determine a shift.
         scales = np.append(scales, np.median(there / here))
         shifts = np.append(shifts, 0.0)
         shares = [

@@ -1,7 +1,7 @@
-"""Checkpoints of networks: local folders in the layout of `save_pretrained`, checked here.
+"""Checkpoints of networks: local folders in the layout of `save_pretrained`.
 
-Only safetensors and JSON are read; nothing is downloaded, and no code of a checkpoint is run. A
-folder of another network is refused with what was found and what is needed.
+Only safetensors and JSON are read. Nothing is downloaded, and no code of a checkpoint runs. The
+error for another network's folder names the network found and the network needed.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from egosim_jax.types import InputError
 DType = Literal["float32", "bfloat16", "float16"]
 CONFIG, WEIGHTS, INDEX = "config.json", "model.safetensors", "model.safetensors.index.json"
 NOT_CONTENT = ("folder", "device", "timeout_s")
-"""Fields that change neither a network nor its results."""
+"""Fields outside the fingerprint: they change neither a network nor its results."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """A network in a worker process, loaded from a local folder when it is first used."""
+    """Network in a worker process, loaded from a local folder on first use."""
 
     needs: ClassVar[str]
-    """Name of the network, and the checkpoint to give, for messages."""
+    """Name of the network and of its checkpoint, for messages."""
     model_types: ClassVar[tuple[str, ...]]
-    """Values of `model_type` in the config.json of its checkpoints."""
+    """Accepted values of `model_type` in config.json."""
     files: ClassVar[tuple[str, ...]] = ()
-    """Further files that its checkpoints have."""
+    """Further required files of a checkpoint."""
     packages: ClassVar[tuple[str, ...]] = ("torch", "transformers")
     """Packages that the worker imports."""
     install: ClassVar[str] = "pip install 'egosim-jax[networks]'"
-    """Command that installs them."""
+    """Command that installs the packages."""
 
     folder: Path
     """Folder of the checkpoint, with config.json and safetensors."""
@@ -49,7 +49,7 @@ class Network:
     dtype: DType = "float32"
     """Floating-point type of the network."""
     timeout_s: float = 1800.0
-    """Longest time for one clip in seconds, with the loading of the network."""
+    """Timeout for one clip in seconds, including the loading of the network."""
 
     def __post_init__(self) -> None:
         """Check that the folder is a checkpoint of this network."""
@@ -65,7 +65,7 @@ class Network:
             )
 
     def check_config(self, config: Mapping[str, Any]) -> None:
-        """Raise `InputError` if the content of config.json is that of another network."""
+        """Raise `InputError` if config.json belongs to another network."""
         found = config.get("model_type")
         if found not in self.model_types:
             raise InputError(
@@ -75,7 +75,7 @@ class Network:
             )
 
     def check_installed(self) -> None:
-        """Raise `InputError` naming the packages of the worker that are not installed."""
+        """Raise `InputError` with the missing packages of the worker."""
         missing = [name for name in self.packages if find_spec(name) is None]
         if missing:
             raise InputError(
@@ -84,14 +84,14 @@ class Network:
             )
 
     def fingerprint(self) -> str:
-        """Return the hash of the network's files and parameters; the folder's path is not in it."""
+        """Return the hash of the network's files and parameters, without the folder's path."""
         options = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in NOT_CONTENT}
         return fingerprint((type(self).__name__, options, file_hashes(self.folder)))
 
     def ask(
         self, arrays: Mapping[str, np.ndarray], **options: Any
     ) -> tuple[dict[str, np.ndarray], Any]:
-        """Return the arrays and the value that the network's worker replies with."""
+        """Return the arrays and the JSON value of the worker's reply."""
         self.check_installed()
         settings = {
             "folder": str(self.folder.absolute()),
@@ -115,7 +115,7 @@ class Network:
 
 
 def weights_of(folder: Path) -> tuple[Path, ...]:
-    """Return the safetensors files of a checkpoint; raise `InputError` if one is missing."""
+    """Return the safetensors files of a checkpoint. Raises `InputError` if one is missing."""
     if (index := folder / INDEX).is_file():
         content = read_json(index)
         shards = content.get("weight_map") if isinstance(content, dict) else None
@@ -138,7 +138,7 @@ def weights_of(folder: Path) -> tuple[Path, ...]:
 
 
 def file_hashes(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of a checkpoint's weights and of its JSON and text files, by name."""
+    """Return the SHA-256 of a checkpoint's weights, JSON and text files, by name."""
     return {path.name: _hash(path, path.stat().st_mtime_ns) for path in _files(folder)}
 
 
@@ -153,7 +153,7 @@ def _hash(path: Path, _modified: int) -> str:
 
 
 def load_network(network: Any, folder: Path, *, device: str, dtype: str) -> Any:
-    """Load a class of transformers in a worker; all of its weights must be in the folder."""
+    """Load a class of transformers in a worker. Raises `InputError` if weights are missing."""
     model, found = network.from_pretrained(
         folder,
         local_files_only=True,
@@ -171,7 +171,7 @@ def load_network(network: Any, folder: Path, *, device: str, dtype: str) -> Any:
 
 
 def check_device(device: str) -> str:
-    """Return the name of a device of torch; raise `InputError` if this machine does not have it."""
+    """Return the name of a torch device. Raises `InputError` if this machine lacks it."""
     import torch
 
     if device == "auto":

@@ -1,4 +1,4 @@
-"""The worker's side of `worker`: load one network, then serve requests until the pipe closes."""
+"""Program of a worker process: load one network, then serve requests until the pipe closes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ import numpy as np
 from egosim_jax.types import InputError
 
 Run = Callable[[Mapping[str, np.ndarray], Mapping[str, Any]], tuple[Mapping[str, np.ndarray], Any]]
-"""Program of a network, which `load` returns: from arrays and options to arrays and JSON."""
+"""Network returned by `load`: maps arrays and options to arrays and a JSON value."""
 
 
 def main() -> None:
-    """Serve the parent of this process."""
+    """Serve the parent process."""
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what libraries print must not become a reply
+    os.dup2(2, 1)  # output of libraries must not become a reply
     requests = _requests()
     start = next(requests)
     folder = Path(start["folder"])
@@ -55,7 +55,7 @@ def _requests() -> Iterator[dict[str, Any]]:
         for line in sys.stdin.buffer:
             lines.put(line)
         shutil.rmtree(folder, ignore_errors=True)
-        os._exit(0)  # the parent is gone, and nobody waits for a result
+        os._exit(0)  # the parent is gone: a running network must not continue
 
     threading.Thread(target=read, daemon=True).start()
     yield json.loads(first)
@@ -64,7 +64,7 @@ def _requests() -> Iterator[dict[str, Any]]:
 
 
 def _guarded(replies: TextIO, work: Callable[[], tuple[Any, Any]]) -> Any:
-    """Reply with the value of some work, or with its failure; return its other result."""
+    """Run `work`, reply with its value or its failure, and return its result."""
     result, reply = None, {}
     try:
         result, reply["value"] = work()

@@ -1,12 +1,15 @@
-"""Perception of generated clips by networks: the pipeline `networks` of the closed loop.
+"""Pipeline `networks`: perception of generated clips by networks, in the closed loop.
 
-Cameras and hand joints are those that the generator was given. A segmenter finds what the state's
-names and the phrases given name, hands and arms too; a depth network's maps are aligned with the
-state where nothing has moved; objects are followed by features inside their masks. What is fused
-into the state is what changed: moved and new objects, the surfaces that they hid, and what the
-state did not know. Elsewhere depth is unknown, and the state stays as it was.
+Cameras and hand joints are the generator's inputs. The stages then run in this order:
 
-With the networks on the generator's GPU, leave memory to them: XLA_PYTHON_CLIENT_MEM_FRACTION.
+    Segment        segments hands, arms, and the objects named by the state and by phrases
+    EstimateDepth  aligns a depth network's maps with the state at static pixels
+    TrackMasks     follows objects by features inside their masks
+    keep_changes   keeps depth of moved and new objects, revealed surfaces, and unknown regions
+
+Elsewhere depth is unknown, and the state does not change.
+
+If the networks share the generator's GPU, reserve memory by XLA_PYTHON_CLIENT_MEM_FRACTION.
 """
 
 from __future__ import annotations
@@ -20,12 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Int32
 
 from egosim_jax.perception.classical import HandMasks, take_action
-from egosim_jax.perception.estimates import (
-    CameraEstimate,
-    DepthEstimator,
-    Segmenter,
-    Verdict,
-)
+from egosim_jax.perception.estimates import CameraEstimate, DepthEstimator, Segmenter, Verdict
 from egosim_jax.perception.networks.align_depth import DepthAlignment
 from egosim_jax.perception.networks.checkpoint import DType
 from egosim_jax.perception.networks.depth_anything import DepthAnything
@@ -46,7 +44,7 @@ from egosim_jax.state.filter import is_hand
 from egosim_jax.types import Action, Clip, InputError, SceneState, View, check_counts
 
 POINT_PX = 2
-"""Size of the points with which the state is rendered, in pixels."""
+"""Size of the state's rendered points, in pixels."""
 DEPTH_NETWORKS = {
     "depth-anything": DepthAnything,
     "depth-pro": DepthPro,
@@ -64,24 +62,24 @@ class Segment:
     """Stage that sets object ids, in the state's numbering, and the names of new objects."""
 
     segmenter: Segmenter
-    """Segmentation of what phrases name."""
+    """Segmentation of objects named by phrases."""
     phrases: tuple[str, ...] = ()
-    """Names of objects besides those of the state."""
+    """Names of objects that the state does not have."""
     hands: tuple[str, ...] = ("hand", "arm")
     """Phrases for hands and arms."""
     min_overlap: float = 0.25
-    """Least overlap (IoU), in the frame where it is largest, with the object of the state."""
+    """Minimum overlap (IoU) with an object of the state, in the best frame."""
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `object_ids` and `names`; where nothing is found, hands that were set before stay."""
+        """Set `object_ids` and `names`. Hands of an earlier stage stay where nothing is found."""
         cameras, hands = (so_far.require(name, "Segment") for name in ("cameras", "object_ids"))
         objects = [name for name in (*state.names.values(), *self.phrases) if not is_hand(name)]
         if not objects:
             raise InputError(
                 "The state has no names of objects: segmentation needs at least one phrase. Name "
-                "what may be moved, such as --phrases 'cup. book'. (--perception)"
+                "movable objects, such as --phrases 'cup. book'. (--perception)"
             )
         found, names = self.segmenter(clip.frames, (*dict.fromkeys(objects), *self.hands))
         view = render(state, cameras, point_px=POINT_PX)
@@ -99,9 +97,9 @@ class Segment:
         view: View,
         state: SceneState,
     ) -> dict[int, int]:
-        """Return the state's id of each found instance, the best pairs first; new ids for others.
+        """Return the state's id of each found instance, or a new id.
 
-        An object of the same name is preferred to one that overlaps as much.
+        Pairs are matched greedily, by overlap plus 1 for the same name.
         """
         known = np.unique(view.object_ids[view.object_ids > 0]).tolist()
         pairs = []
@@ -124,17 +122,17 @@ class Segment:
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateDepth:
-    """Stage that sets depth by a depth network, aligned with the state where nothing has moved."""
+    """Stage that sets depth by a depth network, aligned with the state at static pixels."""
 
     estimator: DepthEstimator
-    """Network that estimates depth."""
+    """Depth network."""
     alignment: DepthAlignment = field(default_factory=DepthAlignment)
     """Alignment of each frame with the state's rendering."""
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `depth_m`; infinite in frames whose depth does not agree with the state's."""
+        """Set `depth_m`; infinite in frames whose depth disagrees with the state's."""
         cameras, ids = (so_far.require(name, "EstimateDepth") for name in ("cameras", "object_ids"))
         estimate = CameraEstimate(
             cameras=cameras,
@@ -150,10 +148,10 @@ class EstimateDepth:
 
 
 def keep_changes(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
-    """Set depth to infinite where the state already has what is seen, and at hands and arms.
+    """Set depth to infinite where the state is already correct, and at hands and arms.
 
-    Kept are objects that moved or are new, the surfaces where a moved object was, and what the
-    state has no points for.
+    Depth is kept at moved and new objects, at surfaces where a moved object was, and where the
+    state has no points.
     """
     cameras, ids, depth, motions, interacted = (
         so_far.require(name, "keep_changes")
@@ -171,41 +169,41 @@ def keep_changes(clip: Clip, action: Action, state: SceneState, so_far: Observat
 @register("networks")
 @dataclass(frozen=True, kw_only=True)
 class NetworksConfig:
-    """Perception by networks: depth, segmentation and tracking, from local checkpoints."""
+    """Perception by networks for depth, segmentation and tracking, from local checkpoints."""
 
     depth: Literal["depth-anything", "depth-pro", "depth-anything-3"] = "depth-anything"
     """Depth network of the pipeline."""
     depth_folder: Path
-    """Folder of its checkpoint."""
+    """Folder of the depth network's checkpoint."""
     masks: Literal["grounded-sam2", "grounded-sam3", "grounded-edgetam", "sam3"] = "grounded-sam2"
-    """Segmentation: Grounding DINO with a tracker, or SAM 3 alone."""
+    """Segmentation by Grounding DINO with a tracker, or by SAM 3 alone."""
     masks_folder: Path
     """Folder of the checkpoint of SAM 2, SAM 3 or EdgeTAM."""
     detector_folder: Path | None = None
-    """Folder of Grounding DINO, if `masks` is grounded."""
+    """Folder of Grounding DINO, for grounded `masks`."""
     phrases: str = ""
-    """Names of objects besides those of the state, with full stops in between."""
+    """Names of objects that the state does not have, separated by full stops."""
     hand_phrases: str = "hand. arm."
-    """Phrases for hands and arms."""
+    """Phrases for hands and arms, separated by full stops."""
     device: str = "cpu"
-    """Device of the networks: cpu, cuda, cuda:N or auto; the generator may need all of a GPU."""
+    """Device of the networks: cpu, cuda, cuda:N or auto; the generator may fill a GPU."""
     dtype: DType = "float32"
     """Floating-point type of the networks."""
     timeout_s: float = 1800.0
-    """Longest time of a network for one clip in seconds."""
+    """Timeout of each network for one clip in seconds."""
     every: int = 16
-    """Objects are looked for in every so many frames, if `masks` is grounded."""
+    """Interval of frames between detections, for grounded `masks`."""
     threshold: float = 0.35
-    """Least score of a detection, if `masks` is grounded."""
+    """Minimum score of a detection, for grounded `masks`."""
     hands: HandMasks = field(default_factory=HandMasks)
-    """Drawing of hands and arms where segmentation finds nothing."""
+    """Drawing of hands and arms, used where segmentation finds nothing."""
     alignment: DepthAlignment = field(default_factory=DepthAlignment)
     """Alignment of depth with the state."""
     tracking: TrackMasks = field(default_factory=TrackMasks)
     """Tracking of objects inside their masks."""
 
     def __post_init__(self) -> None:
-        """Check the numbers, the phrases, and that the folders are those of the networks chosen."""
+        """Check the numbers and the phrases, and that each folder fits its network."""
         check_counts({"every": self.every})
         if not all(is_hand(phrase) for phrase in _split(self.hand_phrases)):
             raise InputError(
@@ -217,7 +215,7 @@ class NetworksConfig:
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
         """Return the pipeline; the ground truth is not used.
 
-        Raises `InputError` if a package of the workers is not installed.
+        Raises `InputError` if a worker's package is not installed.
         """
         depth, masks = self._networks()
         for network in (depth, masks):
@@ -252,11 +250,11 @@ class NetworksConfig:
 
 
 def _split(phrases: str) -> tuple[str, ...]:
-    """Return the phrases of a text that has full stops in between."""
+    """Return the phrases of a text, separated by full stops."""
     return tuple(filter(None, (" ".join(phrase.split()) for phrase in phrases.split("."))))
 
 
 def _largest_iou(a: Bool[np.ndarray, "f h w"], b: Bool[np.ndarray, "f h w"]) -> float:
-    """Return the largest intersection over union of two masks in one frame."""
+    """Return the maximum over frames of the intersection over union of two masks."""
     both, either = (a & b).sum(axis=(1, 2)), (a | b).sum(axis=(1, 2))
     return float((both / np.maximum(either, 1)).max())

@@ -1,4 +1,4 @@
-"""Depth Anything V2, metric: depth in meters from one image.
+"""Metric Depth Anything V2: depth in meters from one image.
 
 Checkpoints: depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf and -Outdoor-Small-hf
 (Apache-2.0), -Base-hf and -Large-hf (CC BY-NC 4.0). Source: Yang et al., Depth Anything V2, 2024.
@@ -31,15 +31,15 @@ class DepthAnything(Network):
 
     _: KW_ONLY
     batch: int = 4
-    """Images that the network sees at once."""
+    """Batch size of the network."""
 
     def __post_init__(self) -> None:
-        """Check the folder and the batch."""
+        """Check the folder and the batch size."""
         super().__post_init__()
         check_counts({"batch": self.batch})
 
     def check_config(self, config: Mapping[str, Any]) -> None:
-        """Raise `InputError` unless the checkpoint is a metric one of this network."""
+        """Raise `InputError` unless this is a metric checkpoint of Depth Anything V2."""
         super().check_config(config)
         kind = config.get("depth_estimation_type", "relative")
         if kind != "metric":
@@ -55,7 +55,7 @@ class DepthAnything(Network):
         estimate: CameraEstimate,
         wanted: Sequence[int],
     ) -> DepthEstimate:
-        """Return depth in meters of the wanted frames; the cameras are not used."""
+        """Return depth in meters of the wanted frames. The cameras are not used."""
         chosen = np.asarray(wanted, np.int32)
         found, _ = self.ask({"frames": frames[chosen]}, batch=self.batch)
         depth_m = found["depth_m"]

@@ -1,9 +1,9 @@
-"""Depth Anything 3: depth and cameras of many views at once, consistent with each other.
+"""Depth Anything 3: consistent depth and cameras of many views.
 
 Checkpoints: depth-anything/DA3-SMALL and DA3-BASE (Apache-2.0), DA3-LARGE, DA3-GIANT and
-DA3NESTED-GIANT-LARGE-1.1 (CC BY-NC 4.0), of which the last one is in meters. Its package demands
-an old NumPy and is installed without its dependencies: see docs/networks.md. Source: Lin et al.,
-Depth Anything 3, 2025.
+DA3NESTED-GIANT-LARGE-1.1 (CC BY-NC 4.0). Only the last one is metric. Its package requires an old
+NumPy, so it is installed without its dependencies (docs/networks.md). Source: Lin et al., Depth
+Anything 3, 2025.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from egosim_jax.perception.networks.child import Run
 from egosim_jax.types import Cameras, InputError, check_counts, is_rigid
 
 MIN_VIEWS = 2
-"""Fewest views from which the scale of given cameras is found."""
+"""Minimum number of views for alignment with given cameras."""
 
 
 @dataclass(frozen=True)
 class _DepthAnything3(Network):
-    """Common part of depth and cameras by Depth Anything 3."""
+    """Shared settings of depth and cameras by Depth Anything 3."""
 
     needs: ClassVar[str] = "Depth Anything 3 (depth-anything/DA3*)"
     packages: ClassVar[tuple[str, ...]] = ("torch", "torchvision", "depth_anything_3")
@@ -42,10 +42,10 @@ class _DepthAnything3(Network):
 
     _: KW_ONLY
     resolution_px: int = 504
-    """Longer side of the images that the network sees, in pixels."""
+    """Longer side of the network's input images in pixels."""
 
     def __post_init__(self) -> None:
-        """Check the folder, and that sizes are positive."""
+        """Check the folder, and that the size is positive."""
         super().__post_init__()
         check_counts({"resolution_px": self.resolution_px})
 
@@ -66,7 +66,7 @@ class DepthAnything3(_DepthAnything3):
 
     _: KW_ONLY
     context: int = 8
-    """Frames of the video that are seen besides the wanted ones, evenly spaced."""
+    """Number of evenly spaced frames that the network sees besides the wanted ones."""
 
     def __post_init__(self) -> None:
         """Check the folder, and that sizes and numbers are positive."""
@@ -82,8 +82,8 @@ class DepthAnything3(_DepthAnything3):
     ) -> DepthEstimate:
         """Return depth of the wanted frames, in the unit of the cameras if they move.
 
-        Without cameras, or with those of a single place, it is in the network's unit: meters if
-        the checkpoint is a metric one.
+        If the cameras are unknown or stay in place, depth is in the network's unit, which is the
+        meter for a metric checkpoint.
         """
         chosen = np.asarray(wanted, np.int32)
         context = np.linspace(0, len(frames) - 1, min(self.context, len(frames))).astype(int)
@@ -110,17 +110,17 @@ class DepthAnything3(_DepthAnything3):
 class DepthAnything3Cameras(_DepthAnything3):
     """Cameras by Depth Anything 3; a `CameraEstimator`.
 
-    The network always gives cameras. They are accepted if corners of the first frame, which are
-    followed through the video by optical flow, meet where these cameras see them.
+    The network always returns cameras. They are accepted if corners of the first frame, tracked
+    by optical flow, triangulate in them with a small reprojection error.
     """
 
     _: KW_ONLY
     max_views: int = 61
-    """Most frames that the network sees, evenly spaced; poses between them are interpolated."""
+    """Maximum number of input frames, evenly spaced; other poses are interpolated."""
     min_points: int = 50
-    """Fewest corners that must show parallax."""
+    """Minimum number of corners with parallax."""
     max_error_px: float = 2.0
-    """Largest median reprojection error of the corners in pixels."""
+    """Maximum median reprojection error of the corners in pixels."""
 
     def __post_init__(self) -> None:
         """Check the folder, and that sizes and numbers are positive."""
@@ -134,17 +134,17 @@ class DepthAnything3Cameras(_DepthAnything3):
         *,
         focal_px: float | None = None,
     ) -> CameraEstimate:
-        """Return cameras and points, in meters if the checkpoint is a metric one, or why not.
+        """Return cameras and points, in meters for a metric checkpoint, or a refusal.
 
-        The network estimates the focal length; `focal_px` is not used.
+        `focal_px` is not used: the network estimates the focal length.
         """
         count, height, width = frames.shape[:3]
         views = np.unique(np.linspace(0, count - 1, min(self.max_views, count)).astype(int))
         found, about = self.ask({"frames": frames[views]}, resolution_px=self.resolution_px)
         if "extrinsics" not in found:
             raise InputError(
-                f"{quote_path(self.folder)} gives depth alone: cameras need a checkpoint of many "
-                "views, such as DA3-BASE. (--cameras)"
+                f"{quote_path(self.folder)} gives depth alone: cameras need a multi-view "
+                "checkpoint. Use one such as DA3-BASE. (--cameras)"
             )
         poses = np.repeat(np.eye(4)[None], len(views), axis=0)
         poses[:, :3] = found["extrinsics"][:, :3]
@@ -178,7 +178,7 @@ def _refused(reason: str, figures: Mapping[str, float]) -> CameraEstimate:
 
 
 def _moves(estimate: CameraEstimate, views: np.ndarray) -> bool:
-    """Return whether the cameras of some views are at different places."""
+    """Return True if the cameras of some views are at different places."""
     if estimate.cameras is None or len(views) < MIN_VIEWS:
         return False
     centers = estimate.cameras.world_from_camera[views, :3, 3]
@@ -186,7 +186,7 @@ def _moves(estimate: CameraEstimate, views: np.ndarray) -> bool:
 
 
 def load(folder: str, device: str, dtype: str) -> Run:
-    """Load the network in a worker; its package chooses the precision."""
+    """Load the network in a worker. Its package chooses the precision."""
     import torch
     from torch.nn.functional import interpolate
 
@@ -204,13 +204,13 @@ def load(folder: str, device: str, dtype: str) -> Run:
         )
         maps = torch.from_numpy(np.asarray(found.depth, np.float32))[:, None]
         maps = interpolate(maps, size=size, mode="bilinear", align_corners=False)[:, 0]
-        given = {"depth": maps.numpy()}
+        reply = {"depth": maps.numpy()}
         if found.extrinsics is not None and found.intrinsics is not None:
-            intrinsics = np.array(found.intrinsics, float)  # of the images that the network saw
+            intrinsics = np.array(found.intrinsics, float)  # of the network's input images
             scale = np.array(size[::-1]) / np.asarray(found.depth).shape[:0:-1]
             intrinsics[:, :2] *= scale[:, None]
             intrinsics[:, :2, 2] += (scale - 1) / 2
-            given |= {"extrinsics": np.asarray(found.extrinsics, float), "intrinsics": intrinsics}
-        return given, {"metric": bool(found.is_metric)}
+            reply |= {"extrinsics": np.asarray(found.extrinsics, float), "intrinsics": intrinsics}
+        return reply, {"metric": bool(found.is_metric)}
 
     return run

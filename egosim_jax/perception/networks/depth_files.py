@@ -1,11 +1,11 @@
-"""Depth and cameras that another program wrote, as Depth Anything 3 in EgoSim's preparation does.
+"""Depth and cameras from files of another program, such as EgoSim's data preparation.
 
     depth_000000.npy ...        `h w`, depth along the z axis; 0, NaN or infinity where unknown
     intrinsics_000000.npy ...   `3 3`, in pixels of the depth map
     extrinsics_000000.npy ...   `3 4` or `4 4`, camera from world, in OpenCV axes
 
-Maps may be smaller than the video, as networks write them; they are resized, and the intrinsics
-with them. Source: the released `data_process` of EgoSim; see also Depth Anything 3's export.
+Maps may be smaller than the video; they are resized to it together with their intrinsics. Source:
+the released `data_process` of EgoSim, which runs Depth Anything 3; see also the latter's export.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdi
 from egosim_jax.types import Cameras, InputError
 
 MAX_VALUES = 1 << 25
-"""Largest array that is read, in values."""
+"""Maximum number of values in an array file."""
 
 
 @dataclass(frozen=True)
 class DepthFiles:
-    """Depth maps read from the files of another program; a `DepthEstimator`."""
+    """Depth maps from files of another program; a `DepthEstimator`."""
 
     folder: Path
     """Folder of depth_######.npy, and intrinsics_ and extrinsics_ if there are cameras."""
@@ -42,7 +42,7 @@ class DepthFiles:
         estimate: CameraEstimate,
         wanted: Sequence[int],
     ) -> DepthEstimate:
-        """Return the depth maps of the wanted frames, in the size of the video."""
+        """Return the depth maps of the wanted frames at the size of the video."""
         height, width = frames.shape[1:3]
         depth = np.stack([self._depth(frame, height, width) for frame in wanted])
         return DepthEstimate(
@@ -53,9 +53,9 @@ class DepthFiles:
         )
 
     def cameras(self, count: int, *, height: int, width: int) -> CameraEstimate:
-        """Return the cameras of the first `count` frames of a video of a size.
+        """Return the cameras of the first `count` frames, for a video of the given size.
 
-        The intrinsics are the mean of all frames'. Raises `InputError` if a file is missing, and
+        The intrinsics are the mean over all frames. Raises `InputError` if a file is missing, and
         if a pose is not a rigid transform.
         """
         poses, matrices = [], []
@@ -117,7 +117,7 @@ class DepthFiles:
 def _resize_intrinsics(
     matrix: Float[np.ndarray, "3 3"], size: tuple[int, ...], target: tuple[int, int]
 ) -> Float[np.ndarray, "3 3"]:
-    """Return intrinsics for an image of another size, pixel centers at integer coordinates."""
+    """Return intrinsics for another image size, with pixel centers at integer coordinates."""
     scale = np.array([target[1] / size[1], target[0] / size[0]])
     resized = matrix.copy()
     resized[:2] *= scale[:, None]

@@ -1,9 +1,9 @@
 """Depth Pro: sharp depth in meters and the focal length from one image.
 
 Checkpoint: apple/DepthPro-hf, under Apple's research license (non-commercial). The network
-estimates inverse depth for a focal length of one image width; a known focal length scales it to
-meters, else the field of view that the network estimates. Source: Bochkovskii et al., Depth Pro,
-2024, section 3.
+estimates inverse depth for a focal length of one image width. A known focal length scales it to
+meters, or else the network's own field of view. Source: Bochkovskii et al., Depth Pro, 2024,
+section 3.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from egosim_jax.perception.networks.pixels import PixelSettings, normalize, to_i
 from egosim_jax.types import InputError
 
 FIELD_OF_VIEW_DEG = (10.0, 150.0)
-"""Smallest and largest plausible horizontal field of view in degrees."""
+"""Minimum and maximum plausible horizontal field of view in degrees."""
 INVERSE_DEPTH = (1e-4, 1e4)
-"""Smallest and largest inverse depth in 1/m."""
+"""Minimum and maximum inverse depth in 1/m."""
 DEFAULT = PixelSettings(height=1536, width=1536, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 
 
 @dataclass(frozen=True)
 class DepthPro(Network):
-    """Depth in meters of single images, and the focal length, by Depth Pro; a `DepthEstimator`."""
+    """Depth in meters and focal length from single images by Depth Pro; a `DepthEstimator`."""
 
     needs: ClassVar[str] = "Depth Pro (apple/DepthPro-hf)"
     model_types: ClassVar[tuple[str, ...]] = ("depth_pro",)
@@ -41,8 +41,8 @@ class DepthPro(Network):
         super().check_config(config)
         if not config.get("use_fov_model"):
             raise InputError(
-                f"{self.folder} estimates no field of view (use_fov_model): {self.needs} must. "
-                "Use the checkpoint as released."
+                f"{self.folder} estimates no field of view (use_fov_model): {self.needs} must "
+                "estimate it. Use the checkpoint as released."
             )
 
     def __call__(
@@ -54,7 +54,7 @@ class DepthPro(Network):
     ) -> DepthEstimate:
         """Return depth in meters of the wanted frames, for the cameras' focal length if known.
 
-        Raises `InputError` if it is not known and the estimated one is implausible.
+        Raises `InputError` if it is unknown and the estimated one is implausible.
         """
         chosen = np.asarray(wanted, np.int32)
         inverse, fields_of_view_deg = self._estimate(frames[chosen])
@@ -73,7 +73,7 @@ class DepthPro(Network):
         )
 
     def focal_px(self, frames: UInt8[np.ndarray, "f h w 3"]) -> float:
-        """Return the focal length of a video in pixels: the median over its frames."""
+        """Return the focal length of a video in pixels, from the median over its frames."""
         return focal_of(self._estimate(frames)[1], frames.shape[2])
 
     def _estimate(

@@ -1,7 +1,7 @@
-"""Segmentation by two networks: Grounding DINO finds what phrases name, a tracker follows it.
+"""Segmentation by two networks: Grounding DINO detects named objects, and a tracker follows them.
 
-Detections are made in every so many frames. What no track covers yet becomes a new one, which is
-followed from there forwards and backwards, so that an object that appears late is found, too.
+The detector runs at a fixed interval of frames. A detection that no track covers starts a new
+track, which is followed forward and backward. So an object that appears late is also found.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from egosim_jax.state.filter import is_hand
 from egosim_jax.types import check_counts
 
 HAND_MARGIN = 0.25
-"""Border around the keypoints of a hand, as a fraction of their extent."""
+"""Border around a hand's keypoints, as a fraction of their extent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,44 +35,44 @@ class _Track:
     score: float
     mask: Bool[np.ndarray, "f h w"]
 
-    def covers(self, frame: int, found: Detection, least: float) -> bool:
-        """Return whether a detection in a frame is of this object, hand or not."""
+    def covers(self, frame: int, found: Detection, min_overlap: float) -> bool:
+        """Return True if a detection in a frame is this object; a hand never matches an object."""
         if is_hand(self.phrase) != is_hand(found.phrase) or not self.mask[frame].any():
             return False
         rows = np.flatnonzero(self.mask[frame].any(axis=1))
         columns = np.flatnonzero(self.mask[frame].any(axis=0))
         box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-        return box_iou(box, found.box_px) > least
+        return box_iou(box, found.box_px) > min_overlap
 
 
 @dataclass(frozen=True)
 class Grounded:
-    """Segmentation and tracking of what phrases name, by a detector and a tracker."""
+    """Segmentation and tracking of named objects by a detector and a tracker."""
 
     tracker_type: ClassVar[type[Tracker]]
 
     detector: Path
     """Folder of Grounding DINO."""
     segmenter: Path
-    """Folder of the tracker, which segments what it follows."""
+    """Folder of the tracker, which also segments."""
     _: KW_ONLY
     device: str = "auto"
     """Device of the workers: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     dtype: DType = "float32"
     """Floating-point type of the networks."""
     timeout_s: float = 1800.0
-    """Longest time of a network for one clip in seconds, with its loading."""
+    """Timeout of each network for one clip in seconds, including its loading."""
     every: int = 16
-    """Objects are looked for in every so many frames."""
+    """Interval of frames between detections."""
     threshold: float = 0.35
-    """Least score of a detection."""
+    """Minimum score of a detection."""
     same_overlap: float = 0.5
-    """A detection belongs to a track whose box it overlaps more than this (IoU)."""
+    """Overlap (IoU) above which a detection belongs to a track."""
 
     def __post_init__(self) -> None:
-        """Check both folders, and the number of frames."""
+        """Check both folders and the interval."""
         check_counts({"every": self.every})
-        self._networks  # noqa: B018 - made here, so that wrong folders are refused here
+        self._networks  # noqa: B018 - checks the folders
 
     @cached_property
     def _networks(self) -> tuple[GroundingDino, Tracker]:
@@ -83,12 +83,12 @@ class Grounded:
         )
 
     def check_installed(self) -> None:
-        """Raise `InputError` naming the packages of the workers that are not installed."""
+        """Raise `InputError` with the missing packages of the workers."""
         for network in self._networks:
             network.check_installed()
 
     def fingerprint(self) -> str:
-        """Return the hash of both networks and the parameters; the folders' paths are not in it."""
+        """Return the hash of both networks and the parameters, without the folders' paths."""
         parameters = (type(self).__name__, self.every, self.same_overlap)
         return fingerprint((parameters, *(n.fingerprint() for n in self._networks)))
 
@@ -98,10 +98,10 @@ class Grounded:
         phrases: Sequence[str],
         hands: HandTracks | None = None,
     ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
-        """Return instance ids and their names; those of phrases for hands and arms are negative.
+        """Return instance ids and their names; ids of hands and arms are negative.
 
-        Known hands are followed also where the detector finds none. Where tracks overlap, the one
-        of the larger score counts.
+        Known hands are followed even if the detector misses them. Where tracks overlap, the higher
+        score wins.
         """
         detector, tracker = self._networks
         keys = np.arange(0, len(frames), self.every)
@@ -120,7 +120,7 @@ class Grounded:
     def _new(
         self, found: Sequence[Detection], tracks: Sequence[_Track], frame: int
     ) -> list[Detection]:
-        """Return the detections in a frame that are of no track and of no better detection."""
+        """Return a frame's detections that belong to no track and no better detection."""
         new: list[Detection] = []
         for one in found:
             twice = any(
@@ -155,7 +155,7 @@ class GroundedEdgeTam(Grounded):
 
 
 def _hand_detections(hands: HandTracks, frame: int, size: tuple[int, ...]) -> Iterator[Detection]:
-    """Yield the known hands of a frame as detections, with a border around their keypoints."""
+    """Yield the known hands of a frame as detections."""
     height, width = size
     for joints, presence in zip(hands.joints_px[frame], hands.presence[frame], strict=True):
         if np.isfinite(joints).all():
@@ -170,7 +170,7 @@ def _hand_detections(hands: HandTracks, frame: int, size: tuple[int, ...]) -> It
 def _paint(
     tracks: Sequence[_Track], shape: tuple[int, ...]
 ) -> tuple[Int32[np.ndarray, "f h w"], dict[int, str]]:
-    """Return ids and names of tracks, the best on top; hands and arms count down from -1."""
+    """Return ids and names of tracks, the best on top; ids of hands and arms are negative."""
     ids, names = np.zeros(shape, np.int32), {}
     for track in sorted(tracks, key=lambda track: track.score):
         hands = sum(number < 0 for number in names)

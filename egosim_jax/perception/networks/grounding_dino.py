@@ -1,4 +1,4 @@
-"""Grounding DINO: boxes of what phrases name, in single images.
+"""Grounding DINO: boxes of objects named by phrases, in single images.
 
 Checkpoints: IDEA-Research/grounding-dino-tiny and -base (Apache-2.0). Source: Liu et al.,
 Grounding DINO, 2023.
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     import torch
 
 MAX_PHRASE = 80
-"""Longest phrase in characters."""
+"""Maximum length of a phrase in characters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Detection:
-    """An object that was found in one frame."""
+    """Detected object in one frame."""
 
     phrase: str
-    """Phrase that names it."""
+    """Phrase that names the object."""
     score: float
     """Confidence from 0 to 1."""
     box_px: tuple[float, float, float, float]
@@ -39,7 +39,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class GroundingDino(Network):
-    """Detector of what phrases name."""
+    """Detector of objects named by phrases."""
 
     needs: ClassVar[str] = "Grounding DINO (IDEA-Research/grounding-dino-tiny)"
     model_types: ClassVar[tuple[str, ...]] = ("grounding-dino",)
@@ -47,9 +47,9 @@ class GroundingDino(Network):
 
     _: KW_ONLY
     threshold: float = 0.35
-    """Least score of a detection."""
+    """Minimum score of a detection."""
     max_overlap: float = 0.7
-    """Largest overlap (IoU) of two detections of a phrase; the one of lower score is dropped."""
+    """Maximum overlap (IoU) of two detections of a phrase; the lower score is dropped."""
 
     def __call__(
         self, frames: UInt8[np.ndarray, "f h w 3"], phrases: Sequence[str]
@@ -79,16 +79,16 @@ class GroundingDino(Network):
 
 
 def clean_phrases(phrases: Sequence[str]) -> list[str]:
-    """Return phrases in lower case without full stops, each once.
+    """Return unique phrases in lower case without full stops.
 
-    Raises `InputError` if there is none, and for one that is too long.
+    Raises `InputError` without any phrase, and for a phrase that is too long.
     """
     clean = [" ".join(p.lower().replace(".", " ").split()) for p in phrases]
     found = list(dict.fromkeys(filter(None, clean)))
     if not found or max(map(len, found)) > MAX_PHRASE:
         raise InputError(
-            f"{len(found)} phrases, of up to {max(map(len, found), default=0)} characters: objects "
-            f"are found by at least one phrase of at most {MAX_PHRASE}. Name them. (--phrases)"
+            f"{len(found)} phrases, of up to {max(map(len, found), default=0)} characters: there "
+            f"must be at least one phrase, of at most {MAX_PHRASE}. Name the objects. (--phrases)"
         )
     return found
 
@@ -120,7 +120,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     tokenizer: Any = BertTokenizer.from_pretrained(folder, local_files_only=True)
     processor: Any = GroundingDinoProcessor(images, tokenizer)
     full_stop = tokenizer.convert_tokens_to_ids(".")
-    most = network.config.max_text_len
+    max_tokens = network.config.max_text_len
 
     def count(phrase: str) -> int:
         return len(tokenizer.tokenize(phrase))
@@ -128,7 +128,8 @@ def load(folder: str, device: str, dtype: str) -> Run:
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
         scores, boxes = [], []
         for frame in arrays["frames"]:
-            parts = [_detect(frame, group) for group in groups(options["phrases"], count, most)]
+            texts = groups(options["phrases"], count, max_tokens)
+            parts = [_detect(frame, group) for group in texts]
             filled = np.zeros((sum(len(s) for s, _ in parts), len(options["phrases"])))
             row = column = 0
             for found, _ in parts:
@@ -156,15 +157,15 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
 
 def groups(
-    phrases: Sequence[str], count: Callable[[str], int], most: int
+    phrases: Sequence[str], count: Callable[[str], int], max_tokens: int
 ) -> Iterator[Sequence[str]]:
-    """Yield the phrases in groups, each of which makes a text of at most so many tokens.
+    """Yield the phrases in groups whose texts have at most `max_tokens` tokens.
 
-    A text has a full stop after each phrase, one token before and one behind all of them.
+    A text has one token at its start, a full stop after each phrase, and one token at its end.
     """
     group: list[str] = []
     for phrase in phrases:
-        if group and 2 + sum(count(p) + 1 for p in (*group, phrase)) > most:
+        if group and 2 + sum(count(p) + 1 for p in (*group, phrase)) > max_tokens:
             yield group
             group = []
         group.append(phrase)
@@ -174,10 +175,10 @@ def groups(
 def phrase_scores(
     tokens: torch.Tensor, text: torch.Tensor, full_stop: int
 ) -> Float[torch.Tensor, "q p"]:
-    """Return the score of each phrase for each query: the largest of the phrase's tokens.
+    """Return the score of each phrase for each query: the maximum over the phrase's tokens.
 
-    `tokens` has the scores `q t` of the tokens of a text, in which each phrase ends with a full
-    stop, after one token that starts the text.
+    `tokens` has the scores `q t` of a text's tokens. The text starts with one special token, and
+    each phrase ends with a full stop.
     """
     import torch
 

@@ -1,10 +1,10 @@
-"""Motion of objects whose masks are known, from features that are followed inside the masks.
+"""Motion of objects with known masks, from features tracked inside the masks.
 
-The first frame shows the object where the state has it, so that each feature has a point in 3D.
-Features are followed by optical flow, forwards and back again (Lucas and Kanade, 1981). The pose of
-each frame is the one that projects their points there and puts them at the depth that is known:
-least squares from the pose before, without outliers. New features replace lost ones; their points
-are those of the object in its pose of that frame. The last pose is refined by `pose_refinement`.
+The object's pose in the first frame is the state's, so each feature has a 3D point. Features are
+tracked by optical flow with a forward-backward check (Lucas and Kanade, 1981). Robust least squares
+from the previous pose fits each frame's pose to the features' pixels and known depths. New features
+replace lost ones; their 3D points come from the object in its pose of that frame. `pose_refinement`
+refines the last pose.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from egosim_jax.rendering.reference import splat
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
 ROUNDS = 8
-"""Steps in which a pose is fitted and outliers are found."""
+"""Number of Gauss-Newton steps; each one updates the outliers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackMasks:
-    """Stage that sets the motions of objects of the state and their supporting planes."""
+    """Stage that sets the motions and supporting planes of the state's objects."""
 
     min_motion_px: float = 2.0
-    """An object has moved if its points move by more than this in the image, as a median."""
+    """Minimum median motion of a moved object's points in the image, in pixels."""
     min_features: int = 8
-    """Fewest features that determine a pose; with fewer, the last pose is kept."""
+    """Minimum number of features for a pose; with fewer, the last pose is kept."""
     max_features: int = 200
-    """Most features of an object."""
+    """Maximum number of features of an object."""
     refill_frames: int = 4
-    """New features are looked for after so many frames."""
+    """Interval in frames at which new features are added."""
     max_error_px: float = 1.5
-    """Largest reprojection error of a feature, and of its flow forwards and back, in pixels."""
+    """Maximum reprojection error and forward-backward error of a feature, in pixels."""
     depth_error: float = 0.02
-    """Error of depth, as a fraction of it, that counts as much as a pixel."""
+    """Relative depth error with the same cost as one pixel."""
     point_px: int = 2
-    """Size of the points with which the object is drawn, in pixels."""
+    """Size of the object's rendered points, in pixels."""
     model: TrackObjects = field(default_factory=partial(TrackObjects, refinement=Refinement()))
     """Supporting planes, comparison of colors, and refinement of the last pose."""
 
     def __post_init__(self) -> None:
-        """Check that the numbers and the error of depth are positive."""
+        """Check that the numbers and the depth error are positive."""
         names = ("min_features", "max_features", "refill_frames", "point_px")
         check_counts({name: getattr(self, name) for name in names})
         if not self.depth_error > 0:
@@ -58,7 +58,7 @@ class TrackMasks:
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `motions` and `support_planes` of the objects that moved."""
+        """Set `motions` and `support_planes` of moved objects."""
         cameras, ids, depth = (
             so_far.require(name, "TrackMasks") for name in ("cameras", "object_ids", "depth_m")
         )
@@ -83,7 +83,7 @@ class TrackMasks:
         depth_m: Float32[np.ndarray, "f h w"],
         cameras: Cameras,
     ) -> Float[np.ndarray, "f 4 4"]:
-        """Return the motion of an object's points, frame by frame, relative to the first frame.
+        """Return the motion of an object in each frame, relative to the first frame.
 
         Depth that is not finite is unknown.
         """
@@ -119,14 +119,14 @@ class TrackMasks:
         frame: int,
         old: Float32[np.ndarray, "k 2"],
     ) -> tuple[Float32[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
-        """Return new features of a frame: pixels, and points of the object at rest."""
+        """Return new features of a frame: pixels, and points of the object in its first pose."""
         import cv2
 
         here = replace(cameras, world_from_camera=cameras.world_from_camera[[frame]])
         local = cameras_in_object_frame(here, path[[frame]])
         depth, index = splat(points_m, local, point_px=self.point_px)
         free = (mask[frame] & (index[0] >= 0)).astype(np.uint8)
-        free = cv2.erode(free, np.ones((3, 3), np.uint8))  # not of its outline
+        free = cv2.erode(free, np.ones((3, 3), np.uint8))  # the outline moves with the background
         for column, row in np.rint(old).astype(int).tolist():
             cv2.circle(free, (column, row), 2, 0, -1)
         found = cv2.goodFeaturesToTrack(
@@ -137,7 +137,7 @@ class TrackMasks:
         pixels = found[:, 0]
         column, row = np.rint(pixels).astype(int).T
         lens = cameras.intrinsics_px
-        rays = (pixels - lens[:2, 2]) / np.diag(lens)[:2]  # of the feature, not of its pixel
+        rays = (pixels - lens[:2, 2]) / np.diag(lens)[:2]  # subpixel, unlike the looked-up depth
         seen = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
         seen *= depth[0, row, column][:, None]
         return pixels, transform(local.world_from_camera[0], seen)
@@ -150,16 +150,16 @@ class TrackMasks:
         guess: Float[np.ndarray, "4 4"],
         lens: Float[np.ndarray, "3 3"],
     ) -> tuple[Float[np.ndarray, "4 4"] | None, Bool[np.ndarray, " k"]]:
-        """Return the pose `camera from object at rest` and its inliers; None if there are few.
+        """Return the pose (camera from the first pose) and its inliers; None with few inliers.
 
-        Gauss-Newton from the last pose: a flat object has a second pose that explains its image
-        almost as well. Outliers are those farther than the median and than `max_error_px`.
+        Gauss-Newton starts at the last pose, because a flat object has a second pose with almost
+        the same image. An outlier's error is above both the median and `max_error_px`.
         """
-        least = max(self.min_features, 4)
+        min_inliers = max(self.min_features, 4)
         pose, inliers = guess, np.ones(len(pixels), bool)
         gaps = np.zeros(len(pixels))
         for _ in range(ROUNDS):
-            if inliers.sum() < least:
+            if inliers.sum() < min_inliers:
                 return None, inliers
             local = transform(pose, places_m)
             errors, slopes = _residuals(local, pixels, depth_m, self.depth_error, lens)
@@ -172,7 +172,7 @@ class TrackMasks:
             gaps = np.linalg.norm(errors[:, :2], axis=1)
             inliers = (gaps <= max(self.max_error_px, float(np.median(gaps)))) & (local[:, 2] > 0)
         inliers &= gaps <= self.max_error_px
-        return (pose, inliers) if inliers.sum() >= least else (None, inliers)
+        return (pose, inliers) if inliers.sum() >= min_inliers else (None, inliers)
 
     def _refine(
         self,
@@ -184,7 +184,7 @@ class TrackMasks:
         state: SceneState,
         ids: Int32[np.ndarray, "f h w"],
     ) -> Float[np.ndarray, "f 4 4"]:
-        """Return the path with its end refined, if the last poses can be compared."""
+        """Return the path with a refined last pose, if the last frames can be compared."""
         first, last = (int(f) for f in np.flatnonzero(moving)[[0, -1]])
         grasped = max(0, first - 1)
         motion = ObjectMotion(
@@ -204,10 +204,10 @@ def _residuals(
     depth_error: float,
     lens: Float[np.ndarray, "3 3"],
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 6"]]:
-    """Return errors of column, row and depth, in pixels, and their slopes.
+    """Return the errors of column, row and depth in pixels, and their Jacobian.
 
-    The slopes are those along a small rotation, as a vector, and a translation in camera axes.
-    Unknown depth has no error.
+    The Jacobian's columns are a small rotation vector and a translation in camera axes. The error
+    of an unknown depth is 0.
     """
     x, y = local_m[:, 0], local_m[:, 1]
     z = np.maximum(local_m[:, 2], 1e-3)
@@ -258,7 +258,7 @@ def flow(
     pixels: Float32[np.ndarray, "k 2"],
     max_error_px: float,
 ) -> tuple[Float32[np.ndarray, "k 2"], Bool[np.ndarray, " k"]]:
-    """Return where pixels are in the next frame, and which come back when followed backwards."""
+    """Return the places of pixels in the next frame, and True where backward flow agrees."""
     import cv2
 
     if not len(pixels):
@@ -285,17 +285,17 @@ def _moving_frames(
     points_m: Float[np.ndarray, "n 3"],
     path: Float[np.ndarray, "f 4 4"],
     cameras: Cameras,
-    least_px: float,
+    min_motion_px: float,
 ) -> Bool[np.ndarray, " f"]:
-    """Return the frames up to the last in which an object is not yet at its end, if it moved.
+    """Return True for frames with an object between its first and last place in the image.
 
-    None if it ends where it began, in the image.
+    All False if it ends where it began.
     """
     some = points_m[:: max(1, len(points_m) // 200)]
     ends = np.stack([np.eye(4), path[-1]])
     last = invert(cameras.world_from_camera[-1])
     begin, end = (_pixels(transform(last @ pose, some), cameras) for pose in ends)
-    if not np.median(np.linalg.norm(end - begin, axis=1)) > least_px:
+    if not np.median(np.linalg.norm(end - begin, axis=1)) > min_motion_px:
         return np.zeros(len(path), bool)
     gaps = []
     for pose in path:

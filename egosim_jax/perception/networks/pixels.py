@@ -1,7 +1,6 @@
-"""Preprocessing of frames for networks whose image processors need torchvision, without it.
+"""Preprocessing of frames without torchvision, which some networks' image processors need.
 
-All functions run in a worker. The sizes and statistics are those that the checkpoint's own
-processor files give.
+All functions run in a worker. Sizes and statistics come from the checkpoint's processor files.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     import torch
 
 MAX_SIZE = 4096
-"""Largest side of a network's input in pixels."""
+"""Maximum side of a network's input in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +33,10 @@ class PixelSettings:
 
     @classmethod
     def read(cls, folder: Path, default: PixelSettings) -> PixelSettings:
-        """Return the settings of a checkpoint's processor files; the default for what none gives.
+        """Return the settings in a checkpoint's processor files, with defaults for missing ones.
 
-        Read are the entry of video_preprocessor_config.json, of preprocessor_config.json, or of
-        processor_config.json, in this order.
+        video_preprocessor_config.json overrides preprocessor_config.json, which overrides
+        processor_config.json.
         """
         found: dict[str, Any] = {}
         for name in ("processor_config", "preprocessor_config", "video_preprocessor_config"):
@@ -64,20 +63,20 @@ class PixelSettings:
 
 
 def normalize(images: torch.Tensor, mean: Sequence[float], std: Sequence[float]) -> torch.Tensor:
-    """Return images `n 3 h w` of 8-bit levels, shifted and scaled to a network's statistics."""
+    """Return images `n 3 h w` in 8-bit levels, normalized to a network's statistics."""
     shift = images.new_tensor(mean)[:, None, None]
     return (images / 255 - shift) / images.new_tensor(std)[:, None, None]
 
 
 def to_images(frames: np.ndarray, device: str) -> torch.Tensor:
-    """Return frames `n h w 3` of a video as floating-point images `n 3 h w` of 8-bit levels."""
+    """Return video frames `n h w 3` as floating-point images `n 3 h w` in 8-bit levels."""
     import torch
 
     return torch.from_numpy(np.ascontiguousarray(frames)).to(device).movedim(-1, 1).float()
 
 
 def resize_levels(images: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Return images of 8-bit levels resized as image libraries do: smoothed, and rounded again."""
+    """Return resized images in 8-bit levels, antialiased and rounded as by image libraries."""
     from torch.nn.functional import interpolate
 
     resized = interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)

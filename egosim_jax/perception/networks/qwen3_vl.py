@@ -1,7 +1,7 @@
-"""Qwen3-VL: a caption of a video, and the names of the objects that the wearer moves.
+"""Qwen3-VL: caption of a video, and names of the objects that the wearer moves.
 
-Checkpoints: Qwen/Qwen3-VL-2B-Instruct, -4B- and -8B- (Apache-2.0). Key frames are shown as images,
-because the processor of videos needs torchvision. Source: Qwen team, Qwen3-VL technical report,
+Checkpoints: Qwen/Qwen3-VL-2B-Instruct, -4B- and -8B- (Apache-2.0). The input is key frames as
+images, because the video processor needs torchvision. Source: Qwen team, Qwen3-VL technical report,
 2025.
 """
 
@@ -24,9 +24,9 @@ from egosim_jax.state.filter import is_hand
 from egosim_jax.types import InputError, check_counts
 
 MAX_CAPTION = 600
-"""Longest caption in characters."""
+"""Maximum length of a caption in characters."""
 MAX_NAMES, MAX_NAME = 12, 40
-"""Most names of objects, and the longest one in characters."""
+"""Maximum number of object names, and maximum length of a name in characters."""
 PROMPT = (
     "These are {count} frames, in order, of a video that a person recorded with a camera on the "
     "head. Describe in one or two sentences what the hands do, with which objects, and where. Then "
@@ -35,7 +35,7 @@ PROMPT = (
 )
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
 TURN = "<|im_start|>user\n{content}<|im_end|>\n<|im_start|>assistant\n"
-"""Chat template of the instruction-tuned checkpoints, for one turn of the user."""
+"""Chat template of the instruction-tuned checkpoints for one user turn."""
 PAD = "<|image_pad|>"
 ARTICLE = re.compile(r"^(a|an|the|some)\s+")
 
@@ -50,9 +50,9 @@ class Qwen3VL(Network):
 
     _: KW_ONLY
     images: int = 8
-    """Frames that are shown, evenly spaced."""
+    """Number of input frames, evenly spaced."""
     max_new_tokens: int = 256
-    """Longest reply in tokens."""
+    """Maximum length of a reply in tokens."""
     prompt: str = PROMPT
     """Question; {count} is the number of frames."""
 
@@ -69,7 +69,7 @@ class Qwen3VL(Network):
         return parse_reply(self.reply(frames))
 
     def reply(self, frames: UInt8[np.ndarray, "f h w 3"]) -> str:
-        """Return the network's reply to the question about a video, as it is."""
+        """Return the network's raw reply to the question about a video."""
         count = min(self.images, len(frames))
         chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
         try:
@@ -86,9 +86,9 @@ class Qwen3VL(Network):
 
 
 def parse_reply(text: str) -> tuple[str, tuple[str, ...]]:
-    """Return the caption and the names of objects in a reply, both bounded and on one line each.
+    """Return the caption and the object names in a reply, bounded and each on one line.
 
-    Names are in lower case without articles, each once, and none is of hands. Raises
+    Names are unique, in lower case and without articles. Names of hands are dropped. Raises
     `NetworkError` if the reply has no caption.
     """
     found = _json_object(text)
@@ -106,7 +106,7 @@ def parse_reply(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _json_object(text: str) -> dict[str, Any]:
-    """Return the first JSON object in a text that has a caption; empty if there is none."""
+    """Return the first JSON object with a caption in a text, or an empty one."""
     decoder = json.JSONDecoder()
     for start in (match.start() for match in re.finditer(r"\{", text)):
         try:
@@ -119,7 +119,7 @@ def _json_object(text: str) -> dict[str, Any]:
 
 
 def _one_line(text: str, limit: int) -> str:
-    """Return text on one line without unprintable characters, cut at a word within a limit."""
+    """Return text on one line, without unprintable characters, cut between words at a limit."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return line if len(line) <= limit else line[:limit].rpartition(" ")[0] or line[:limit]
 
@@ -166,7 +166,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
 
 def chat(question: str, image_tokens: Sequence[int]) -> str:
-    """Return the text of one turn: images, each of so many tokens, and a question about them."""
+    """Return the text of one turn: images with their numbers of tokens, and a question."""
     shown = "".join(IMAGE.replace(PAD, count * PAD) for count in image_tokens)
-    clean = question.replace("<|", "< |")  # a question does not end its turn
+    clean = question.replace("<|", "< |")  # a question must not end its turn
     return TURN.format(content=shown + clean)

@@ -1,8 +1,8 @@
-"""SAM 3: masks of all that phrases name, followed through a video, by one network.
+"""SAM 3: segmentation and tracking of all objects named by phrases, by one network.
 
 Checkpoint: facebook/sam3 (SAM license; access on request). Its processor needs torchvision, and
-its suppression of duplicates a compiled kernel from a hub; both are done here. Source: Carion et
-al., SAM 3: Segment Anything with Concepts, 2025.
+its non-maximum suppression needs a compiled kernel from a hub; this module replaces both. Source:
+Carion et al., SAM 3: Segment Anything with Concepts, 2025.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     import torch
 
 MAX_TOKENS = 32
-"""Length of a phrase in tokens, as the network was trained."""
+"""Length of a phrase in tokens, as in the network's training."""
 
 
 @dataclass(frozen=True)
 class Sam3(Network):
-    """Segmentation and tracking of what phrases name by SAM 3; a `Segmenter`."""
+    """Segmentation and tracking of named objects by SAM 3; a `Segmenter`."""
 
     needs: ClassVar[str] = "SAM 3 (facebook/sam3)"
     model_types: ClassVar[tuple[str, ...]] = ("sam3_video",)
@@ -44,9 +44,9 @@ class Sam3(Network):
         phrases: Sequence[str],
         hands: HandTracks | None = None,
     ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
-        """Return instance ids and their names; those of phrases for hands and arms are negative.
+        """Return instance ids and their names; ids of hands and arms are negative.
 
-        Known hands are not used: the network takes phrases.
+        Known hands are not used, because the network's prompts are phrases.
         """
         phrases = clean_phrases(phrases)
         found, instances = self.ask({"frames": frames}, phrases=phrases)
@@ -98,17 +98,16 @@ def load(folder: str, device: str, dtype: str) -> Run:
                     label = numbers.setdefault(found, len(numbers) + 1)
                     labels[output.frame_idx][mask] = label
                 for found, prompt in session.obj_id_to_prompt_id.items():
-                    phrase_of[found] = session.prompts[prompt]  # forgotten once it is removed
+                    phrase_of[found] = session.prompts[prompt]  # before it forgets the object
         return {"labels": labels}, [phrase_of[number] for number in numbers]
 
     return run
 
 
 def visible_masks(output: Any, session: Any, size: tuple[int, int]) -> list[tuple[int, np.ndarray]]:
-    """Return the objects of a frame and their masks `h w`, those that cover others last.
+    """Return the objects of a frame and their masks `h w`, in ascending order of tracker score.
 
-    Objects that the network suppressed are left away; where masks overlap, the one with the larger
-    score of the tracker counts.
+    Where masks overlap, the last one wins. Objects that the network suppressed are omitted.
     """
     from torch.nn.functional import interpolate
 
@@ -125,13 +124,13 @@ def visible_masks(output: Any, session: Any, size: tuple[int, int]) -> list[tupl
 
 
 class MaskTools:
-    """The two functions of the kernel that SAM 3's postprocessing looks for, on the CPU."""
+    """CPU version of the two kernel functions that SAM 3's postprocessing calls."""
 
     @staticmethod
     def generic_nms(
         ious: torch.Tensor, scores: torch.Tensor, threshold: float, *, use_iou_matrix: bool
     ) -> torch.Tensor:
-        """Return the indices of the detections that none of a larger score overlaps too much."""
+        """Return the indices of detections without too much overlap with a higher score."""
         import torch
 
         kept: list[int] = []

@@ -1,4 +1,4 @@
-"""Tracking of objects through a video from boxes in one frame, by networks of the SAM family.
+"""Tracking of objects through a video, from boxes in one frame, by the SAM family.
 
 Checkpoints: yonigozlan/EdgeTAM-hf and facebook/sam2.1-hiera-tiny to -large (Apache-2.0),
 facebook/sam3 (SAM license; access on request). Sources: Zhou et al., EdgeTAM, 2025; Ravi et al.,
@@ -20,19 +20,14 @@ from jaxtyping import Int32, UInt8
 
 from egosim_jax.perception.networks.checkpoint import CONFIG, Network, check_device, load_network
 from egosim_jax.perception.networks.child import Run
-from egosim_jax.perception.networks.pixels import (
-    PixelSettings,
-    normalize,
-    resize_levels,
-    to_images,
-)
+from egosim_jax.perception.networks.pixels import PixelSettings, normalize, resize_levels, to_images
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     import torch
 
 BOX_LABELS = (2, 3)
-"""Labels of a box's first and last corner among point prompts."""
+"""Point prompt labels of a box's first and last corner."""
 SAM2_PIXELS = PixelSettings(
     height=1024, width=1024, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
 )
@@ -48,10 +43,10 @@ class Tracker(Network):
     def __call__(
         self, frames: UInt8[np.ndarray, "f h w 3"], frame: int, boxes_px: Sequence[Box]
     ) -> Int32[np.ndarray, "f h w"]:
-        """Return the number of the box, from 1, whose object each pixel shows; 0 for none.
+        """Return the box number (from 1) of each pixel's object; 0 for no object.
 
-        The boxes are those of objects in one frame, from which they are followed forwards and
-        backwards.
+        The boxes contain the objects in one frame. The objects are tracked forward and backward
+        from there.
         """
         found, _ = self.ask(
             {"frames": frames, "boxes_px": np.asarray(boxes_px, np.float32)}, frame=frame
@@ -67,7 +62,7 @@ class EdgeTam(Tracker):
     model_types: ClassVar[tuple[str, ...]] = ("edgetam_video",)
 
     def check_installed(self) -> None:
-        """Raise `InputError` naming missing packages: RepViT, its image encoder, is in timm."""
+        """Raise `InputError` with missing packages; its image encoder RepViT needs timm."""
         super().check_installed()
         vision = self._read_config().get("vision_config") or {}
         encoder = (vision.get("backbone_config") or {}).get("model_type")
@@ -88,14 +83,14 @@ class Sam2Tracker(Tracker):
 
 @dataclass(frozen=True)
 class Sam3Tracker(Tracker):
-    """Tracker of SAM 3, from the checkpoint that also finds objects by text."""
+    """SAM 3's tracker, from the checkpoint that also detects objects by text."""
 
     needs: ClassVar[str] = "SAM 3 (facebook/sam3)"
     model_types: ClassVar[tuple[str, ...]] = ("sam3_video", "sam3_tracker_video")
 
 
 def load(folder: str, device: str, dtype: str) -> Run:
-    """Load the network that the folder holds in a worker."""
+    """Load the folder's network in a worker."""
     import torch
     import transformers
 
@@ -139,17 +134,17 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
 
 def _propagate(network: Any, session: Any, start: int) -> Iterator[Any]:
-    """Yield the outputs of all frames, from a start forwards and then backwards."""
+    """Yield the outputs of all frames: forward from a start frame, then backward."""
     yield from network.propagate_in_video_iterator(session, start_frame_idx=start)
     if start > 0:
         yield from network.propagate_in_video_iterator(session, start_frame_idx=start, reverse=True)
 
 
 class PreparedFrames:
-    """Frames of a video as a network's inputs, each prepared when it is asked for."""
+    """Frames of a video as a network's inputs, each prepared on access."""
 
     def __init__(self, frames: np.ndarray, pixels: PixelSettings, dtype: torch.dtype):
-        """Remember the frames `f h w 3`, and the size, statistics and type to prepare them to."""
+        """Store the frames `f h w 3`, and the size, statistics and type of the inputs."""
         self._frames, self._pixels, self._dtype = frames, pixels, dtype
 
     def __len__(self) -> int:
@@ -163,7 +158,7 @@ class PreparedFrames:
 
 
 def to_labels(logits: torch.Tensor, size: tuple[int, int]) -> np.ndarray:
-    """Return the number, from 1, of the mask `n h w` of largest positive logit at each pixel."""
+    """Return the number (from 1) of the mask with the largest positive logit at each pixel."""
     from torch.nn.functional import interpolate
 
     resized = interpolate(logits[:, None].float(), size=size, mode="bilinear", align_corners=False)[

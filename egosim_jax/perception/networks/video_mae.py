@@ -1,9 +1,9 @@
-"""VideoMAE: features of videos, for a Fréchet video distance.
+"""VideoMAE: features of videos for a Fréchet video distance (FVD).
 
-The I3D network of the original FVD is distributed as TorchScript, a program, which is not run here.
-Checkpoints: MCG-NJU/videomae-base-finetuned-kinetics and -large-finetuned-kinetics (CC BY-NC 4.0),
-of which the encoder is used. Distances of different networks cannot be compared. Source: Tong et
-al., VideoMAE, 2022; Ge et al., On the Content Bias in Fréchet Video Distance, 2024.
+The original FVD uses I3D, which is distributed as TorchScript; this package runs no downloaded
+programs. Checkpoints: MCG-NJU/videomae-base-finetuned-kinetics and -large-finetuned-kinetics (CC
+BY-NC 4.0); only the encoder is used. Distances from different networks are not comparable. Source:
+Tong et al., VideoMAE, 2022; Ge et al., On the Content Bias in Fréchet Video Distance, 2024.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from egosim_jax.perception.networks.child import Run
 from egosim_jax.perception.networks.pixels import normalize, resize_levels, to_images
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Statistics of ImageNet's colors, for checkpoints without a processor file."""
+"""Mean and standard deviation of ImageNet, for checkpoints without a processor file."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class VideoMae(Network):
     model_types: ClassVar[tuple[str, ...]] = ("videomae",)
 
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Float32[np.ndarray, " d"]:
-        """Return the mean feature of a video's tubes, at evenly spaced frames."""
+        """Return the mean feature of the tubes of evenly spaced frames."""
         found, _ = self.ask({"frames": frames})
         return found["features"]
 
@@ -62,7 +62,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
 
 def _statistics(folder: Path) -> tuple[Sequence[float], Sequence[float]]:
-    """Return mean and deviation of the colors on which a checkpoint was trained."""
+    """Return the mean and standard deviation of a checkpoint's training colors."""
     path = folder / "preprocessor_config.json"
     found = read_json(path) if path.is_file() else {}
     return found.get("image_mean") or MEAN, found.get("image_std") or STD

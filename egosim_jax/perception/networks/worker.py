@@ -1,9 +1,9 @@
-"""Worker processes: a network runs in a process that the caller starts, feeds and ends.
+"""Worker processes that run networks: started, fed and ended by the calling process.
 
-The generating process never imports torch, so that neither its memory nor its libraries meet those
-of jax. Requests and replies are lines of JSON over pipes; arrays travel as npz files in a private
-temporary folder, without pickle. A worker starts with its first request, keeps its network loaded
-between requests, and ends when its pipe closes: with its parent, however that ends.
+The calling process never imports torch, whose memory and libraries would conflict with jax.
+Requests and replies are lines of JSON over pipes. Arrays are npz files without pickle in a private
+temporary folder. A worker starts at its first request and keeps its network loaded. It ends when
+its pipe closes, and so also when its parent is killed.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ import numpy as np
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.types import InputError
 
-TAIL_LINES, TAIL_BYTES = 12, 4096
-"""Most lines and bytes of a worker's error output that a message shows."""
+MAX_TAIL_LINES, MAX_TAIL_BYTES = 12, 4096
+"""Maximum lines and bytes of a worker's error output in a message."""
 MAX_REPLY_BYTES = 1 << 20
-"""Largest reply in bytes, without its arrays."""
+"""Maximum size of a reply in bytes, without its arrays."""
 ENVIRONMENT = {
     "HF_HUB_OFFLINE": "1",
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",
     "TRANSFORMERS_VERBOSITY": "error",
     "TOKENIZERS_PARALLELISM": "false",
 }
-"""Variables of a worker: nothing is downloaded, neither weights nor code."""
+"""Environment variables of a worker: it downloads neither weights nor code."""
 
 Arrays = Mapping[str, np.ndarray]
 
 
 class NetworkError(CommandExit):
-    """Failure of a worker process: it died, took too long, or its network failed."""
+    """Failure of a worker process: it died or timed out, or its network failed."""
 
     def __init__(self, message: str):
         super().__init__(message, ExitCode.FAILED)
 
 
 class Worker:
-    """One child process that runs the program of one network."""
+    """One child process that runs one network."""
 
     def __init__(self, module: str, settings: Mapping[str, Any]):
-        """Remember what to run: the function `load` of a module, called with the settings."""
+        """Store the module whose function `load` the child calls with the settings."""
         self._module, self._settings = module, dict(settings)
         self._lock = threading.Lock()
         self._child: _Child | None = None
@@ -64,20 +64,21 @@ class Worker:
     ) -> tuple[dict[str, np.ndarray], Any]:
         """Return the arrays and the JSON value of a network's reply; start the worker if needed.
 
-        Raises `InputError` for what the worker refuses, and `NetworkError` if it dies, fails or
-        takes longer than `timeout_s`, loading included; the next call starts a new one.
+        Raises `InputError` if the worker refuses the request. Raises `NetworkError` if it dies,
+        fails, or takes longer than `timeout_s`, loading included; the next call then starts a new
+        worker.
         """
         with self._lock:
             deadline = time.monotonic() + timeout_s
             try:
                 child = self._running(deadline)
-                given: dict[str, Any] = dict(arrays)
-                np.savez(child.folder / "request.npz", **given)
+                request: dict[str, Any] = dict(arrays)
+                np.savez(child.folder / "request.npz", **request)
                 value = child.exchange({"options": dict(options)}, deadline)
                 with np.load(child.folder / "reply.npz", allow_pickle=False) as found:
                     return {name: found[name] for name in found.files}, value
             except InputError:
-                raise  # refused, and ready for the next request
+                raise  # the worker is ready for the next request
             except TimeoutError:
                 self._end()
                 raise NetworkError(
@@ -95,7 +96,7 @@ class Worker:
             self._end()
 
     def _running(self, deadline: float) -> _Child:
-        """Return the child process; start it, and load its network, unless it runs."""
+        """Return the child process. Start it and load its network if it is not alive."""
         if self._child is None or not self._child.is_alive():
             self._end()
             self._child = _Child(self._module)
@@ -129,7 +130,7 @@ class _Child:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env={**os.environ, **variables},
-                process_group=0,  # Ctrl-C in a terminal is the parent's
+                process_group=0,  # Ctrl-C in a terminal is for the parent alone
             )
         self._requests = cast(IO[bytes], self._process.stdin)
         self._replies = cast(IO[bytes], self._process.stdout)
@@ -139,7 +140,7 @@ class _Child:
         return self._process.poll() is None
 
     def exchange(self, request: Mapping[str, Any], deadline: float) -> Any:
-        """Send a request; return the value of its reply."""
+        """Send a request and return the value of its reply."""
         try:
             self._requests.write(json.dumps(request).encode() + b"\n")
             self._requests.flush()
@@ -175,7 +176,7 @@ class _Child:
         return line
 
     def _death(self) -> NetworkError:
-        """Return the error of a process that closed its pipe, with the end of its error output."""
+        """Return the error for a closed pipe, with the end of the process's error output."""
         try:
             code = self._process.wait(5)
         except subprocess.TimeoutExpired:
@@ -183,8 +184,8 @@ class _Child:
         how = f"signal {-code}" if code and code < 0 else f"exit code {code}"
         hint = " It may have run out of memory." if code == -9 else ""
         with (self.folder / "stderr").open("rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
-            lines = file.read().decode("utf-8", "replace").splitlines()[-TAIL_LINES:]
+            file.seek(max(0, os.fstat(file.fileno()).st_size - MAX_TAIL_BYTES))
+            lines = file.read().decode("utf-8", "replace").splitlines()[-MAX_TAIL_LINES:]
         tail = "\n".join("".join(c for c in line if c.isprintable()) for line in lines)
         return NetworkError(
             f"{self._name}: the worker process ended during a request ({how}).{hint} Its last "
@@ -193,17 +194,17 @@ class _Child:
 
 
 _WORKERS: dict[tuple[int, str, str], Worker] = {}
-"""Workers of this process by process id, module and settings."""
+"""Workers by process id, module and settings; a forked process does not use its parent's."""
 
 
 def worker_of(module: str, settings: Mapping[str, Any]) -> Worker:
-    """Return this process's worker for a network: one for each module and settings."""
+    """Return this process's worker for a module and its settings."""
     key = os.getpid(), module, json.dumps(settings, sort_keys=True)
     return _WORKERS.setdefault(key, Worker(module, settings))
 
 
 def close_workers() -> None:
-    """End all worker processes of this process, which frees their memory."""
+    """End all workers of this process, which frees their memory."""
     for key in [key for key in _WORKERS if key[0] == os.getpid()]:
         _WORKERS.pop(key).close()
 

@@ -1,8 +1,8 @@
 """X-CLIP: similarity of a video to a text.
 
-Checkpoints: microsoft/xclip-base-patch32 and its relatives (MIT). A few frames, evenly spread over
-the video, are resized by their shorter side, cropped in the middle and normalized, as in the
-checkpoint's preprocessor_config.json. Source: Ni et al., Expanding Language-Image Pretrained Models
+Checkpoints: microsoft/xclip-base-patch32 and its variants (MIT). A few evenly spaced frames are
+resized by their shorter side, center-cropped and normalized, as in the checkpoint's
+preprocessor_config.json. Source: Ni et al., Expanding Language-Image Pretrained Models
 for General Video Recognition, 2022.
 """
 
@@ -23,12 +23,12 @@ from egosim_jax.perception.networks.child import Run
 
 PREPROCESSOR = "preprocessor_config.json"
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-"""Mean and deviation of CLIP's training images, for checkpoints that do not name theirs."""
+"""Mean and standard deviation of CLIP's training images, if a checkpoint has no values."""
 
 
 @dataclass(frozen=True)
 class XClip(Network):
-    """Network that compares videos with texts."""
+    """Similarity of videos to texts by X-CLIP."""
 
     needs: ClassVar[str] = "X-CLIP (microsoft/xclip-base-patch32)"
     model_types: ClassVar[tuple[str, ...]] = ("xclip",)
@@ -51,7 +51,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     settings = read_json(Path(folder) / PREPROCESSOR)
     vision = network.config.vision_config
     mean, std = (
-        settings.get(name, kept) for name, kept in (("image_mean", MEAN), ("image_std", STD))
+        settings.get(name, default) for name, default in (("image_mean", MEAN), ("image_std", STD))
     )
 
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
@@ -71,7 +71,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
 def prepare(
     video: UInt8[np.ndarray, "f h w 3"], *, frames: int, size: int, mean: Any, std: Any
 ) -> Float[np.ndarray, "n 3 {size} {size}"]:
-    """Return frames spread over a video as the network's input: cropped squares, normalized."""
+    """Return evenly spaced frames of a video as the network's input: normalized center crops."""
     chosen = np.linspace(0, len(video) - 1, frames).round().astype(int)
     height, width = video.shape[1:3]
     scale = size / min(height, width)

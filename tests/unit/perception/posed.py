@@ -18,12 +18,12 @@ def make_clip(seed=0):
 
 
 def hands_of(clip):
-    """Pixels of hands and of the body that they move."""
+    """Return the pixels of hands and of the body that they move."""
     return (clip.ids >= FIRST_HAND) | (clip.ids == clip.body_ids[clip.target])
 
 
 def sparse_points(clip, *, count=300, seed=0):
-    """Points of frame 0 and the frames that see them, at exact pixels."""
+    """Return points of frame 0 and their exact pixels in all frames that see them."""
     rng = np.random.default_rng(seed)
     cameras, depth = clip.cameras, clip.depth_m
     rows, columns = np.nonzero(np.isfinite(depth[0]) & ~hands_of(clip)[0])
@@ -51,7 +51,7 @@ def sparse_points(clip, *, count=300, seed=0):
 
 
 def estimate_of(clip, *, unit=1.0, rung="incremental", points=True):
-    """The clip's own cameras and points, with lengths in an unknown unit of `unit` meters."""
+    """Return the clip's exact cameras and points, in an unknown unit of `unit` meters."""
     poses = clip.cameras.world_from_camera.copy()
     poses[:, :3, 3] /= unit
     sparse = sparse_points(clip) if points else None

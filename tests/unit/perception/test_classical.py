@@ -1,4 +1,4 @@
-"""Classical perception of ground-truth frames: moved objects, their ends, revealed surfaces."""
+"""Classical perception of ground-truth frames: moved objects, last poses, revealed surfaces."""
 
 from dataclasses import replace
 
@@ -78,7 +78,7 @@ def test_the_silhouettes_cover_the_hands(clip):
     assert covered.mean() < 3 * hands.mean()
 
 
-def test_a_clip_in_which_nothing_moves_changes_nothing(clip):
+def test_a_clip_without_motion_changes_nothing(clip):
     still = np.repeat(clip.first.colors[None], SPEC.frames, axis=0)
     cameras = clip.cameras
     action = to_action(clip)
@@ -98,7 +98,7 @@ def test_without_hands_nothing_is_found(clip):
     assert not np.isfinite(found.depth_m).any()
 
 
-def test_of_two_hands_on_one_object_one_moved_it(clip, found):
+def test_only_one_of_two_hands_on_an_object_moves_it(clip, found):
     """A second hand next to the first, with the same motion."""
     action = to_action(clip)
     second = action.joints_m + [0.02, 0, 0]
@@ -141,7 +141,7 @@ def test_furniture_is_found_open_or_shut(kind, seed, number, verb, shape):
 
 
 @pytest.mark.parametrize(("aside_m", "moved"), [(0.0, True), (0.06, False)])
-def test_in_frames_that_tell_nothing_the_grip_decides(clip, aside_m, moved):
+def test_in_uniform_frames_the_grip_decides(clip, aside_m, moved):
     gray = np.full_like(clip.frames, 127)
     action = to_action(clip)
     action = replace(action, joints_m=action.joints_m + np.array([0, 0, aside_m]), prompt="")

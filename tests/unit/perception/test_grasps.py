@@ -42,7 +42,7 @@ def test_fingers_hold_while_they_stay_as_far_apart(opening_cm, holds):
     [([7, 7.4, 7, 7.2, 7], 3 + 2 + 1), ([3, 5, 7, 9, 11], 3 + 2 + 1), ([6, 8, 9.5, 9.5, 9.5], 1)],
     ids=["never closes or opens", "never is steady", "opens and stays open"],
 )
-def test_a_hand_that_does_not_close_says_less(opening_cm, count):
+def test_a_hand_that_does_not_close_is_less_evidence(opening_cm, count):
     holds, sure = find_holds(fingers(opening_cm), TOLERANCE_M)
     assert len(holds) == count
     assert not sure
@@ -64,8 +64,8 @@ def test_the_grip_is_a_cylinder_between_thumb_and_fingers(point_cm, between):
     assert is_between(away, tips, radius_m=0.01) is between
 
 
-def test_a_hinge_turns_what_is_held_about_its_axis():
-    """Fingertips on a handle that turns by 80 degrees about an edge, and then leave it."""
+def test_a_hinge_turns_a_held_object_about_its_axis():
+    """The fingertips hold a handle while it turns by 80 degrees, and then leave it."""
     axis = np.array([1.0, 0.2, 0]) / np.linalg.norm([1, 0.2, 0])
     point = np.array([0.1, 0.5, 0.3])
     true = np.stack([turn(axis, point, angle) for angle in np.radians(np.linspace(0, 80, 8))])
@@ -85,7 +85,7 @@ def test_a_straight_path_has_no_hinge(bend_m):
     assert hinge_motion(tips, (0, 7)) is None
 
 
-def test_what_is_loose_moves_with_the_palm_while_it_is_held():
+def test_a_loose_object_moves_with_the_palm_while_held():
     motion = np.stack([turn(np.array([0, 0, 1.0]), np.zeros(3), a) for a in np.linspace(0, 1, 6)])
     motion[:, :3, 3] += np.linspace(0, 1, 6)[:, None] * [0.1, 0.2, 0.3]
     palm = np.stack([transform(m, np.eye(3) * 0.1 + 0.2) for m in motion])

@@ -45,7 +45,7 @@ def carried(end_m, released=12, hinged=False, plane=TABLE):
 
 
 def test_the_supporting_plane_is_the_same_in_every_run():
-    """Open3D's RANSAC stops early; several threads would stop it at different samples."""
+    """Open3D's RANSAC stops early, and with several threads at varying samples."""
     rng = np.random.default_rng(0)
     table = rng.uniform(-0.14, 0.14, (9000, 3)) * [1, 1, 0] + rng.normal(0, 0.003, (9000, 3))
     wall = rng.uniform(-0.14, 0.14, (3000, 3)) * [1, 0, 1] + [0, 0.14, 0]
@@ -80,9 +80,7 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
     [([0.1, 0, 0.04], 0.0), ([0.3, 0, 0.13], 0.1), ([0.3, 0, 0.1], 0.1)],
     ids=["onto the table", "onto a block", "put down on a block"],
 )
-def test_a_released_object_comes_to_rest_at_its_first_height_above_the_support(
-    end_m, height_m, plane
-):
+def test_a_released_object_rests_at_its_first_height_above_the_support(end_m, height_m, plane):
     fallen = fall(carried(end_m, plane=plane), OTHERS, FPS)
     np.testing.assert_allclose(fallen.path[-1, :3, 3], [*end_m[:2], height_m], atol=1e-6)
     np.testing.assert_array_equal(fallen.path[:13], carried(end_m).path[:13])
@@ -104,7 +102,7 @@ def test_a_released_object_falls_with_the_acceleration_of_gravity():
     ],
     ids=["held to the end", "on a hinge", "no surface known", "not lifted"],
 )
-def test_nothing_else_falls(options):
+def test_other_objects_do_not_fall(options):
     np.testing.assert_array_equal(
         fall(carried(**options), OTHERS, FPS).path, carried(**options).path
     )

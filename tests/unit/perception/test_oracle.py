@@ -68,7 +68,7 @@ def test_an_archive_keeps_everything(clips, tmp_path):
     assert (again.step, again.names) == (found.step, found.names)
 
 
-def test_a_file_that_is_no_archive_is_named(tmp_path):
+def test_a_file_that_is_not_an_archive_is_named(tmp_path):
     path = tmp_path / "perceived.npz"
     np.savez(path, about=np.zeros(3, np.uint8))
     with pytest.raises(InputError, match="not those expected"):

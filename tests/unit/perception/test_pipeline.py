@@ -1,4 +1,4 @@
-"""Stages see what came before them, and an incomplete pipeline is named."""
+"""Stages see earlier results, and errors name the missing field of a pipeline."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -54,7 +54,7 @@ def tracks(clip, action, state, so_far):
 
 @dataclass(frozen=True)
 class DepthFromScale:
-    """A depth that needs the cameras."""
+    """Depth that needs the cameras."""
 
     meters: float
     shape: tuple[int, ...] = SIZE
@@ -69,7 +69,7 @@ class DepthFromScale:
 STAGES = (poses, masks, tracks, DepthFromScale(0.5), find_interactions)
 
 
-def test_the_record_becomes_what_was_perceived():
+def test_a_finished_observation_becomes_a_perceived():
     found = Pipeline(stages=STAGES)(*asked())
     assert found.step == 5
     assert found.depth_m.dtype == np.float32
@@ -91,7 +91,7 @@ def test_the_record_becomes_what_was_perceived():
         (4, "Perceived needs interacted_frames"),
     ],
 )
-def test_a_missing_stage_is_named_by_its_field_and_by_what_needs_it(missing, message):
+def test_a_missing_field_is_named_with_its_user(missing, message):
     stages = tuple(stage for number, stage in enumerate(STAGES) if number != missing)
     with pytest.raises(InputError, match=f"{message}, which no stage before it has set"):
         Pipeline(stages=stages)(*asked())

@@ -1,4 +1,4 @@
-"""First frames without hands, of the tabletop world, where the image under them is known."""
+"""Clean plates of the tabletop world, versus the known image behind the hands."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ def clip():
 
 @pytest.fixture(scope="module")
 def covered(clip):
-    """A clip with a dark occluder that passes over the first frame without hands."""
+    """Return a clip with a dark occluder that passes over the hand-free first frame."""
     frames = np.repeat(clip.first.colors[None], 5, axis=0)
     moving = np.zeros(frames.shape[:3], bool)
     for number in range(5):
@@ -27,7 +27,7 @@ def covered(clip):
     return frames, moving, replace(clip.cameras, world_from_camera=poses)
 
 
-def test_what_an_occluder_hid_is_what_later_frames_show(clip, covered):
+def test_pixels_behind_an_occluder_come_from_later_frames(clip, covered):
     frames, moving, cameras = covered
     plate = clean_plate(frames, moving, cameras, clip.first.depth_m)
     difference = np.abs(plate.image.astype(int) - clip.first.colors)
@@ -57,7 +57,7 @@ def test_frames_in_which_the_surroundings_have_moved_are_not_used(clip, covered)
     assert plate.method == "patchmatch"
 
 
-def test_what_no_frame_shows_is_filled_by_patches(clip, covered):
+def test_pixels_that_no_frame_shows_are_filled_by_patches(clip, covered):
     frames, moving, cameras = covered
     always = moving | moving[0]
     plate = clean_plate(frames, always, cameras, clip.first.depth_m)
@@ -74,7 +74,7 @@ def test_without_the_library_telea_fills(clip, covered, monkeypatch):
     assert plate.method == "telea"
 
 
-def test_a_frame_without_hands_is_returned_as_it_is(clip, covered):
+def test_a_frame_without_hands_is_unchanged(clip, covered):
     frames, moving, cameras = covered
     plate = clean_plate(frames, np.zeros_like(moving), cameras, clip.first.depth_m)
     np.testing.assert_array_equal(plate.image, frames[0])

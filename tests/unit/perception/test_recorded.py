@@ -1,4 +1,4 @@
-"""Artifacts in the official layout are read back with their values."""
+"""Reading of artifacts in the official layout."""
 
 import zipfile
 from pathlib import Path
@@ -51,7 +51,7 @@ def asked(step=0):
 
 
 def write(folder: Path, *, scale=1.0, frames=FRAMES, depth=0.5):
-    """Write the files of a reconstruction in its own coordinates and units."""
+    """Write a reconstruction's files in its own coordinates and unit."""
     for kind in ("pose", "intrinsics", "depth", "mask"):
         (folder / kind).mkdir(exist_ok=True)
     there = path()

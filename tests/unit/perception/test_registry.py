@@ -1,4 +1,4 @@
-"""Pipelines by name: configured from a command line, hashed into a run, extended by users."""
+"""Pipelines by name: command line, fingerprint of a run, and user extensions."""
 
 import sys
 from dataclasses import FrozenInstanceError, dataclass
@@ -44,7 +44,7 @@ def test_each_threshold_is_an_option():
         ("--motion.refinement.steps-m 0.01", "one step per round"),
     ],
 )
-def test_a_threshold_that_cannot_be_is_refused(options, message, capsys):
+def test_an_invalid_threshold_is_refused(options, message, capsys):
     with pytest.raises(SystemExit, match="2"):
         registry.parse(f"classical {options}")
     assert message in " ".join(capsys.readouterr().err.split())
@@ -75,7 +75,7 @@ def test_a_pipeline_of_a_user_is_found_by_name():
     @registry.register("mine")
     @dataclass(frozen=True, kw_only=True)
     class MyConfig:
-        """Nothing but an example."""
+        """An example."""
 
         threshold: float = 0.5
 
@@ -105,6 +105,6 @@ def test_a_module_that_registers_a_pipeline_is_imported(tmp_path, monkeypatch):
     ("text", "message"),
     [("classical 'x", "not a name with options: No closing"), (".x:mine", "'.x' is relative")],
 )
-def test_a_text_that_names_no_pipeline_is_refused(text, message):
+def test_a_text_without_a_pipeline_is_refused(text, message):
     with pytest.raises(InputError, match=message):
         registry.parse(text)

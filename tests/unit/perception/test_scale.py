@@ -38,7 +38,7 @@ def depth_of(values, estimate):
 
 @pytest.fixture
 def table(estimate):
-    """Depth of a table that is seen obliquely: a plane through (0, 0, 0.6 m), 0.4 m away."""
+    """Depth of an oblique table: a plane through (0, 0, 0.6 m) at distance 0.4 m."""
     rays = pixel_rays(estimate.cameras.intrinsics_px, height=HEIGHT, width=WIDTH)
     sine = TABLE_M / 0.6
     normal = np.array([0, np.sqrt(1 - sine**2), sine])
@@ -46,7 +46,7 @@ def table(estimate):
 
 
 def hands_above(estimate, table, heights):
-    """Fingertips on the rays of pixels, nearer than the table by factors; metric, in the camera."""
+    """Return metric joints whose fingertips are at factors of the table's depth, per frame."""
     joints = np.full((FRAMES, 2, 21, 3), np.nan)
     rng = np.random.default_rng(0)
     rays = pixel_rays(estimate.cameras.intrinsics_px, height=HEIGHT, width=WIDTH)
@@ -107,7 +107,7 @@ def test_without_any_source_the_median_depth_is_assumed_and_flagged(estimate, ta
     assert np.median(table.depth_m) * found.meters_per_unit == pytest.approx(0.6)
 
 
-def test_what_is_given_wins(estimate, table):
+def test_a_given_scale_wins(estimate, table):
     assert estimate_scale(estimate, table, meters_per_unit=2.0).meters_per_unit == 2
     metric = replace(estimate, metric=True)
     assert estimate_scale(metric, table, camera_height_m=1.0).meters_per_unit == 1

@@ -1,4 +1,4 @@
-"""A textured room with a box on its floor, seen by known cameras: rays, rectangles and noise."""
+"""A ray-cast textured room with a box on its floor, seen by known cameras."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _texture(seed: int) -> np.ndarray:
 
 
 def render(cameras: Cameras, *, lens: Lens | None = None, seed: int = 0) -> np.ndarray:
-    """Return the uint8 frames that cameras see; through a lens, its recorded pixels."""
+    """Return the uint8 frames of cameras, distorted by a lens if given."""
     rows, columns = np.mgrid[: cameras.height, : cameras.width].astype(float)
     x = np.stack([columns, rows], axis=-1) - cameras.intrinsics_px[:2, 2]
     x /= cameras.intrinsics_px[0, 0] if lens is None else lens.focal_px
@@ -82,7 +82,7 @@ def _frame(pose: np.ndarray, rays: np.ndarray, textures: list[np.ndarray]) -> np
 def path(
     count: int, *, move: np.ndarray = STILL, turn_deg: np.ndarray = STILL, portrait: bool = False
 ) -> Cameras:
-    """Return cameras that move and turn evenly, with a little sway, from the identity."""
+    """Return cameras that start at the identity and move and turn evenly, with a little sway."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     for frame in range(count):
         share = frame / max(count - 1, 1)

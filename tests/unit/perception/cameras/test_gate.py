@@ -1,4 +1,4 @@
-"""The gate on figures as measured, and the figures of reconstructions with known geometry."""
+"""The gate on measured figures, and figures of reconstructions with known geometry."""
 
 from dataclasses import replace
 

@@ -78,7 +78,7 @@ def test_a_small_turn_does_not_give_the_focal_length() -> None:
     assert found.verdict.figures["rotation_assumed_view_deg"] == 90
 
 
-def test_parallax_is_no_rotation() -> None:
+def test_a_camera_with_parallax_is_not_a_rotation() -> None:
     frames = render(path(10, move=np.array([0.5, 0.0, 0.0])))
     found = estimate(ROTATION, frames)
     assert found.verdict.figures["rotation_residual_px"] > 1.5

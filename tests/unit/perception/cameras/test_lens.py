@@ -1,4 +1,4 @@
-"""Undistorted frames and pixels versus the room seen by a pinhole camera."""
+"""Undistorted frames and pixels versus a pinhole camera in the rendered room."""
 
 import numpy as np
 import pytest

@@ -115,7 +115,7 @@ def test_black_frames_and_skipped_images_are_interpolated() -> None:
     assert angle < 0.6
 
 
-def test_what_moves_is_not_used() -> None:
+def test_moving_pixels_are_not_used() -> None:
     frames, moving = room(False).copy(), np.zeros((24, 240, 320), bool)
     noise = render(path(1), seed=3)[0]
     for frame in range(24):

@@ -1,4 +1,4 @@
-"""Density of the points of a wall that a camera comes nearer to."""
+"""Density of a wall's points for a camera that approaches it."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ MATRIX = np.array([[60.0, 0, 39.5], [0, 60, 29.5], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(("nearest", "wanted"), [(1.0, 1), (0.6, 1), (0.3, 2)])
-def test_a_wall_that_is_magnified_more_than_twice_is_split(nearest, wanted):
+def test_a_wall_magnified_more_than_twice_gets_denser_points(nearest, wanted):
     poses = np.repeat(np.eye(4)[None], 5, axis=0)
     poses[:, 2, 3] = 1 - np.linspace(1, nearest, 5)
     cameras = Cameras(world_from_camera=poses, intrinsics_px=MATRIX, height=60, width=80)

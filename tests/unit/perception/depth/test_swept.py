@@ -1,4 +1,4 @@
-"""Depth of posed videos of the tabletop world, whose depth is exact."""
+"""Depth of posed videos of the tabletop world, versus its exact depth."""
 
 from dataclasses import replace
 

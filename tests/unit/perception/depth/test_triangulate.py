@@ -1,4 +1,4 @@
-"""Tracked and triangulated corners of a textured wall, before which a camera moves sideways."""
+"""Tracked and triangulated corners of a textured wall, seen by a camera that moves sideways."""
 
 import cv2
 import numpy as np

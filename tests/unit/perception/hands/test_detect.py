@@ -1,4 +1,4 @@
-"""Palms, regions and candidates of hands, with networks that see a painted hand."""
+"""Palms, regions and candidates of hands, with networks that detect painted hands."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from egosim_jax.perception.hands.palms import (
     decode_palms,
     make_anchors,
     make_tiles,
-    suppress_duplicates,
+    merge_overlapping,
 )
 from egosim_jax.perception.hands.regions import (
     Regions,
@@ -24,7 +24,7 @@ from egosim_jax.perception.hands.regions import (
     joints_in_image,
     regions_of_joints,
     regions_of_palms,
-    turned_back,
+    unrotate,
 )
 from tests.hands import PaintedHands, hand_px, paint
 
@@ -67,7 +67,7 @@ def test_overlapping_palms_are_merged_by_their_scores():
     values = np.zeros((3, 9, 2))
     values[:, 0] = [[10, 10], [14, 10], [90, 90]]
     values[:, 1] = 20
-    palms = suppress_duplicates(values, np.array([0.9, 0.3, 0.6]))
+    palms = merge_overlapping(values, np.array([0.9, 0.3, 0.6]))
     np.testing.assert_allclose(palms.score, [0.9, 0.6])
     np.testing.assert_allclose(palms.boxes_px[0], [11, 10, 20, 20])
     np.testing.assert_allclose(palms.boxes_px[1], [90, 90, 20, 20])
@@ -110,7 +110,7 @@ def test_a_point_of_the_frame_is_where_its_crop_has_it():
 def test_meters_are_turned_with_the_region_and_keep_their_depth():
     regions = Regions(center_px=np.zeros((1, 2)), size_px=np.ones(1), angle=np.array([np.pi / 2]))
     joints = np.tile([0.0, -0.1, 0.03], (1, 21, 1))  # up in the crop is right in the image
-    np.testing.assert_allclose(turned_back(regions, joints)[0, 0], [0.1, 0, 0.03], atol=1e-9)
+    np.testing.assert_allclose(unrotate(regions, joints)[0, 0], [0.1, 0, 0.03], atol=1e-9)
 
 
 def search(frames, networks, **options):
@@ -126,7 +126,7 @@ def test_a_hand_is_found_where_it_was_painted():
     assert (found.palm > 0.9).all()
 
 
-def test_a_hand_is_followed_both_ways_from_the_one_frame_in_which_its_palm_is_seen():
+def test_a_hand_is_followed_both_ways_from_the_only_frame_with_its_palm():
     hands = [hand_px(center=(150 + 4 * i, 120)) for i in range(5)]
     frames = paint([[hand] for hand in hands], hidden={0, 1, 3, 4})
     found = search(frames, PaintedHands())

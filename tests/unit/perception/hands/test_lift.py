@@ -1,4 +1,4 @@
-"""Metric hands from keypoints in pixels: exact on hands that are known."""
+"""Metric hands from keypoints in pixels: exact for known hands."""
 
 import numpy as np
 
@@ -26,19 +26,19 @@ def tracks_of(shape, joints_m):
     )
 
 
-def test_a_known_hand_is_put_back_exactly_where_it_was():
+def test_a_known_hand_is_lifted_to_its_exact_place():
     shape, joints_m = hands()
     lifted = lift(tracks_of(shape - shape.mean((-2,), keepdims=True), joints_m), INTRINSICS_PX)
     np.testing.assert_allclose(lifted, joints_m, atol=1e-9)
 
 
-def test_a_lifted_hand_projects_to_the_pixels_that_were_seen_even_if_its_shape_is_another():
+def test_a_lifted_hand_projects_to_its_pixels_even_with_another_shape():
     shape, joints_m = hands()
     tracks = tracks_of(shape * 1.2 + 0.005, joints_m)
     np.testing.assert_allclose(project(lift(tracks, INTRINSICS_PX)), tracks.joints_px, atol=1e-6)
 
 
-def test_a_larger_hand_of_the_same_look_is_farther_away():
+def test_a_larger_hand_with_the_same_image_is_farther_away():
     shape, joints_m = hands()
     lifted = lift(tracks_of(1.1 * shape, joints_m), INTRINSICS_PX)
     np.testing.assert_allclose(lifted, 1.1 * joints_m, rtol=1e-6)

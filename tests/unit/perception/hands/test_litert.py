@@ -1,4 +1,4 @@
-"""MediaPipe's networks on the CPU: a file is run image by image, or refused."""
+"""MediaPipe's networks on the CPU: runs of single images, and refused files."""
 
 import sys
 
@@ -19,7 +19,7 @@ BLACK = np.zeros((1, 48, 64, 3), np.uint8)
 
 
 class Writer:
-    """TensorFlow Lite file under construction: tensors by number, operations in order."""
+    """Builder of a TensorFlow Lite file: tensors by number, operations in order."""
 
     def __init__(self):
         self.model, self.graph = schema.ModelT(), schema.SubGraphT()
@@ -89,7 +89,7 @@ def test_an_image_is_scaled_to_one_and_the_next_one_is_run_by_itself(tmp_path):
     np.testing.assert_allclose(logits[:4], [0.2, 0.4, 1, 0], atol=1e-6)
 
 
-def test_a_file_that_is_no_network_is_refused(tmp_path):
+def test_a_file_that_is_not_a_network_is_refused(tmp_path):
     (tmp_path / "palms.tflite").write_bytes(b"no network")
     with pytest.raises(InputError, match="not a model that LiteRT can run"):
         HandNetworks(tmp_path / "palms.tflite", tmp_path / "palms.tflite", threads=1)
@@ -114,7 +114,7 @@ def test_an_annotation_reads_the_weights_that_it_is_given(tmp_path):
         hands(BLACK)
 
 
-def test_offline_without_weights_is_refused_with_the_way_out(tmp_path, monkeypatch):
+def test_offline_without_weights_is_refused_with_a_fix(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(InputError, match="egosim models fetch hands"):
         LandmarkHands(offline=True)(BLACK)

@@ -1,4 +1,4 @@
-"""Tracks of hands on synthetic candidates: crossings, doubles, gaps, noise in the side."""
+"""Tracks of synthetic candidates: crossing hands, duplicates, gaps, wrong sides."""
 
 from dataclasses import replace
 
@@ -63,13 +63,13 @@ def test_a_hand_whose_forearm_enters_from_the_right_is_a_right_one():
     assert (chosen(candidates(*hands, forearm=0.95), 6)[:, RIGHT] >= 0).all()
 
 
-def test_of_two_readings_of_a_hand_the_one_whose_fingers_bend_as_on_its_side_is_chosen():
+def test_the_detection_whose_fingers_bend_as_on_its_side_is_chosen():
     hands = [(f, (100 + d, 100), 0.6, 0.9, 0.9) for d in (0, 30) for f in range(6)]
     found = candidates(*hands, forearm=0.95, bend=[0.05] * 6 + [0.95] * 6)
     assert chosen(found, 6)[:, RIGHT].tolist() == list(range(6, 12))
 
 
-def test_other_joints_of_a_hand_are_no_second_hand():
+def test_other_joints_of_a_hand_are_not_a_second_hand():
     hands = [(f, (100 + d, 100), r, 0.9, 0.9) for d, r in ((0, 0.9), (90, 0.1)) for f in range(6)]
     assert (chosen(candidates(*hands), 6) >= 0).all()
     path = chosen(candidates(*hands, again=[False] * 6 + [True] * 6), 6)
@@ -105,12 +105,12 @@ def test_a_gap_stays_a_gap():
     assert (path[[0, 1, 2, 3, 8, 9, 10, 11], RIGHT] >= 0).all()
 
 
-def test_a_hand_of_one_frame_is_no_hand():
+def test_a_hand_in_only_one_frame_is_dropped():
     found = candidates((5, (100, 100), 0.9, 0.9, 0.9))
     assert (chosen(found, 12) == -1).all()
 
 
-def test_what_looks_like_a_hand_but_has_no_palm_loses_against_one_that_has():
+def test_a_candidate_without_a_palm_loses_to_one_with_a_palm():
     found = candidates(
         *[(f, (100, 100), 0.95, 0.95, 0) for f in range(6)],
         *[(f, (300, 100), 0.85, 0.85, 0.9) for f in range(6)],
@@ -118,14 +118,14 @@ def test_what_looks_like_a_hand_but_has_no_palm_loses_against_one_that_has():
     assert chosen(found, 6, side=2.0)[:, RIGHT].tolist() == list(range(6, 12))
 
 
-def test_a_track_whose_palm_is_hardly_ever_detected_is_no_hand():
+def test_a_track_with_rarely_detected_palms_is_dropped():
     palms = [0.9] + [0] * 9
     found = candidates(*[(f, (100, 100), 0.9, 0.9, palm) for f, palm in enumerate(palms)])
     assert (chosen(found, 10) == -1).all()
     assert (chosen(found, 10, min_palms=0.1)[:, RIGHT] >= 0).all()
 
 
-def test_no_candidates_are_no_tracks():
+def test_without_candidates_there_are_no_tracks():
     nothing = candidates((0, (0, 0), 0, 0, 0)).take(np.zeros(0, int))
     assert (chosen(nothing, 3) == -1).all()
 
@@ -138,16 +138,16 @@ def moving(frames=9, missing=()):
 
 
 def test_only_short_gaps_with_two_ends_are_found():
-    gaps = find_gaps(moving(missing=[0, 2, 3, 8]), most=2, max_motion=1.0)
+    gaps = find_gaps(moving(missing=[0, 2, 3, 8]), max_gap=2, max_motion=1.0)
     assert np.flatnonzero(gaps[:, RIGHT]).tolist() == [2, 3]
     assert not gaps[:, LEFT].any()
-    assert not find_gaps(moving(missing=[2, 3, 4]), most=2, max_motion=1.0).any()
-    assert not find_gaps(moving(missing=[2, 3]), most=2, max_motion=0.01).any()
+    assert not find_gaps(moving(missing=[2, 3, 4]), max_gap=2, max_motion=1.0).any()
+    assert not find_gaps(moving(missing=[2, 3]), max_gap=2, max_motion=0.01).any()
 
 
 def test_a_filled_gap_is_straight_motion():
     broken = moving(missing=[2, 3, 7])
-    gaps = find_gaps(broken, most=2, max_motion=1.0)
+    gaps = find_gaps(broken, max_gap=2, max_motion=1.0)
     np.testing.assert_allclose(fill_gaps(broken, gaps), moving(), atol=1e-9)
 
 

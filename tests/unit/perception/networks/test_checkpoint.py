@@ -1,4 +1,4 @@
-"""Folders of checkpoints: those of other networks, partial ones and pickles are refused."""
+"""Checkpoint folders: other networks, partial downloads and pickles are refused."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from egosim_jax.types import InputError
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder that has everything but real weights."""
+    """Return a complete folder, except for real weights."""
     folder = tmp_path / "small"
     folder.mkdir()
     config = {"model_type": "depth_anything", "depth_estimation_type": "metric"}
@@ -36,7 +36,7 @@ def change(folder, **values):
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
-def test_a_folder_of_another_network_is_refused_with_what_was_found(folder):
+def test_a_folder_of_another_network_is_refused_with_its_name(folder):
     change(folder, model_type="sam3_video")
     refused(folder, "model_type 'sam3_video': Depth Anything V2 .* needs depth_anything")
 
@@ -71,7 +71,7 @@ def test_a_partial_or_damaged_index_of_shards_is_refused(folder, index, message)
     refused(folder, message)
 
 
-def test_a_config_that_holds_no_object_is_refused(folder):
+def test_a_config_that_is_not_an_object_is_refused(folder):
     (folder / "config.json").write_text("[]")
     refused(folder, "must hold an object")
 
@@ -99,7 +99,7 @@ def test_a_missing_extra_is_named_before_a_worker_starts(folder, monkeypatch):
         DepthAnything(folder).ask({"frames": np.zeros((1, 4, 4, 3), np.uint8)})
 
 
-def test_weights_that_are_not_in_the_files_are_not_invented():
+def test_missing_weights_are_refused():
     found = {"missing_keys": {"head.weight"}, "mismatched_keys": set()}
     network = SimpleNamespace(
         from_pretrained=lambda folder, **_: (None, found), __name__="DepthNetwork"

@@ -1,4 +1,4 @@
-"""The closed loop's stages, with a segmenter and a depth network that are as real ones are."""
+"""Stages of the closed loop, with a substitute segmenter and depth network."""
 
 from dataclasses import dataclass, replace
 
@@ -100,7 +100,7 @@ def made():
 
 @dataclass(frozen=True)
 class Masks:
-    """The true masks in another numbering, and a hand in a corner."""
+    """Ground-truth masks with other ids, and a hand in a corner."""
 
     object_ids: np.ndarray
 
@@ -115,7 +115,7 @@ class Masks:
 
 @dataclass(frozen=True)
 class Depth:
-    """Depth with another scale and shift of its inverse in each frame."""
+    """Depth with a different scale and shift of inverse depth in each frame."""
 
     depth_m: np.ndarray
 
@@ -145,12 +145,12 @@ def perceived(made):
     return Pipeline(stages=stages(made))(made.clip, made.action, made.state)
 
 
-def test_the_substitutes_are_what_the_stages_take(made):
+def test_the_substitutes_satisfy_the_protocols(made):
     assert isinstance(Masks(made.object_ids), Segmenter)
     assert isinstance(Depth(made.depth_m), DepthEstimator)
 
 
-def test_instances_get_the_ids_of_the_state_and_others_new_ones(made, perceived):
+def test_known_instances_get_the_state_s_ids_and_others_new_ids(made, perceived):
     elsewhere = np.ones((HEIGHT, WIDTH), bool)
     elsewhere[:10, :10] = elsewhere[-12:, -12:] = False
     np.testing.assert_array_equal(perceived.object_ids[:, elsewhere], made.object_ids[:, elsewhere])

@@ -1,4 +1,4 @@
-"""Depth Anything V2 in its worker: the same numbers as transformers here, and no torch needed."""
+"""Depth Anything V2 in its worker gives the depth of transformers; the caller needs no torch."""
 
 import subprocess
 import sys
@@ -47,7 +47,7 @@ def test_depth_is_that_of_transformers_own_pipeline(folder):
 
 
 @pytest.mark.slow
-def test_a_device_that_is_not_there_is_refused(folder):
+def test_a_missing_device_is_refused(folder):
     with pytest.raises(InputError, match=r"no device 'cuda:7'.*--device"):
         DepthAnything(folder, device="cuda:7")(FRAMES, STILL, UNKNOWN, [0])
 

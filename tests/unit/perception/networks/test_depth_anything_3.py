@@ -1,4 +1,4 @@
-"""Depth Anything 3 is called as its package asks, here with a small one of the same interface."""
+"""Calls of Depth Anything 3, with a small package that has the same interface."""
 
 import json
 

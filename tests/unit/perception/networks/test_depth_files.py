@@ -1,4 +1,4 @@
-"""Depth and cameras in the files of another program come back in the size of the video."""
+"""Depth and cameras from files of another program, at the size of the video."""
 
 import numpy as np
 import pytest

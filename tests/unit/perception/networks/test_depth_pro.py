@@ -1,4 +1,4 @@
-"""Depth Pro in its worker, versus the formulas of its paper and of transformers' processor."""
+"""Depth Pro in its worker, versus the formulas of its paper and of transformers."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def expected(folder):
 
 
 def check_depth(depth_m, inverse):
-    """Compare in 1/m: the network's output, of which far depths amplify the rounding."""
+    """Compare in 1/m, the network's output, because far depths amplify rounding errors."""
     inverse = np.clip(inverse, 1e-4, 1e4)
     np.testing.assert_allclose(1 / depth_m, inverse, rtol=1e-3, atol=1e-4 * inverse.max())
 

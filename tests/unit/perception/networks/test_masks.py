@@ -1,4 +1,4 @@
-"""Detection, tracking and SAM 3 in their workers, on tiny random checkpoints in the real layout."""
+"""Detection, tracking and SAM 3 in their workers, with tiny random checkpoints."""
 
 import json
 
@@ -25,7 +25,7 @@ BOXES = [(5.0, 5.0, 30.0, 40.0), (30.0, 8.0, 75.0, 44.0)]
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """Return a function that makes the checkpoint of a name once."""
+    """Return a function that makes each named checkpoint once."""
     made = {}
 
     def make(name):
@@ -101,7 +101,7 @@ def test_a_tracker_labels_every_frame_as_its_network_does(folders, name, kind):
 
 
 def labels_of(name, folder):
-    """Return what the network gives for inputs that are made by their formulas."""
+    """Return the network's labels for inputs from independent formulas."""
     import transformers as hf
     from torch.nn.functional import interpolate
 

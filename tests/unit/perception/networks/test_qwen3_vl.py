@@ -1,4 +1,4 @@
-"""Qwen3-VL: what its replies are read as, and a tiny random checkpoint that replies."""
+"""Qwen3-VL: parsing of replies, and replies of a tiny random checkpoint."""
 
 import json
 

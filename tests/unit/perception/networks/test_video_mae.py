@@ -1,4 +1,4 @@
-"""VideoMAE's features in its worker: those of transformers here; FVD of them in a table."""
+"""VideoMAE in its worker gives the features of transformers; a table has their FVD."""
 
 import json
 

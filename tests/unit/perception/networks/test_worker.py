@@ -1,4 +1,4 @@
-"""Worker processes: they stay warm, refuse, fail, die and end as their parent can understand."""
+"""Worker processes: warm reuse, refusals, failures, deaths and shutdown."""
 
 import os
 import signal
@@ -76,7 +76,7 @@ def test_a_worker_stays_warm_and_survives_what_it_refuses(worker):
     assert not is_alive(first["pid"])
 
 
-def test_a_dead_worker_says_its_last_words_and_the_next_call_starts_another(worker):
+def test_a_dead_worker_reports_its_last_output_and_the_next_call_starts_another(worker):
     with pytest.raises(NetworkError, match=r"(?s)signal 9.*last words") as error:
         ask(worker, die=True)
     assert error.value.code == ExitCode.FAILED

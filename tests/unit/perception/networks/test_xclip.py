@@ -1,4 +1,4 @@
-"""X-CLIP in its worker: the similarity of transformers here, and a ranking by it."""
+"""X-CLIP in its worker gives the similarity of transformers, and ranks candidates."""
 
 import numpy as np
 import pytest

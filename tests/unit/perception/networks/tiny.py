@@ -97,7 +97,7 @@ def grounding_dino(folder: Path, words=("red", "cup", "book", "hand", "arm")) ->
 
 
 SIZE, CHANNELS = 128, 128
-"""Input of the tiny trackers; their memory asks for at least 128 channels."""
+"""Input size of the tiny trackers; their memory needs at least 128 channels."""
 
 
 def _hiera(size: int) -> dict:
@@ -152,7 +152,7 @@ IMAGENET = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225])
 
 
 def edgetam(folder: Path) -> Path:
-    """EdgeTAM with SAM 2's vision encoder: its own one, RepViT, is part of another library."""
+    """EdgeTAM with SAM 2's vision encoder, because its own encoder RepViT needs another library."""
     import torch
     import transformers as hf
 
@@ -232,7 +232,7 @@ def sam3(folder: Path, *, size: int = 112) -> Path:
 
 
 def _bytes() -> list[str]:
-    """Characters that stand for the 256 bytes in byte-level vocabularies."""
+    """Return the characters of the 256 bytes in byte-level vocabularies."""
     shown = [*range(33, 127), *range(161, 173), *range(174, 256)]
     others = [b for b in range(256) if b not in shown]
     return [chr(b) for b in shown] + [chr(256 + k) for k in range(len(others))]
