@@ -150,7 +150,7 @@ def test_the_substitutes_satisfy_the_protocols(made):
     assert isinstance(Depth(made.depth_m), DepthEstimator)
 
 
-def test_known_instances_get_the_state_s_ids_and_others_new_ids(made, perceived):
+def test_instances_get_the_ids_of_the_state_or_new_ids(made, perceived):
     elsewhere = np.ones((HEIGHT, WIDTH), bool)
     elsewhere[:10, :10] = elsewhere[-12:, -12:] = False
     np.testing.assert_array_equal(perceived.object_ids[:, elsewhere], made.object_ids[:, elsewhere])
