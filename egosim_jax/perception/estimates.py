@@ -116,6 +116,19 @@ class DepthEstimate:
     reason: str = ""
     """Method, for the report; it says if depth was assumed instead of measured."""
 
+    @classmethod
+    def measured(
+        cls, frames: Sequence[int], depth_m: Float[np.ndarray, "k h w"], *, metric: bool
+    ) -> DepthEstimate:
+        """Return an estimate whose valid pixels (finite and positive) are all measured."""
+        valid = np.isfinite(depth_m) & (depth_m > 0)
+        return cls(
+            frames=np.asarray(frames, np.int32),
+            depth_m=np.where(valid, depth_m, np.inf).astype(np.float32),
+            confident=valid,
+            metric=metric,
+        )
+
 
 @runtime_checkable
 class HandEstimator(Protocol):

@@ -10,7 +10,6 @@ fingertips counts as moved unless the clip clearly shows it at rest. A released 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -170,27 +169,21 @@ def _best_candidate(
             gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
             max_change = config.grip_evidence if gripped else -improvement
             loose = couplings(palm, rigid[hold[0]], model.plane[:3], hold)
-            for motion in _motions(model, hold, loose, hinges[hold]):
-                cost = prior * _cost(model, motion.path, action.cameras, shown, hidden, config)
+            for path in (*loose, hinges[hold]):
+                if path is None:
+                    continue
+                cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
                 known = np.isfinite(cost) and np.isfinite(rest)
                 change = (cost - rest if known else 0.0) - max_change
                 if change < (0.0 if best is None else best[0]):
-                    best = change, motion
+                    hinged = path is hinges[hold]
+                    best = (
+                        change,
+                        ObjectMotion(
+                            model=model, grasped=hold[0], released=hold[1], path=path, hinged=hinged
+                        ),
+                    )
     return best
-
-
-def _motions(
-    model: ObjectModel,
-    hold: tuple[int, int],
-    loose: Iterable[Float[np.ndarray, "f 4 4"]],
-    hinge: Float[np.ndarray, "f 4 4"] | None,
-) -> Iterator[ObjectMotion]:
-    """Yield the possible motions of a held object: loose, then on a hinge."""
-    motion = partial(ObjectMotion, model=model, grasped=hold[0], released=hold[1])
-    for path in loose:
-        yield motion(path=path)
-    if hinge is not None:
-        yield motion(path=hinge, hinged=True)
 
 
 def _near_tips(

@@ -110,9 +110,7 @@ def decode_palms(
     return merge_overlapping(np.concatenate(found_boxes), np.concatenate(found_scores))
 
 
-def merge_overlapping(
-    values: Float[np.ndarray, "n 9 2"], score: Float[np.ndarray, " n"]
-) -> Palms:
+def merge_overlapping(values: Float[np.ndarray, "n 9 2"], score: Float[np.ndarray, " n"]) -> Palms:
     """Merge overlapping detections into their mean, weighted by score.
 
     `values` has center, size and keypoints. A merged detection keeps the highest score.

@@ -56,16 +56,8 @@ class DepthAnything(Network):
         wanted: Sequence[int],
     ) -> DepthEstimate:
         """Return depth in meters of the wanted frames. The cameras are not used."""
-        chosen = np.asarray(wanted, np.int32)
-        found, _ = self.ask({"frames": frames[chosen]}, batch=self.batch)
-        depth_m = found["depth_m"]
-        valid = np.isfinite(depth_m) & (depth_m > 0)
-        return DepthEstimate(
-            frames=chosen,
-            depth_m=np.where(valid, depth_m, np.inf).astype(np.float32),
-            confident=valid,
-            metric=True,
-        )
+        found, _ = self.ask({"frames": frames[np.asarray(wanted, np.int32)]}, batch=self.batch)
+        return DepthEstimate.measured(wanted, found["depth_m"], metric=True)
 
 
 def load(folder: str, device: str, dtype: str) -> Run:

@@ -97,13 +97,8 @@ class DepthAnything3(_DepthAnything3):
             arrays["intrinsics"] = np.repeat(matrix[None], len(views), axis=0)
         found, about = self.ask(arrays, resolution_px=self.resolution_px)
         depth = found["depth"][np.searchsorted(views, chosen)]
-        valid = np.isfinite(depth) & (depth > 0)
-        return DepthEstimate(
-            frames=chosen,
-            depth_m=np.where(valid, depth, np.inf).astype(np.float32),
-            confident=valid,
-            metric=estimate.metric if aligned else bool(about["metric"]),
-        )
+        metric = estimate.metric if aligned else bool(about["metric"])
+        return DepthEstimate.measured(wanted, depth, metric=metric)
 
 
 @dataclass(frozen=True)

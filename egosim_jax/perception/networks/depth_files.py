@@ -45,12 +45,7 @@ class DepthFiles:
         """Return the depth maps of the wanted frames at the size of the video."""
         height, width = frames.shape[1:3]
         depth = np.stack([self._depth(frame, height, width) for frame in wanted])
-        return DepthEstimate(
-            frames=np.asarray(wanted, np.int32),
-            depth_m=depth,
-            confident=np.isfinite(depth),
-            metric=self.metric,
-        )
+        return DepthEstimate.measured(wanted, depth, metric=self.metric)
 
     def cameras(self, count: int, *, height: int, width: int) -> CameraEstimate:
         """Return the cameras of the first `count` frames, for a video of the given size.

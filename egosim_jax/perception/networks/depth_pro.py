@@ -56,21 +56,14 @@ class DepthPro(Network):
 
         Raises `InputError` if it is unknown and the estimated one is implausible.
         """
-        chosen = np.asarray(wanted, np.int32)
-        inverse, fields_of_view_deg = self._estimate(frames[chosen])
+        inverse, fields_of_view_deg = self._estimate(frames[np.asarray(wanted, np.int32)])
         width = frames.shape[2]
         if estimate.cameras is not None:
             focal_px = float(estimate.cameras.intrinsics_px[0, 0])
         else:
             focal_px = focal_of(fields_of_view_deg, width)
         depth_m = 1 / np.clip(inverse * (width / focal_px), *INVERSE_DEPTH)
-        valid = np.isfinite(depth_m)
-        return DepthEstimate(
-            frames=chosen,
-            depth_m=np.where(valid, depth_m, np.inf).astype(np.float32),
-            confident=valid,
-            metric=True,
-        )
+        return DepthEstimate.measured(wanted, depth_m, metric=True)
 
     def focal_px(self, frames: UInt8[np.ndarray, "f h w 3"]) -> float:
         """Return the focal length of a video in pixels, from the median over its frames."""
