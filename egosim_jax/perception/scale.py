@@ -21,7 +21,7 @@ from egosim_jax.types import Cameras, InputError
 
 Source = Literal["given", "cameras", "camera height", "metric depth", "hands", "median depth"]
 """Origin of a scale, from the most to the least certain."""
-TIPS = (4, 8, 12, 16, 20)
+FINGERTIPS = (4, 8, 12, 16, 20)
 """Keypoints of the tips of thumb, index, middle, ring and little finger."""
 CONTACT_PERCENTILE = 90
 """Percentile of z_hand / z_scene that counts as contact."""
@@ -145,7 +145,7 @@ def _from_hands(
 ) -> Scale | None:
     """Return the scale at which hands touch the scene; None with too few fingertips."""
     small, depth = _scene_depth(cameras, scene)
-    tips = joints_camera_m[:, :, TIPS].reshape(len(joints_camera_m), -1, 3)
+    tips = joints_camera_m[:, :, FINGERTIPS].reshape(len(joints_camera_m), -1, 3)
     row, column, inside = pixels_of(small, np.where(np.isfinite(tips), tips, -1.0))
     behind = np.take_along_axis(depth.reshape(len(depth), -1), row * small.width + column, axis=1)
     ratios = (tips[..., 2] / behind)[inside & np.isfinite(behind)]

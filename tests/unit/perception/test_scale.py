@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.geometry import pixel_rays
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict
-from egosim_jax.perception.scale import TIPS, estimate_scale, scale_cameras, scale_depth
+from egosim_jax.perception.scale import FINGERTIPS, estimate_scale, scale_cameras, scale_depth
 from egosim_jax.types import Cameras, InputError
 
 UNIT_M = 0.37
@@ -51,7 +51,7 @@ def hands_above(estimate, table, heights):
     rng = np.random.default_rng(0)
     rays = pixel_rays(estimate.cameras.intrinsics_px, height=HEIGHT, width=WIDTH)
     for frame, factor in enumerate(heights):
-        for tip in TIPS:
+        for tip in FINGERTIPS:
             row, column = rng.integers(20, 40), rng.integers(25, 55)
             behind = table.depth_m[0, row, column] * UNIT_M
             joints[frame, 1, tip] = rays[row, column] * behind * factor
