@@ -11,6 +11,9 @@ from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 SPEC = VideoSpec(frames=9, height=120, width=208, fps=8)
+UNKNOWN_CAMERAS = CameraEstimate(
+    cameras=None, metric=False, verdict=Verdict(rung="refused", reason="no texture", figures={})
+)
 
 
 def make_clip(seed=0):

@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from egosim_jax.perception.estimates import CameraEstimate, Verdict
 from egosim_jax.perception.networks.depth_anything import DepthAnything
 from egosim_jax.perception.networks.worker import close_workers
 from egosim_jax.types import InputError
 from tests.unit.perception.networks import tiny
+from tests.unit.perception.posed import UNKNOWN_CAMERAS
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (3, 48, 80, 3)).astype(np.uint8)
-UNKNOWN = CameraEstimate(
-    cameras=None, metric=False, verdict=Verdict(rung="refused", reason="no texture", figures={})
-)
 STILL = np.zeros(FRAMES.shape[:3], bool)
 
 
@@ -37,7 +34,7 @@ def test_depth_is_that_of_transformers_own_pipeline(folder):
     want = processor.post_process_depth_estimation(output, [(48, 80)] * 2)
     want = np.stack([one["predicted_depth"].numpy() for one in want])
 
-    found = DepthAnything(folder, batch=1)(FRAMES, STILL, UNKNOWN, [2, 0])
+    found = DepthAnything(folder, batch=1)(FRAMES, STILL, UNKNOWN_CAMERAS, [2, 0])
 
     assert found.frames.tolist() == [2, 0]
     assert found.metric
@@ -49,7 +46,7 @@ def test_depth_is_that_of_transformers_own_pipeline(folder):
 @pytest.mark.slow
 def test_a_missing_device_is_refused(folder):
     with pytest.raises(InputError, match=r"no device 'cuda:7'.*--device"):
-        DepthAnything(folder, device="cuda:7")(FRAMES, STILL, UNKNOWN, [0])
+        DepthAnything(folder, device="cuda:7")(FRAMES, STILL, UNKNOWN_CAMERAS, [0])
 
 
 def test_the_calling_process_never_imports_torch(folder):

@@ -4,17 +4,14 @@ import numpy as np
 import pytest
 
 from egosim_jax.geometry import invert, look_at, pixel_rays, project, transform
-from egosim_jax.perception.estimates import CameraEstimate, Verdict
 from egosim_jax.perception.networks.depth_files import DepthFiles
 from egosim_jax.types import InputError
+from tests.unit.perception.posed import UNKNOWN_CAMERAS
 
 HEIGHT, WIDTH, FRAMES = 8, 12, 3
 SMALL = np.array([[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]])
 POSES = np.stack(
     [look_at(np.array([0.1 * k, 0, -1.0]), np.zeros(3), up=np.array([0, 1.0, 0])) for k in range(3)]
-)
-UNKNOWN = CameraEstimate(
-    cameras=None, metric=False, verdict=Verdict(rung="refused", reason="", figures={})
 )
 
 
@@ -31,7 +28,7 @@ def folder(tmp_path):
 
 def read(folder, wanted=(0,)):
     frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
-    return DepthFiles(folder)(frames, frames[..., 0] > 0, UNKNOWN, wanted)
+    return DepthFiles(folder)(frames, frames[..., 0] > 0, UNKNOWN_CAMERAS, wanted)
 
 
 def test_depth_is_resized_and_unknown_pixels_stay_unknown(folder):

@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from egosim_jax.perception.estimates import CameraEstimate, Verdict
 from egosim_jax.perception.networks.depth_pro import DepthPro, focal_of
 from egosim_jax.perception.networks.worker import close_workers
 from egosim_jax.types import Cameras, InputError
 from tests.unit.perception.networks import tiny
+from tests.unit.perception.posed import UNKNOWN_CAMERAS
 
 pytestmark = pytest.mark.slow
 HEIGHT, WIDTH = 40, 60
 FRAMES = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3)).astype(np.uint8)
 STILL = np.zeros(FRAMES.shape[:3], bool)
-UNKNOWN = CameraEstimate(
-    cameras=None, metric=False, verdict=Verdict(rung="refused", reason="no texture", figures={})
-)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +50,7 @@ def test_depth_and_focal_length_follow_the_field_of_view(folder, expected):
     inverse, fields = expected
     network = DepthPro(folder)
     focal = 0.5 * WIDTH / np.tan(0.5 * np.radians(np.median(fields)))
-    found = network(FRAMES, STILL, UNKNOWN, [0, 1])
+    found = network(FRAMES, STILL, UNKNOWN_CAMERAS, [0, 1])
     assert found.metric
     assert np.ptp(inverse) > 1e-3
     check_depth(found.depth_m, inverse * WIDTH / focal)
@@ -66,7 +63,7 @@ def test_a_known_focal_length_replaces_the_estimated_one(folder, expected):
         world_from_camera=np.stack([np.eye(4)] * 2), intrinsics_px=matrix, height=HEIGHT,
         width=WIDTH,
     )  # fmt: skip
-    found = DepthPro(folder)(FRAMES, STILL, replace(UNKNOWN, cameras=cameras), [1])
+    found = DepthPro(folder)(FRAMES, STILL, replace(UNKNOWN_CAMERAS, cameras=cameras), [1])
     check_depth(found.depth_m, expected[0][1:] * WIDTH / 90)
 
 
