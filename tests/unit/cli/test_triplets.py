@@ -214,7 +214,7 @@ def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
     assert rate("videos") == 24
     assert rate("rate") == 8
     assert rate("frames", fps=12) == 12
-    with pytest.raises(InputError, match="do not say their frame rate: give it"):
+    with pytest.raises(InputError, match="have no frame rate: give it"):
         rate("frames")
     for name, have in (("videos", 24), ("rate", 8)):
         with pytest.raises(InputError, match=f"have {have} frames per second, not 30"):
