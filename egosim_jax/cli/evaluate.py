@@ -32,7 +32,7 @@ class Evaluate(Options):
 
     def run(self) -> int:
         """Compare all clips, then summarize."""
-        from egosim_jax.evaluation.methods import Folder
+        from egosim_jax.evaluation.methods import Folder, autoencoded
         from egosim_jax.evaluation.result import SHOWN
         from egosim_jax.evaluation.scoring import Protocol
 
@@ -40,10 +40,8 @@ class Evaluate(Options):
         first = folders[0]
         if len(folders) == 1 and "=" not in self.generated[0]:
             folders = [replace(first, name="generated", title="generated")]
-        title = "ground truth through the autoencoder"
-        vae = Folder(path=first.path, name="vae", title=title, suffix="_vae", optional=True)
         evaluation = self.compare(
-            [*folders, vae],
+            [*folders, autoencoded(first.path)],
             self.read_clips(),
             protocol=Protocol(size=self.size),
             out=self.out or first.path,
