@@ -44,7 +44,7 @@ from egosim_jax.worlds.tabletop.clips import render_scenes
 CASES = ("seen", "unseen")
 """The object moves in view, or while the wearer looks elsewhere."""
 AWAY_DEGREES = 50.0
-"""Angle by which the wearer turns away from the object."""
+"""Angle in degrees of the wearer's turn away from the object."""
 OUTSIDE_DEGREES = 35.0
 """Minimum horizontal angle between the optical axis and an object out of view."""
 FRAMES_BACK = 4
@@ -54,7 +54,7 @@ NEAR_PERCENT = 5.0
 TRUE = "ground truth, classical"
 """Row of the ground-truth frames, and of the state by classical perception of them."""
 SHEET_SCENES = 3
-"""Scenes of each case on the contact sheet."""
+"""Number of scenes of each case on the contact sheet."""
 MEASURES = {
     "kept": ("object where it was left %", "{:.0f}"),
     "region_psnr": ("region PSNR dB", "{:.2f}"),
@@ -64,15 +64,15 @@ MEASURES = {
 DEFINITIONS = {
     "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the image's width of its true "
     f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
-    "object_error": "distance of the centroid of the object, segmented by color among the colors "
-    "of all bodies, from that of its ground-truth ids, in percent of the width, median over those "
-    "frames",
-    "region_psnr": "dB over the pixels of those frames where the object is or was before the move",
+    "object_error": "distance between the object's centroid, segmented by color among the colors "
+    "of all bodies, and the centroid of its ground-truth ids, in percent of the width, median over "
+    "the same frames",
+    "region_psnr": "dB over the pixels of these frames where the object is or was before the move",
     "state_accuracy": "share of the object's points in the last state within 1 cm of its true "
-    "surface; 0 if there are none",
+    "surface; 0 without points",
     "seen, unseen": "the object is carried in view, or while the wearer looks elsewhere",
-    "ground truth": "frames of the true world, which test how the object is found, and the state "
-    "that classical perception makes of them",
+    "ground truth": "frames of the true world, which test the detection of the object, and the "
+    "state by classical perception of them",
     "differences": "from no update, on the same scenes; mean and 95 % interval",
 }
 

@@ -53,9 +53,9 @@ DEFINITIONS = {
     "goal horizontally and 2 cm vertically",
     "seen, frames": "the same by the ground-truth and by the generated frames: the centroid of the "
     "object, segmented by color among the colors of all bodies, is within 3 cm, at the goal's "
-    "depth, of that of the object at the goal; median over the last 3 frames in which the hand "
-    "does not hide it; else no success",
-    "state": "the same as true by the pose of the object in the state after the generated clip",
+    "depth, of the centroid of the object at the goal; median over the last 3 frames in which the "
+    "hand does not hide it; else no success",
+    "state": "as true, by the pose of the object in the state after the generated clip",
     **rank_correlation.DEFINITIONS,
 }
 
@@ -290,7 +290,7 @@ def _plot(rows: Mapping[str, Summary], path: Path, judges: Sequence[str]) -> Non
 
 
 def _draw(out: Path, tasks: Sequence[Task], generator: Generator) -> None:
-    """Draw the generated and the true clip of every policy."""
+    """Draw the generated and the ground-truth clip of every policy."""
     clips = []
     for task in tasks:
         start = World(scene=task.script.scene, seed=task.seed)

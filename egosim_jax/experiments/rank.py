@@ -21,12 +21,12 @@ from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 
 MEASURES = {"top1": ("top-1 %", "{:.1f}"), "spearman": ("Spearman", "{:.3f}")}
 DEFINITIONS = {
-    "score": "-LPIPS of AlexNet between the last frame of a video and that of the goal's action; "
-    "mean over seeds",
+    "score": "-LPIPS (AlexNet) between the last frames of a video and of the goal's action; mean "
+    "over seeds",
     "top1": "share of goals whose action has the highest score, in percent; 95 % interval of "
     "Clopper and Pearson",
-    "spearman": "rank correlation of the scores of a goal's candidates with those of their true "
-    "videos; mean over goals, 95 % interval of the bootstrap over goals",
+    "spearman": "rank correlation between the scores of a goal's candidates and the scores of their "
+    "true videos; mean over goals, 95 % interval of the bootstrap over goals",
 }
 MAX_TRIES = 200
 """Maximum number of actions of a scene to try for different ones."""
