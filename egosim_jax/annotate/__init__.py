@@ -15,4 +15,5 @@ and writes them. Source: EgoSim, section 4 (data); the authors' networks are opt
     cluster      annotate many clips on a Ray cluster
     gallery      HTML page of all clips
     to_episode   make an episode from an annotated clip
+    lerobot_episode   make an episode from a LeRobot dataset
 """

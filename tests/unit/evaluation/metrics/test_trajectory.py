@@ -51,7 +51,7 @@ def test_the_ground_truth_has_its_own_cameras(clip):
 
 
 def test_a_video_from_elsewhere_has_the_cameras_there(clip):
-    """Each frame stands in for its successor."""
+    """Each frame replaces the previous frame."""
     late = np.concatenate([clip.frames[1:], clip.frames[-1:]])
     truth = clip.cameras.world_from_camera
     found = estimate_cameras(late, clip.frames, clip.depth_m, still(clip), clip.cameras)[:-1]
