@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.types import Action, GroundTruth, SceneState
 
-IMAGES = 6
+SHEET_FRAMES = 6
 """Number of frames of each video on a contact sheet."""
 CLIPS = 3
 """Default number of clips in the tabletop world."""
@@ -181,7 +181,7 @@ def check_fits(episode: Episode, video: VideoSpec, config: str) -> None:
 
 def sheet_moments(frames: int) -> list[int]:
     """Return the evenly spaced frames of a video that a contact sheet shows."""
-    return [(frames - 1) * k // (IMAGES - 1) for k in range(IMAGES)]
+    return [(frames - 1) * k // (SHEET_FRAMES - 1) for k in range(SHEET_FRAMES)]
 
 
 @dataclass(frozen=True)
