@@ -142,7 +142,7 @@ class AnnotateConfig:
                 option = name.removesuffix("_px").removesuffix("_m").replace("_", "-")
                 raise InputError(f"--{option} is {value:g}: it must be above {low} and finite.")
         if self.scale is not None and self.camera_height_m is not None:
-            raise InputError("--scale and --camera-height both determine the scale: give one.")
+            raise InputError("--scale and --camera-height both determine the scale: choose one.")
         if self.rung is not None and self.rung not in get_args(ChosenRung):
             raise InputError(f"--rung must be one of {', '.join(get_args(ChosenRung))}.")
         if _find(_CAMERAS, self.cameras, "--cameras")[1] and (self.rung or self.focal_px):

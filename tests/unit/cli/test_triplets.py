@@ -188,7 +188,7 @@ def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, fixed, tmp_path):
     assert command.run() == 0
     (files,) = read_metadata(tmp_path / "out" / "metadata.csv")
     assert probe_video(files.target).fps == probe_video(files.prior).fps == rate
-    with pytest.raises(InputError, match=r"29\.97 frames per second, not 8: .*Leave it out"):
+    with pytest.raises(InputError, match=r"29\.97 frames per second, not 8: .*Omit --fps"):
         replace(command, fps=8).run()
 
 
