@@ -1,11 +1,11 @@
-"""Annotation of one clip: the stages over its record, journaled, and the files of its triplet.
+"""Annotation of one clip: run the stages, store their results and write the clip's files.
 
 work/ID/            journal and results of finished stages; removed when the clip is done
 ID/                 the triplet's files, in the layout of `data/metadata.py`
-ID/action.npz       world_from_camera, intrinsics_px and joints_m, as `egosim episode` reads
+ID/action.npz       world_from_camera, intrinsics_px and joints_m, which `egosim episode` reads
 ID/depth.npz        depth_m of the first frame, infinite where unknown
 ID/state            the scene (`state/snapshot.py`)
-ID/annotation.json  what was chosen and measured, or why the clip was refused; written last
+ID/annotation.json  choices and measurements, or the reason of a refusal; written last
 """
 
 from __future__ import annotations
@@ -41,44 +41,44 @@ from egosim_jax.types import InputError
 
 ANNOTATION, SHEET, WORK = "annotation.json", "sheet.jpg", "work"
 FINAL = ("done", "refused")
-"""Statuses of clips that are not annotated again; those that failed are."""
+"""Statuses of clips that are not annotated again; failed clips are retried."""
 MOMENTS = 6
-"""Frames of each video on the sheet of a clip."""
+"""Number of frames of each video on a clip's contact sheet."""
 SHEET_PX = 208
-"""Width of a frame on the sheet, in pixels."""
+"""Width of a frame on the contact sheet in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One clip to annotate: paths and small values only, so that it can be sent anywhere."""
+    """One clip to annotate: paths and small values only, cheap to send to other processes."""
 
     video_id: str
     """Unique id of the clip."""
     recording: str
     """Folder of the recording."""
     start: int
-    """First frame, at the rate of the clip."""
+    """First frame, at the clip's frame rate."""
     stop: int
-    """Frame after the last."""
+    """End frame, exclusive, at the clip's frame rate."""
     figures: Mapping[str, float]
-    """Figures of its quality."""
+    """Quality figures of the clip (`prepare.Quality`)."""
     focal_px: float | None = None
-    """Focal length of its device in pixels of the clip, from other clips of the video."""
+    """Focal length in pixels of the clip, estimated from other clips of the video."""
 
 
 def annotate(
-    job: Job, out: Path, config: AnnotateConfig, parts: Estimators, *, first_only: bool = False
+    job: Job, out: Path, config: AnnotateConfig, estimators: Estimators, *, first_only: bool = False
 ) -> str:
-    """Annotate a clip, or run its first stages only; return done, refused, failed or started.
+    """Annotate a clip; return its status: done, refused, failed or (with `first_only`) started.
 
-    What was finished before is not repeated. An error of the program is reported as a failure of
-    this clip, with its traceback in `work`; a full disk ends the run.
+    Finished stages are not repeated. An unexpected error counts as a failure of this clip, with a
+    traceback in `work`. System failures, such as a full disk, end the run.
     """
     if is_final(job, out):
         return read_annotation(job.video_id, out)["status"]
     notes: dict[str, Any] = {}
     try:
-        record = _run_stages(job, out, config, parts, notes, first_only=first_only)
+        record = _run_stages(job, out, config, estimators, notes, first_only=first_only)
         if record is None:
             return "started"
         _write(job, out, config, record, notes)
@@ -104,20 +104,20 @@ def read_annotation(video_id: str, out: Path) -> dict[str, Any]:
 
 
 def is_final(job: Job, out: Path) -> bool:
-    """Return True if a clip is annotated and is not to be tried again."""
+    """Return True if a clip needs no further attempt."""
     about = read_annotation(job.video_id, out)
     return about.get("status") in FINAL and not (can_retry(about) and job.focal_px is not None)
 
 
 def can_retry(about: Mapping[str, Any]) -> bool:
-    """Return True for a clip without cameras that its device's focal length may still give."""
+    """Return True if no cameras were found, and a known focal length may still help."""
     return about.get("rule") == "cameras" and about.get("focal_px") is None
 
 
 def finish(
     job: Job, out: Path, config: AnnotateConfig, status: str, notes: Mapping[str, Any]
 ) -> None:
-    """Write the annotation of a clip, and a sheet of the video of one without a triplet."""
+    """Write the annotation of a clip; if there is no triplet, draw its video instead."""
     folder = out / job.video_id
     if status != "done":
         _draw_refused(job, out, config)
@@ -136,7 +136,7 @@ def finish(
 
 
 def open_record(job: Job, config: AnnotateConfig) -> Record:
-    """Return the record of a clip before its stages, with its frames."""
+    """Return the initial record of a clip, with its frames."""
     recording = Recording.load(Path(job.recording))
     fitted = plan(recording, config.sampling, cut=config.cutting.clips)
     frames = read_frames(recording, fitted, job.start, job.stop)
@@ -154,14 +154,14 @@ def _run_stages(
     job: Job,
     out: Path,
     config: AnnotateConfig,
-    parts: Estimators,
+    estimators: Estimators,
     notes: dict[str, Any],
     *,
     first_only: bool,
 ) -> Record | None:
-    """Run the stages, or load their results; return the record, or None after the first ones.
+    """Run the stages or load their results; return the record, or None with `first_only`.
 
-    Notes and times of the stages are added to `notes` as they finish.
+    Each finished stage adds its notes and time to `notes`, which survive an error of a later stage.
     """
     import cv2
 
@@ -174,13 +174,13 @@ def _run_stages(
     record = open_record(job, config)
     times = notes.setdefault("seconds", {})
     for stage in chosen:
-        cv2.setRNGSeed(config.seed % 2**31)
+        cv2.setRNGSeed(config.seed % 2**31)  # per stage: a resumed clip gets the same results
         then = time.monotonic()
         if stage.stored:
-            record = _stored(journal, folder, stage, record, parts, config)
+            record = _stored(journal, folder, stage, record, estimators, config)
             times[stage.name] = journal.done[stage.name]["seconds"]
         else:
-            record = stage.run(record, parts, config)
+            record = stage.run(record, estimators, config)
             times[stage.name] = round(time.monotonic() - then, 3)
         notes |= record.notes
     return None if first_only else record
@@ -191,13 +191,13 @@ def _stored(
     folder: Path,
     stage: Stage,
     record: Record,
-    parts: Estimators,
+    estimators: Estimators,
     config: AnnotateConfig,
 ) -> Record:
     return journal.phase(
         stage.name,
         folder / f"{stage.name}.npz",
-        make=lambda: stage.run(record, parts, config),
+        make=lambda: stage.run(record, estimators, config),
         save=lambda path, found: records.save(path, found, stage.stored, stage.name),
         load=partial(_load, record=record, stage=stage),
     )
@@ -210,7 +210,7 @@ def _load(path: Path, *, record: Record, stage: Stage) -> Record:
 def _write(
     job: Job, out: Path, config: AnnotateConfig, record: Record, notes: dict[str, Any]
 ) -> None:
-    """Write the triplet and what was estimated with it."""
+    """Write the triplet, its cameras, joints, depth and state, and a contact sheet."""
     then = time.monotonic()
     triplet, figures = to_triplet(record, config)
     check_prior(record.require("estimate").verdict.rung, figures, config)
@@ -248,7 +248,7 @@ def _write(
 
 
 def _draw_refused(job: Job, out: Path, config: AnnotateConfig) -> None:
-    """Draw frames of a clip that has no triplet, if its video can be read."""
+    """Draw frames of a clip without a triplet, if its video is readable."""
     picked = np.linspace(job.start, job.stop - 1, MOMENTS).astype(int)
     try:
         recording = Recording.load(Path(job.recording))

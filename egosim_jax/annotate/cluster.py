@@ -1,13 +1,12 @@
-"""Annotation on Ray: the stages as two pools of actors, on this machine or on a cluster.
+"""Annotation on Ray: two pools of actors run the stages, on this machine or on a cluster.
 
     ray start --head                                    on one machine of the cluster
-    ray start --address=HEAD:6379                       on each of the others
+    ray start --address=HEAD:6379                       on each other machine
     ray job submit -- egosim data annotate VIDEO ... --out OUT --ray auto --ray-actors 8 4
 
-OUT and the videos must be at the same paths on all machines. Rows are ids and paths: no frame
-enters the object store. What an actor finishes is on disk, so a run that was killed resumes as one
-without Ray does, and either continues the other's. A local cluster listens on the loopback device
-only and sends no usage statistics.
+OUT and the videos must have the same paths on all machines. Rows hold ids and paths: no frame
+enters the object store. Actors write finished stages to disk, so a killed run can be resumed, with
+or without Ray. A local cluster listens on the loopback device only and sends no usage statistics.
 """
 
 from __future__ import annotations
@@ -27,32 +26,37 @@ from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.types import InputError
 
 ADDRESS = "RAY_ADDRESS"
-"""Variable that names the cluster of a submitted job."""
+"""Environment variable with the cluster address of a submitted job."""
 
 
 LOOPBACK = "127.0.0.1"
 
 
 class FirstStages:
-    """Actor that runs the stages that need no camera, on rows of clips."""
+    """Ray actor for the first stages, which need no cameras; it maps rows of clips."""
 
     def __init__(self, out: str, config: AnnotateConfig):
-        self._out, self._config, self._parts = Path(out), config, config.build()
+        self._out, self._config, self._estimators = Path(out), config, config.build()
 
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         """Return the row with the clip's status."""
-        status = clip.annotate(_job(row), self._out, self._config, self._parts, first_only=True)
+        status = clip.annotate(
+            _job(row), self._out, self._config, self._estimators, first_only=True
+        )
         return {**row, "status": status}
 
 
 class LastStages(FirstStages):
-    """Actor that runs the other stages and writes the clips."""
+    """Ray actor for the other stages; it also writes the clips."""
 
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         """Return the row with the clip's status."""
         if row["status"] == "failed":
             return row
-        return {**row, "status": clip.annotate(_job(row), self._out, self._config, self._parts)}
+        return {
+            **row,
+            "status": clip.annotate(_job(row), self._out, self._config, self._estimators),
+        }
 
 
 def annotate_on_ray(
@@ -64,9 +68,9 @@ def annotate_on_ray(
     gpus: tuple[float, float] = (0.0, 0.0),
     actors: tuple[int, int] = (1, 1),
 ) -> Iterator[str]:
-    """Annotate clips by two pools of actors; yield the status of each when it is done.
+    """Annotate clips by two pools of actors; yield the status of each finished clip.
 
-    `address` is that of a cluster; `auto` is the one that RAY_ADDRESS names, or a new local one.
+    `address` is a cluster address, or `auto` for the cluster in RAY_ADDRESS or a new local one.
     """
     if find_spec("ray") is None:
         raise InputError(
@@ -82,11 +86,11 @@ def annotate_on_ray(
 
     try:
         data = ray.data.from_items(rows, override_num_blocks=min(len(rows), 1000))
-        for stage, gpu, most in zip((FirstStages, LastStages), gpus, actors, strict=True):
+        for stage, gpu, max_actors in zip((FirstStages, LastStages), gpus, actors, strict=True):
             data = data.map(
                 cast(Any, stage),
                 fn_constructor_args=(str(out), config),
-                compute=ray.data.ActorPoolStrategy(min_size=1, max_size=max(1, most)),
+                compute=ray.data.ActorPoolStrategy(min_size=1, max_size=max(1, max_actors)),
                 num_gpus=gpu or None,
             )
         for row in data.iter_rows():
@@ -98,7 +102,7 @@ def annotate_on_ray(
 def _connect(address: str) -> None:
     """Connect to a cluster, or start one that only this machine can reach."""
     alone = address == "auto" and not os.environ.get(ADDRESS)
-    if alone:  # before ray is imported, which decides then what it listens on
+    if alone:  # before the import: ray reads these variables when it is imported
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     import ray
@@ -115,8 +119,8 @@ def _connect(address: str) -> None:
     if (listens := ray.util.get_node_ip_address()) != LOOPBACK:
         ray.shutdown()
         raise InputError(
-            f"Ray would listen on {listens}, not on the loopback device alone: this version, or a "
-            "program that imported Ray before, decides so. Start a cluster yourself and give its "
+            f"Ray would listen on {listens}, not only on the loopback device. The cause is this "
+            "version of Ray, or an earlier import of Ray. Start a cluster yourself and give its "
             "address. (--ray)"
         )
 

@@ -1,6 +1,6 @@
-"""Configuration of an annotation: rules for clips, and the estimator of each stage.
+"""Configuration of an annotation: rules for the clips, and an estimator for each stage.
 
-An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
+An estimator is given as `NAME`, or as `NAME=FOLDER` with the weights of a network:
 
     masks     geometry, sam3=FOLDER, grounded-sam3=FOLDER, grounded-sam2=FOLDER,
               grounded-edgetam=FOLDER                     perception.silhouettes, networks
@@ -8,7 +8,7 @@ An estimator is written `NAME`, or `NAME=FOLDER` for a network's weights:
     depth     sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER
     caption   any text, or qwen=FOLDER
 
-Every choice that the stages would make can be given instead: focal length, rung, scale, side.
+Focal length, rung, scale and side are estimated unless they are given.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ class Estimators:
     cameras: CameraEstimator
     depth: DepthEstimator
     segmenter: Segmenter | None = None
-    """None for silhouettes drawn from the hands."""
+    """Segmentation network; None: silhouettes are drawn from the hands."""
     captioner: Captioner | None = None
-    """None for captions from the recording or the command."""
+    """Caption network; None: captions come from the recording or the command."""
 
     def prepare(self) -> None:
-        """Fetch what is fetched at the first use; raise `InputError` naming missing packages."""
+        """Fetch missing weights now. Raises `InputError` if a package is missing."""
         from egosim_jax.perception.cameras import CameraLadder
         from egosim_jax.perception.cameras.colmap import require_pycolmap
         from egosim_jax.perception.hands import LandmarkHands
@@ -87,53 +87,53 @@ class Estimators:
 
 @dataclass(frozen=True, kw_only=True)
 class AnnotateConfig:
-    """Configuration of an annotation; equal ones make equal annotations."""
+    """Configuration of an annotation; equal configurations give equal annotations."""
 
     sampling: Sampling = field(default_factory=Sampling)
-    """Size, rate and length of the clips."""
+    """Size, frame rate and length of the clips."""
     cutting: Cutting = field(default_factory=Cutting)
-    """Shots, windows and quality."""
+    """Rules for shots, windows and quality."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""
     offline: bool = False
-    """Refuse to fetch anything."""
+    """Never download: raise `InputError` if files are missing."""
     side: Side = "auto"
-    """Side of all hands; auto: as the landmarks say."""
+    """Side of all hands; auto: as detected."""
     masks: str = "geometry"
-    """Silhouettes of hands, arms and objects."""
+    """Estimator of the silhouettes of hands, arms and objects."""
     detector: Path | None = None
-    """Folder of Grounding DINO, which finds what a tracker follows."""
+    """Folder of Grounding DINO, which detects the objects for a tracker."""
     device: str = "auto"
     """Device of the networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     dtype: DType = "float32"
     """Floating-point type of the networks."""
     phrases: tuple[str, ...] = ()
-    """Objects to segment, where no network names them."""
+    """Names of the objects to segment, if no network finds them."""
     cameras: str = "ladder"
-    """Camera estimator; the recording's cameras are used instead where it has some."""
+    """Camera estimator; cameras in the recording take precedence."""
     focal_px: float | None = None
     """Focal length in pixels of the video."""
     rung: ChosenRung | None = None
-    """Rung of the ladder of camera estimation to use instead of trying them."""
+    """Rung of the camera ladder to use, instead of trying all."""
     depth: str = "sweep"
-    """Depth estimator; the recording's depth is used instead where it has some."""
+    """Depth estimator; depth in the recording takes precedence."""
     scale: float | None = None
     """Meters per unit of the cameras."""
     camera_height_m: float | None = None
-    """Height of the camera above the surface in front of it, from which the scale follows."""
+    """Height in meters of the camera above the surface in front of it; determines the scale."""
     state: Literal["first", "fused"] = "first"
-    """Scene of the prior: seen in the first frame alone, or fused from key frames."""
+    """Scene of the prior: from the first frame, or fused from key frames."""
     caption: str | None = None
-    """Caption, or a network that writes it."""
+    """Caption of all clips, or a network that writes captions."""
     renderer: RendererName = "jax"
     """Renderer of prior and hands."""
     split: str = "train"
-    """Value of the column split."""
+    """Value of the metadata column `split`."""
     seed: int = 0
-    """Seed of what is random."""
+    """Random seed."""
 
     def __post_init__(self) -> None:
-        """Check everything that can be checked before a video is read."""
+        """Check all settings before any video is read."""
         check_seed(self.seed)
         check_length(self.sampling.num_frames, cut=self.cutting.clips)
         for name, low in (("focal_px", 1), ("scale", 0), ("camera_height_m", 0)):
@@ -142,31 +142,31 @@ class AnnotateConfig:
                 option = name.removesuffix("_px").removesuffix("_m").replace("_", "-")
                 raise InputError(f"--{option} is {value:g}: it must be above {low} and finite.")
         if self.scale is not None and self.camera_height_m is not None:
-            raise InputError("--scale and --camera-height both give the scale: choose one.")
+            raise InputError("--scale and --camera-height both determine the scale: choose one.")
         if self.rung is not None and self.rung not in get_args(ChosenRung):
             raise InputError(f"--rung must be one of {', '.join(get_args(ChosenRung))}.")
         if _find(_CAMERAS, self.cameras, "--cameras")[1] and (self.rung or self.focal_px):
             raise InputError(
-                "--rung and --focal are options of --cameras ladder: a network that estimates "
-                "cameras takes neither. Omit them."
+                "--rung and --focal are options of --cameras ladder, not of a camera network. "
+                "Omit them."
             )
         _find(_DEPTH, self.depth, "--depth")
         name, _ = _find(_MASKS, self.masks, "--masks")
         if name.startswith("grounded-") != (self.detector is not None):
             raise InputError(
                 "--masks grounded-...=FOLDER and --detector FOLDER belong together: the detector "
-                "finds what the tracker follows."
+                "finds the objects that the tracker follows. Give both, or neither."
             )
 
     @property
     def depth_files(self) -> Path | None:
-        """Folder of depth maps made by others."""
+        """Folder of given depth maps, if any."""
         name, folder = _find(_DEPTH, self.depth, "--depth")
         return folder if name == "files" else None
 
     @property
     def caption_text(self) -> str | None:
-        """Caption that was given as text."""
+        """Caption given as text, if any."""
         return None if self._captioner else self.caption
 
     @property
@@ -174,7 +174,7 @@ class AnnotateConfig:
         return (self.caption or "").partition("=")[0] in _CAPTIONS and "=" in (self.caption or "")
 
     def build(self) -> Estimators:
-        """Return the estimators; heavy libraries are imported here, networks loaded later."""
+        """Return the estimators; this imports heavy libraries, but loads no network yet."""
         from egosim_jax.perception.cameras import CameraLadder
         from egosim_jax.perception.hands import LandmarkHands
 
@@ -192,7 +192,7 @@ class AnnotateConfig:
             name, folder = _find(_CAPTIONS, self.caption or "", "--caption")
             captioner = cast(Captioner, _import(_CAPTIONS[name])(folder, **where))
         name, folder = _find(_DEPTH, self.depth, "--depth")
-        if name == "files":  # frames without a map are estimated
+        if name == "files":  # for frames without a depth map
             name, folder = "sweep", None
         kind = _import(_DEPTH[name])
         depth = kind() if folder is None else kind(folder, **where)
@@ -206,7 +206,7 @@ class AnnotateConfig:
 
 
 def _find(known: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:
-    """Return name and folder of an estimator. Raises `InputError` naming all that are known."""
+    """Return name and folder of an estimator. Raises `InputError` listing the known ones."""
     name, equals, folder = text.partition("=")
     bare = name in _BARE
     if name not in known or bool(equals) == bare or (equals and not folder):

@@ -1,13 +1,13 @@
-"""Rate, size and length of the clips of a recorded video, and its frames at that size.
+"""Frame rate, size and length of the clips of a recorded video, and its frames at that size.
 
-- Rate: that of the video. Above 60 fps every second, third, ... frame is taken, so that 60 are not
-  exceeded. Another rate takes the frame nearest in time, as EgoSim does. Frames are taken to be
-  equally spaced; a variable frame rate is refused (`sources`).
-- Size: that of the video, reduced to at most 832 pixels on its longer side and cropped at the
-  borders to multiples of 16. Another size crops what its aspect ratio does not hold; one that would
-  lose more than 40 % of the image, as landscape from portrait, is refused.
-- Length: all frames, cut to 4k+1. More than 601 need `--clips` or `--num-frames`.
-- HDR (PQ or HLG) is refused: converted to 8 bits without its tone curve, it would be pale.
+- Frame rate: by default the video's. Above 60 fps, every second, third, ... frame is taken, for at
+  most 60 fps. A given rate takes the frames nearest in time, as EgoSim does. Frames are assumed to
+  be equally spaced; `sources` refuses a variable frame rate.
+- Size: by default the video's, reduced to at most 832 pixels on the longer side and cropped to
+  multiples of 16. A given size crops the image to its aspect ratio. A crop that loses more than
+  40 % of the image, such as landscape from portrait, is refused.
+- Length: all frames, cut to 4k+1. More than 601 frames need `--clips` or `--num-frames`.
+- HDR (PQ or HLG) is refused: converted to 8 bits without its tone curve, it looks pale.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from egosim_jax.io.bounded import quote_path
 from egosim_jax.types import WAN_GRID, InputError, check_counts
 
 MAX_FPS = 60
-"""Highest rate that is kept, in frames per second."""
+"""Maximum frame rate of clips in frames per second."""
 MAX_CLIP_FRAMES, MIN_CLIP_FRAMES = 601, 9
-"""Longest and shortest clip in frames."""
-LONGEST_PX = 832
-"""Longer side of clips without a given size, at most, in pixels."""
+"""Maximum and minimum length of a clip in frames."""
+MAX_SIDE_PX = 832
+"""Maximum longer side in pixels of clips without a given size."""
 MIN_KEPT = 0.6
-"""Smallest fraction of the image that a crop may keep."""
+"""Minimum fraction of the image that a crop must keep."""
 CHUNK = 300
-"""Frames of a video that are decoded at a time."""
+"""Number of frames that are decoded at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Size, rate and length of clips, each that of the video where it is not given."""
+    """Size, frame rate and length of clips; None: as in the video."""
 
     size: tuple[int, int] | None = None
     """Height and width in pixels, multiples of 16."""
     fps: float | None = None
     """Frame rate of the clips in frames per second."""
     num_frames: int | None = None
-    """Frames of a clip, 4k + 1."""
+    """Number of frames in a clip, 4k + 1."""
 
     def __post_init__(self) -> None:
         """Check that a model can encode such clips."""
@@ -60,18 +60,18 @@ class Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The frames to take of one video and how to fit them."""
+    """Frames to take from one video, and their scale and crop."""
 
     source_fps: Fraction
-    """Rate of the video in frames per second."""
+    """Frame rate of the video in frames per second."""
     fps: Fraction
-    """Rate of the clips in frames per second."""
+    """Frame rate of the clips in frames per second."""
     count: int
-    """Number of frames at the rate of the clips."""
+    """Number of frames of the whole video at the clips' frame rate."""
     height: int
-    """Rows of a clip in pixels."""
+    """Height of a clip in pixels."""
     width: int
-    """Columns of a clip in pixels."""
+    """Width of a clip in pixels."""
     scale: float
     """Pixels of the clip per pixel of the video."""
     offset_px: tuple[float, float]
@@ -79,16 +79,17 @@ class Plan:
 
     @no_type_check
     def indices(self, start: int, stop: int) -> Int[np.ndarray, " f"]:
-        """Return the frames of the video nearest in time to some at the rate of the clips.
+        """Return the frames of the video nearest in time to frames `start` to `stop` of the clip.
 
-        Of two equally near ones the later is taken.
+        Of two equally near frames, the later one is taken.
         """
+        # Fractions: with floats, frame rates such as 30000/1001 would round ties at random.
         times = [Fraction(k) * self.source_fps / self.fps for k in range(start, stop)]
         return np.array([int(time + Fraction(1, 2)) for time in times])
 
     @no_type_check
     def intrinsics(self, source_px: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-        """Return intrinsics of the video as those of the clip, both in pixels."""
+        """Return the intrinsics of the clip, given the intrinsics of the video, both in pixels."""
         fitted = np.array(source_px, float)
         fitted[:2] *= self.scale
         fitted[:2, 2] += (self.scale - 1) / 2 - np.array(self.offset_px)
@@ -96,7 +97,7 @@ class Plan:
 
     @no_type_check
     def fit(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Return a frame of the video resized, by areas, and cropped."""
+        """Return a frame of the video, resized (by area if smaller) and cropped."""
         import cv2
 
         rows, columns = frame.shape[:2]
@@ -108,9 +109,10 @@ class Plan:
 
 
 def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
-    """Return rate, size and crop of a recording's clips, which are `cut` from it or all of it.
+    """Return frame rate, size and crop of a recording's clips.
 
-    Raises `InputError` for one that is too short or too long, or of another shape than the size.
+    Without `cut`, the whole recording is one clip. Raises `InputError` if the recording is too
+    short or too long, or if the size has too different an aspect ratio.
     """
     name = quote_path(recording.video)
     fps = recording.fps / ceil(recording.fps / MAX_FPS)
@@ -126,7 +128,7 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     if not cut and sampling.num_frames is None and count > MAX_CLIP_FRAMES:
         raise InputError(
             f"{name} has {count} frames at {float(fps):.4g} fps: a clip has at most "
-            f"{MAX_CLIP_FRAMES}. Cut it into clips (--clips), or take its first ones "
+            f"{MAX_CLIP_FRAMES}. Cut it into clips (--clips), or take its first frames "
             "(--num-frames)."
         )
     info = recording
@@ -152,8 +154,8 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
 
 
 def _own_size(info: Recording) -> tuple[int, int]:
-    """Return the largest size on the grid of at most 832 pixels that keeps a video's shape."""
-    scale = min(1.0, LONGEST_PX / max(info.height, info.width))
+    """Return the largest size on the grid with a video's aspect ratio and at most 832 pixels."""
+    scale = min(1.0, MAX_SIDE_PX / max(info.height, info.width))
     unit = WAN_GRID.spatial_stride * WAN_GRID.patch
     height, width = (
         max(unit, int(size * scale + 1e-6) // unit * unit) for size in (info.height, info.width)
@@ -164,7 +166,7 @@ def _own_size(info: Recording) -> tuple[int, int]:
 def read_frames(
     recording: Recording, fitted: Plan, start: int, stop: int
 ) -> UInt8[np.ndarray, "f h w 3"]:
-    """Return frames `start` to `stop`, at the rate of the clips, fitted to their size.
+    """Return frames `start` to `stop` at the clips' frame rate and size.
 
     Raises `InputError` if the video is damaged.
     """

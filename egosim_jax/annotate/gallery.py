@@ -1,4 +1,4 @@
-"""A page of all annotated clips: prior, mask, hands and video, or why there is none."""
+"""HTML page of all annotated clips: prior, mask, hands and video, or the reason of a refusal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egosim_jax.io.run import write_text
 
 PAGE = "index.html"
 MAX_IMAGES = 500
-"""Maximum number of clips shown with their images; the others are only listed."""
+"""Maximum number of clips shown with images; further clips are only listed."""
 MAX_SHEET_BYTES = 1 << 24
 _HEAD = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>Annotated clips</title>
@@ -31,7 +31,7 @@ h2 { font-size: 16px; margin: 4px 0 }
 
 
 def write_page(out: Path, report: Mapping[str, Any]) -> None:
-    """Write the page: self-contained, without scripts; every text is escaped."""
+    """Write the page: self-contained, without scripts, with escaped text."""
     counts = report["clips"]
     parts = [
         _HEAD,

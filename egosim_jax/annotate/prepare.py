@@ -1,10 +1,10 @@
 """Shots, windows and quality of a recorded video, measured on thumbnails in one pass.
 
-A shot ends where the image changes by more than `cut_difference` gray levels and three times as
-much as in the frames around (adaptive content detection, as in PySceneDetect); black frames belong
-to no shot. A clip is a window of one shot. It is refused if it is black, blurred, still, or shaken,
-each with the figure that decided; the figures are fractions of the image's width, so that they
-hold for any size. Whether hands are visible is known after the first stage (`stages`).
+A shot ends where the image changes by more than `cut_difference` gray levels and by more than three
+times the change in the frames around (adaptive content detection, as in PySceneDetect). Black
+frames belong to no shot. A clip is a window of one shot. Black, blurred, still or shaken clips are
+refused, with the decisive figure. Motion is measured in image widths, which makes the limits
+independent of the size. The first stage checks if hands are visible (`stages`).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.types import WAN_GRID, InputError
 
 THUMB_PX = 160
-"""Width of the thumbnails, on which changes and motion are measured, in pixels."""
+"""Width in pixels of the thumbnails for changes and motion."""
 SHARP_PX = 320
-"""Width at which sharpness is measured, in pixels."""
+"""Width in pixels at which sharpness is measured."""
 
 
 class RefusedError(InputError):
-    """Raised for a clip that a rule refuses, with the rule's name and the figures that decided."""
+    """A rule refuses a clip; has the name of the rule and the decisive figures."""
 
     def __init__(self, rule: str, reason: str, figures: Mapping[str, float] | None = None):
         super().__init__(reason)
@@ -37,23 +37,23 @@ class RefusedError(InputError):
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """Rules that a clip must satisfy; 0 or infinity switches a rule off."""
+    """Rules for a clip; 0 or infinity switches a rule off."""
 
     min_hands: float = 0.5
-    """Smallest fraction of frames in which a hand is visible."""
+    """Minimum fraction of frames in which a hand is visible."""
     min_sharpness: float = 15.0
-    """Smallest median over frames of the Laplacian's variance, in squared gray levels."""
+    """Minimum variance of the Laplacian in squared gray levels, median over frames."""
     max_black: float = 0.0
-    """Largest fraction of black frames, darker than 16 of 255."""
+    """Maximum fraction of black frames (mean gray level below 16 of 255)."""
     min_motion: float = 0.005
-    """Smallest motion of what moves fastest (95 %), in widths of the image per second."""
+    """Minimum speed of the fastest motion (95th percentile), in image widths per second."""
     max_motion: float = 1.5
-    """Largest motion of the image as a whole (median), in widths of the image per second."""
+    """Maximum speed of the camera motion (median), in image widths per second."""
     min_prior_gain_db: float = -2.0
-    """Smallest PSNR of the prior, compared with that of the first frame repeated, in decibels."""
+    """Minimum PSNR of the prior minus PSNR of the repeated first frame, in decibels."""
 
     def check(self, figures: Mapping[str, float]) -> None:
-        """Raise `RefusedError` for the first rule that the figures of a clip break."""
+        """Raise `RefusedError` for the first rule that a clip breaks."""
         for rule, name, bad, option in (
             ("black", "black", figures["black"] > self.max_black, "--max-black"),
             ("blur", "sharpness", figures["sharpness"] < self.min_sharpness, "--min-sharpness"),
@@ -73,41 +73,43 @@ class Cutting:
     """Rules for shots and windows."""
 
     clips: bool = False
-    """Cut videos into clips; else a video is one clip, which a cut makes unusable."""
+    """Cut videos into clips; otherwise a video is one clip and must have no cut."""
     cut_difference: float = 15.0
-    """Smallest change of the image at a cut, in gray levels."""
+    """Minimum change of the image at a cut, in gray levels."""
     quality: Quality = field(default_factory=Quality)
-    """Rules that a clip must satisfy."""
+    """Quality rules for clips."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """Measurements of every frame of a video, at the rate of the clips."""
+    """Measurements of every frame of a video, at the clips' frame rate."""
 
     difference: Float[np.ndarray, " f"]
-    """Mean absolute change of color from the frame before, in gray levels."""
+    """Mean absolute color change from the previous frame, in gray levels."""
     luminance: Float[np.ndarray, " f"]
     """Mean brightness in gray levels."""
     sharpness: Float[np.ndarray, " f"]
     """Variance of the Laplacian in squared gray levels."""
     motion: Float[np.ndarray, "f 2"]
-    """Optical flow from the frame before, median and 95 %, in widths of the image per second."""
+    """Optical flow from the previous frame, median and 95 %, in image widths per second."""
 
     @property
     def black(self) -> Bool[np.ndarray, " f"]:
-        """Frames that are black."""
+        """True for black frames."""
         return self.luminance < 16
 
-    def cuts(self, least: float) -> list[int]:
-        """Return the first frames of all shots but the first."""
+    def cuts(self, min_difference: float) -> list[int]:
+        """Return the first frame of every shot except the first shot."""
         around = np.pad(self.difference, 3, mode="edge")
         near = np.stack([around[k : k + len(self.difference)] for k in (0, 1, 2, 4, 5, 6)])
-        sudden = (self.difference > least) & (self.difference > 3 * np.median(near, axis=0))
+        sudden = (self.difference > min_difference) & (
+            self.difference > 3 * np.median(near, axis=0)
+        )
         return np.flatnonzero(sudden).tolist()
 
     def figures(self, start: int, stop: int) -> dict[str, float]:
-        """Return the figures of a clip that `Quality` judges."""
+        """Return the figures of a clip for `Quality.check`."""
         inner = self.motion[start + 1 : stop]
         return {
             "black": float(self.black[start:stop].mean()),
@@ -157,24 +159,24 @@ def scan(recording: Recording, fitted: Plan) -> Scan:
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """A clip to annotate: some frames of a recording, at the rate of the clips."""
+    """A clip to annotate: a range of frames of a recording, at the clips' frame rate."""
 
     video_id: str
     """Unique id of the clip."""
     start: int
-    """First frame of the clip in the video."""
+    """First frame of the clip."""
     stop: int
-    """Frame after the last."""
+    """End frame, exclusive."""
     figures: Mapping[str, float]
-    """Figures that `Quality` judges."""
+    """Figures for `Quality.check`."""
     refused: tuple[str, str] | None = None
-    """Rule and reason if the clip is refused."""
+    """Rule and reason of a refusal; None for an accepted clip."""
 
 
 def windows(
     recording: Recording, scanned: Scan, length: int | None, rules: Cutting
 ) -> list[Window]:
-    """Return the clips of a recording, refused ones included."""
+    """Return the clips of a recording, including refused clips."""
     count = len(scanned.difference)
     cuts = scanned.cuts(rules.cut_difference)
     name = recording.recording_id
@@ -183,10 +185,8 @@ def windows(
         inside = [cut for cut in cuts if cut < stop]
         refusal = None
         if inside:
-            refusal = (
-                "cut",
-                (f"the shot changes at frame {inside[0]}: a clip is one shot. (--clips)"),
-            )
+            reason = f"the shot changes at frame {inside[0]}: a clip is one shot. (--clips)"
+            refusal = "cut", reason
         return [_judge(name, scanned, 0, stop, rules, refusal)]
     check_length(length, cut=True)
     found, length = [], length or count
@@ -198,7 +198,7 @@ def windows(
 
 
 def _shots(scanned: Scan, cuts: Sequence[int]) -> list[tuple[int, int]]:
-    """Return first frame and end of every run of frames that are in one shot and not black."""
+    """Return first frame and end of every run of non-black frames in one shot."""
     bounds = np.zeros(len(scanned.black) + 1, bool)
     bounds[[0, *cuts, -1]] = True
     changes = np.flatnonzero(np.diff(scanned.black.astype(int))) + 1
@@ -225,7 +225,7 @@ def _judge(
 
 
 def check_length(length: int | None, *, cut: bool) -> None:
-    """Raise `InputError` if clips are cut without a length, or of one that is too long."""
+    """Raise `InputError` if clips are cut without a length, or are too long."""
     if cut and length is None:
         raise InputError("--clips needs the length of the clips: --num-frames, or --config.")
     if length is not None and length > MAX_CLIP_FRAMES:

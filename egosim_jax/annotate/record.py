@@ -1,8 +1,8 @@
-"""The growing record of one clip, and storage of a stage's results as npz.
+"""Record of one clip, to which every stage adds results, and their storage as npz.
 
-Every stage reads the record and returns it with its own fields added, as in `perception.pipeline`.
-Expensive fields are stored by name: arrays as they are, nested dataclasses by dotted names, object
-ids run-length encoded, everything else as JSON. Nothing is pickled.
+Every stage reads the record and returns it with additional fields, as in `perception.pipeline`.
+Expensive fields are stored by name: arrays directly, nested dataclasses by dotted names, object ids
+with run-length encoding, and all other values as JSON. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -43,48 +43,48 @@ _CLASSES = {
     "estimate.lens": Lens,
     "depth": DepthEstimate,
 }
-"""Dataclass of each dotted name."""
+"""Dataclass of each dotted field name."""
 _RUNS = "object_ids"
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Results of the stages for one clip; None where no stage has run yet."""
+    """Results of the stages for one clip; None before the stage has run."""
 
     video_id: str
     """Unique id of the clip."""
     recording: Recording
-    """Knowledge of the clip's part of the video; its frames are at the video's rate."""
+    """Recorded data of this segment, at the video's frame rate."""
     plan: Plan
-    """Rate and crop of the clip."""
+    """Frame rate and crop of the clip."""
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Clip that is annotated."""
+    """Frames of the clip."""
     device_focal_px: float | None = None
-    """Focal length of the device in pixels of the clip, from other clips."""
+    """Focal length in pixels of the clip, estimated from other clips of the video."""
     hands: HandTracks | None = None
-    """Hands of the clip, in pixels."""
+    """Detected or recorded hands, in pixels."""
     object_ids: Int32[np.ndarray, "f h w"] | None = None
-    """Object instance of each pixel: 0 none, negative hands and arms."""
+    """Object instance of each pixel: 0 background, negative for hands and arms."""
     names: Mapping[int, str] | None = None
     """Names of object instances."""
     estimate: CameraEstimate | None = None
-    """Cameras, with the decision about them; in meters from the stage `scale` on."""
+    """Cameras and the verdict about them; in meters after the stage `scale`."""
     depth: DepthEstimate | None = None
-    """Depth of some frames, the first included; in meters from the stage `scale` on."""
+    """Depth of the first and maybe other frames; in meters after the stage `scale`."""
     joints_m: Float[np.ndarray, "f n j 3"] | None = None
     """Joints in the world in meters."""
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None
     """First frame without hands."""
     state: SceneState | None = None
-    """Scene of the clip in 3D, without hands."""
+    """3D scene of the clip, without hands."""
     prompt: str | None = None
     """Caption of the clip."""
     notes: Mapping[str, Any] = field(default_factory=dict)
-    """Choices, figures and warnings of the stages, for annotation.json."""
+    """Choices, figures and warnings of each stage, for annotation.json."""
 
     def require(self, name: str) -> Any:
-        """Return a field; raise `InputError` if no stage has set it."""
+        """Return a field. Raises `InputError` if no stage has set it."""
         value = getattr(self, name)
         if value is None:
             raise InputError(f"{name} is missing: no stage before this one sets it.")
@@ -92,7 +92,7 @@ class Record:
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras, once they are estimated."""
+        """Cameras, after the stage `cameras`."""
         return self.require("estimate").cameras
 
     @property
@@ -102,13 +102,13 @@ class Record:
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"] | None:
-        """Intrinsics of the clip in pixels, where the recording knows them."""
+        """Intrinsics of the clip in pixels, if the recording has them."""
         known = self.recording.intrinsics_px
         return None if known is None else self.plan.intrinsics(known)
 
     @property
     def fps(self) -> Fraction:
-        """Rate of the clip in frames per second."""
+        """Frame rate of the clip in frames per second."""
         return self.plan.fps
 
     def add(self, stage: str, notes: Mapping[str, Any], **fields: Any) -> Record:
@@ -117,7 +117,7 @@ class Record:
 
 
 def save(path: Path, record: Record, fields: Sequence[str], stage: str) -> None:
-    """Write some fields of a record, and the notes of a stage, atomically."""
+    """Write the given fields and the notes of a stage atomically."""
     arrays: dict[str, np.ndarray] = {}
     about: dict[str, Any] = {"notes": record.notes.get(stage, {})}
     for name in fields:
@@ -132,7 +132,7 @@ def save(path: Path, record: Record, fields: Sequence[str], stage: str) -> None:
 
 
 def load(path: Path, record: Record, fields: Sequence[str], stage: str) -> Record:
-    """Return a record with the fields and notes of a file that `save` wrote.
+    """Return the record with the fields and notes in a file written by `save`.
 
     Raises `InputError` if the file is damaged.
     """
@@ -153,7 +153,7 @@ def load(path: Path, record: Record, fields: Sequence[str], stage: str) -> Recor
 
 
 def _number(value: Any) -> Any:
-    """Return a NumPy number as one of Python, for JSON."""
+    """Return a value for JSON: a NumPy number as a Python number, others as text."""
     if isinstance(value, np.generic):
         return value.item()
     return str(value)

@@ -1,16 +1,15 @@
-"""Annotation of many videos: scanned, annotated in parallel, and listed.
+"""Annotation of many videos: scan them, annotate their clips in parallel, write the report.
 
-    OUT/journal.jsonl        the configuration, so that another one is refused
-    OUT/work/recordings/ID   what is known of each video
-    OUT/work/scans/ID.json   its clips, or why it has none
+    OUT/journal.jsonl        the configuration; a different one is refused
+    OUT/work/recordings/ID   the recording of each video
+    OUT/work/scans/ID.json   its clips, or the reason why it has none
     OUT/ID/                  each clip (`clip`)
     OUT/metadata.csv         the accepted clips
     OUT/report.json          all clips and videos, with reasons
     OUT/index.html           a page of all clips
 
-A file is written when it is complete, and what exists is not made again, so the same command
-continues after an interruption at any time. A video that cannot be read is reported; the others
-are annotated.
+Files are written atomically and existing files are kept: the same command resumes after an
+interruption at any time. Unreadable videos are reported, and the other videos are annotated.
 """
 
 from __future__ import annotations
@@ -53,13 +52,13 @@ class Scanned:
     jobs: tuple[Job, ...] = ()
     """Clips of the video to annotate."""
     refused: tuple[tuple[Job, str, str], ...] = ()
-    """Clips that are refused before any stage, with rule and reason."""
+    """Clips that were refused before any stage, with rule and reason."""
     problem: str | None = None
-    """Reason if the video has no clips."""
+    """Reason why the video has no clips, if so."""
 
 
 def require_config(out: Path, config: AnnotateConfig) -> None:
-    """Record the configuration of a folder. Raises `InputError` if it holds another one's clips."""
+    """Record the configuration. Raises `InputError` if the folder has clips of another one."""
     journal = Journal(out, outputs=(REPORT, f"*/{ANNOTATION}"))
     journal.require("annotate", {name: str(value) for name, value in _flat(plain(config)).items()})
 
@@ -75,10 +74,10 @@ def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
-    """Measure a video and choose its clips, or load the result; report one that is not readable.
+    """Measure a video and choose its clips, or load the earlier result.
 
-    One that had no clips is measured again. Raises `InputError` if the file of another one was
-    replaced since.
+    An unreadable video becomes a `problem` in the result. A video with a problem is measured again.
+    Raises `InputError` if the video file differs from the scanned one.
     """
     path = out / WORK / "scans" / f"{source.name}.json"
     size = 0 if source.path.is_dir() else source.path.stat().st_size
@@ -86,7 +85,7 @@ def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
     if written is not None and "problem" not in written:
         if written["path"] != str(source.path) or written["bytes"] != size:
             raise InputError(
-                f"{source.path} is not the file that {out} was made of: {written['path']} of "
+                f"{source.path} is not the file that {out} was made from: {written['path']} of "
                 f"{written['bytes']:,} bytes. Choose another folder. (--out)"
             )
         return _scanned(source.name, written)
@@ -128,14 +127,14 @@ def _scanned(name: str, about: Mapping[str, Any]) -> Scanned:
 def scan_sources(
     sources: Sequence[Source], out: Path, config: AnnotateConfig, *, workers: int
 ) -> Iterator[Scanned]:
-    """Scan videos, in parallel; yield each when it is done."""
+    """Scan videos in parallel; yield each result."""
     yield from _each(scan_source, [(source, out, config) for source in sources], workers)
 
 
 def annotate_jobs(
     jobs: Sequence[Job], out: Path, config: AnnotateConfig, *, workers: int
 ) -> Iterator[str]:
-    """Annotate clips, in parallel; yield the status of each when it is done."""
+    """Annotate clips in parallel; yield the status of each finished clip."""
     yield from _each(_annotate_one, [(job, out, config) for job in jobs], workers)
 
 
@@ -154,7 +153,7 @@ def _each(run: Callable[..., T], calls: Sequence[tuple[Any, ...]], workers: int)
 
 
 _built: dict[AnnotateConfig, Any] = {}
-"""Estimators of this process, so that networks are loaded once."""
+"""Estimators of this process; networks are loaded once per process, not per clip."""
 
 
 def _annotate_one(job: Job, out: Path, config: AnnotateConfig) -> str:
@@ -164,9 +163,9 @@ def _annotate_one(job: Job, out: Path, config: AnnotateConfig) -> str:
 
 
 def choose_jobs(scanned: Iterable[Scanned], out: Path, config: AnnotateConfig) -> list[Job]:
-    """Return the clips to annotate; write the annotations of those that are refused already.
+    """Return the clips to annotate; write the annotations of clips refused by the scan.
 
-    Of two clips with one id, the second one's video is reported as a problem.
+    Raises `InputError` if two recordings have clips with the same id.
     """
     jobs: list[Job] = []
     seen: dict[str, str] = {}
@@ -186,9 +185,9 @@ def choose_jobs(scanned: Iterable[Scanned], out: Path, config: AnnotateConfig) -
 
 
 def choose_retries(scanned: Iterable[Scanned], out: Path) -> list[Job]:
-    """Return refused clips that have no cameras, with the focal length of their video's others.
+    """Return refused clips without cameras, with a focal length from other clips of their video.
 
-    It is the median over the clips whose cameras were calibrated without one.
+    It is the median over the clips whose focal length was estimated.
     """
     retries = []
     for found in scanned:
@@ -209,7 +208,7 @@ def choose_retries(scanned: Iterable[Scanned], out: Path) -> list[Job]:
 
 
 def write_report(scanned: Sequence[Scanned], out: Path) -> dict[str, Any]:
-    """Write metadata.csv, report.json and index.html of what is annotated; return the report."""
+    """Write metadata.csv, report.json and index.html; return the report."""
     clips: list[dict[str, Any]] = []
     rows: list[dict[str, str]] = []
     for found in scanned:

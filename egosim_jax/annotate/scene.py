@@ -1,4 +1,4 @@
-"""Stages that make the scene of a clip: meters, first frame without hands, state, caption."""
+"""Last stages of an annotation: metric scale, first frame without hands, scene state, caption."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import SceneState, Triplet
 
 PLATE_MARGIN = 1 / 80
-"""Width in images of the border around drawn hands that is replaced, too."""
+"""Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
-"""Frames that are rendered together."""
+"""Number of frames that are rendered together."""
 POINT_PX = 2
 """Size in pixels of the points of a prior."""
 
 
-def find_scale(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Bring cameras, depth and joints to meters; note the scale, its source and uncertainty."""
+def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Convert cameras, depth and joints to meters; note the scale, its source and uncertainty."""
     from egosim_jax.perception.hands import lift
     from egosim_jax.perception.scale import Scale, estimate_scale, scale_cameras, scale_depth
 
@@ -51,7 +51,7 @@ def find_scale(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
             meters_per_unit=1.0,
             uncertainty=0.0,
             source="metric depth",
-            reason="depth is in meters, and the camera stays in its place",
+            reason="depth is in meters, and the camera does not move",
         )
     else:
         moved = depth.metric and not estimate.metric and estimate.points is not None
@@ -72,7 +72,7 @@ def find_scale(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
 
 
 def _sparse_depth(record: Record) -> DepthEstimate:
-    """Return the triangulated points as depth of the first frame, in the unit of the cameras."""
+    """Return the triangulated points as sparse depth of the first frame, in camera units."""
     estimate = record.require("estimate")
     points, cameras = estimate.points, estimate.cameras
     own = points.frames == 0
@@ -85,8 +85,8 @@ def _sparse_depth(record: Record) -> DepthEstimate:
     )
 
 
-def clean_first_frame(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `first_frame`: hands and arms replaced by what other frames show, or filled in."""
+def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `first_frame`: hands and arms are replaced from other frames, or inpainted."""
     from egosim_jax.perception.plate import clean_plate
 
     depth_m = record.require("depth").depth_m[0]
@@ -100,8 +100,8 @@ def clean_first_frame(record: Record, parts: Estimators, config: AnnotateConfig)
     return record.add("plate", notes, first_frame=plate.image)
 
 
-def build_state(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `state`, the scene that the prior shows: of the first frame, or of key frames too."""
+def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `state`, the scene of the prior, from the first frame or also from key frames."""
     from egosim_jax.perception.depth import points_per_pixel
 
     cameras, ids, depth = record.cameras, record.object_ids, record.require("depth")
@@ -124,11 +124,12 @@ def build_state(record: Record, parts: Estimators, config: AnnotateConfig) -> Re
 def extend_state(
     state: SceneState, record: Record, frame: int, depth_m: Float32[np.ndarray, "h w"]
 ) -> SceneState:
-    """Return a state with points of a later frame where the state shows nothing in its view."""
+    """Return a state with the points of a later frame that the state does not cover."""
     import cv2
 
     pose = record.cameras.world_from_camera[frame]
     here = replace(record.cameras, world_from_camera=pose[None])
+    # Slightly larger points than in the prior close the gaps between the points of a surface.
     seen, _ = splat(state.points_m, here, point_px=POINT_PX + 1)
     hidden = cv2.dilate(record.moving[frame].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     new = ~np.isfinite(seen[0]) & ~hidden & np.isfinite(depth_m)
@@ -144,24 +145,24 @@ def extend_state(
     )
 
 
-def add_caption(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `prompt`: given, known, written by a network, or by a rule that says what it knows."""
+def add_caption(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `prompt`: given, recorded, written by a network, or made by a rule."""
     names = sorted(set((record.names or {}).values()) | set(record.recording.names))
     if config.caption_text is not None:
         prompt, source = config.caption_text, "--caption"
-    elif record.recording.caption and parts.captioner is None:
+    elif record.recording.caption and estimators.captioner is None:
         prompt, source = record.recording.caption, "recording"
-    elif parts.captioner is not None:
-        prompt, source = parts.captioner(record.frames)[0], config.caption or "network"
+    elif estimators.captioner is not None:
+        prompt, source = estimators.captioner(record.frames)[0], config.caption or "network"
     else:
         prompt, source = plain_caption(record, names), "rule"
     return record.add("caption", {"source": source, "names": names}, prompt=prompt)
 
 
 def plain_caption(record: Record, names: list[str]) -> str:
-    """Return a caption of what is known without a network: the hands in view, and names.
+    """Return a caption with the visible hands and the known objects.
 
-    It says nothing of the action, which no stage has recognized.
+    It does not name the action: without a network, no stage recognizes actions.
     """
     what = f" near {', '.join(names)}" if names else ""
     if record.recording.kind == "robot":
@@ -177,7 +178,7 @@ def plain_caption(record: Record, names: list[str]) -> str:
 
 
 def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[str, Any]]:
-    """Return the triplet of a finished record, and figures of its prior."""
+    """Return the triplet of a finished record, and quality figures of its prior."""
     prior, mask, hands, drawn = _render(record, config)
     triplet = Triplet(
         video_id=record.video_id,
@@ -193,7 +194,7 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
             "rung": record.require("estimate").verdict.rung,
         },
     )
-    judged = drawn & ~record.moving  # the mask's observed part is wider than what is drawn
+    judged = drawn & ~record.moving  # not the mask: its observed region is wider than the points
     judged[0] = False
     first = np.broadcast_to(record.frames[0], record.frames.shape)
     return triplet, {
@@ -211,10 +212,7 @@ def _render(
     UInt8[np.ndarray, "f h w 3"],
     Bool[np.ndarray, "f h w"],
 ]:
-    """Return prior, mask, hands and the pixels where a point is drawn.
-
-    They are rendered some frames at a time, for less memory.
-    """
+    """Return prior, mask, hands, and the pixels with a point, rendered in chunks to save memory."""
     from egosim_jax import rendering
 
     renderer, cameras = rendering.get(config.renderer), record.cameras
@@ -222,7 +220,7 @@ def _render(
     last = len(record.frames) - 1
     pieces = []
     for start in range(0, last + 1, FRAMES_AT_ONCE):
-        # The last piece is filled up, so that one program is compiled for all.
+        # Padding the last chunk keeps one shape, and so one compiled program.
         here = np.minimum(np.arange(start, start + min(FRAMES_AT_ONCE, last + 1)), last)
         some = replace(cameras, world_from_camera=cameras.world_from_camera[here])
         view = renderer.render(state, some, point_px=POINT_PX)
@@ -239,7 +237,7 @@ def _psnr(
     target: UInt8[np.ndarray, "f h w 3"],
     judged: Bool[np.ndarray, "f h w"],
 ) -> float:
-    """Return the mean PSNR over the frames of some pixels; 0 without any."""
+    """Return the PSNR over the judged pixels, mean over frames; 0 without such pixels."""
     errors = [
         np.square(frame[here].astype(np.float32) - other[here]).mean(dtype=np.float64)
         for frame, other, here in zip(video, target, judged, strict=True)
@@ -249,21 +247,16 @@ def _psnr(
 
 
 def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig) -> None:
-    """Raise `RefusedError` for a prior that shows the background worse than the first frame.
-
-    A camera that stays in its place is not judged so: its prior is the first frame, turned, and
-    what its hands hid there.
-    """
-    if rung in ("static", "rotation"):
+    """Raise `RefusedError` if the prior shows the background worse than the first frame does."""
+    if rung in ("static", "rotation"):  # the prior is the first frame itself, at most turned
         return
     gain = figures["psnr_background"] - figures["psnr_first_frame"]
-    least = config.cutting.quality.min_prior_gain_db
-    if gain < least:
+    limit = config.cutting.quality.min_prior_gain_db
+    if gain < limit:
         raise RefusedError(
             "prior",
-            f"prior: the background is {gain:+.1f} dB like the video, compared with the first "
-            f"frame repeated; at least {least:+.1f} dB. Cameras or depth are wrong. "
-            "(--min-prior-gain)",
+            f"prior: the PSNR of the background is {gain:+.1f} dB relative to the repeated first "
+            f"frame, below {limit:+.1f} dB. Cameras or depth are wrong. (--min-prior-gain)",
             figures,
         )
 
@@ -281,4 +274,4 @@ STAGES = (
 )
 """Stages of an annotation, in order."""
 FIRST_STAGES = 2
-"""Stages that need no camera: the first pool of actors runs them."""
+"""Number of stages that need no cameras; the first pool of Ray actors runs them."""

@@ -1,4 +1,4 @@
-"""Videos and recordings to annotate, found by path, each with its unique id."""
+"""Find and open the videos and recordings to annotate, each with a unique id."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from egosim_jax.io.segments import probe_long_video
 from egosim_jax.types import InputError
 
 DEPTH_SUFFIXES = {".png": 0.001, ".npy": 1.0}
-"""Suffixes of depth maps, and the unit of each in meters."""
+"""Suffix of depth maps -> unit in meters."""
 MAX_UNEVENNESS_S = 0.1
-"""Largest distance in seconds of a frame's time from equal spacing at a constant frame rate."""
+"""Maximum deviation in seconds of a timestamp from a constant frame rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A video file, or a folder of a recording."""
+    """A video file or the folder of a recording."""
 
     name: str
-    """Unique id, which names the clips of a video."""
+    """Unique id; the ids of the clips begin with it."""
     path: Path
     """Video file or recording folder."""
 
 
 def find_sources(paths: Sequence[Path]) -> list[Source]:
-    """Return the videos and recordings that paths name: files, or folders of them.
+    """Return the videos and recordings at the paths: files, or folders of them.
 
-    Raises `InputError` for a path that does not exist or holds neither, and where two have one id.
+    Raises `InputError` if a path does not exist or holds neither, or if two sources have one id.
     """
     found: list[Path] = []
     for path in paths:
@@ -54,18 +54,17 @@ def find_sources(paths: Sequence[Path]) -> list[Source]:
     ]
     if doubles:
         raise InputError(
-            f"Videos that would have one id: {listing(doubles)}. Ids are made of the file's and "
-            "its folder's name: rename some, or annotate them to different folders."
+            f"Videos with the same id: {listing(doubles)}. Ids are made from the names of a file "
+            "and its folder: rename some, or annotate them to different folders."
         )
     return [Source(name=name, path=path) for name, path in zip(names, found, strict=True)]
 
 
 def open_source(source: Source, depth_files: Path | None = None) -> Recording:
-    """Return the recording of a source; of a video, no more than its length, size and rate.
+    """Return the recording of a source; for a video, it has only length, size and frame rate.
 
-    Depth maps of others are `depth_files`/ID/N.png (millimeters) or N.npy (meters), N being the
-    frame of the video, with or without the prefix `depth_`. Raises `InputError` if a file cannot be
-    read.
+    `depth_files` is a folder of depth maps: ID/N.png (millimeters) or ID/N.npy (meters) for frame N
+    of the video, optionally with the prefix `depth_`. Raises `InputError` if a file cannot be read.
     """
     if source.path.is_dir():
         recording = Recording.load(source.path)
@@ -78,10 +77,10 @@ def open_source(source: Source, depth_files: Path | None = None) -> Recording:
             )
         if info.unevenness_s > MAX_UNEVENNESS_S:
             raise InputError(
-                f"{quote_path(source.path)} has a variable frame rate: its frames are up to "
-                f"{info.unevenness_s:.2f} s from equal spacing, and at most {MAX_UNEVENNESS_S:g} s "
-                "is taken as constant. Convert it, for instance with `ffmpeg -i IN -fps_mode cfr "
-                f"-r {float(info.fps):.0f} OUT`."
+                f"{quote_path(source.path)} has a variable frame rate: its timestamps deviate "
+                f"by up to {info.unevenness_s:.2f} s from a constant rate, and at most "
+                f"{MAX_UNEVENNESS_S:g} s is allowed. Convert it, for instance with `ffmpeg -i IN "
+                f"-fps_mode cfr -r {float(info.fps):.0f} OUT`."
             )
         recording = Recording(
             recording_id=source.name,
@@ -112,7 +111,7 @@ def _with_depth(recording: Recording, folder: Path) -> Recording:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """Return recordings and videos below a folder, without the videos of recordings."""
+    """Return the recordings and videos in a folder, without the videos of recordings."""
     if (folder / DESCRIPTION).is_file():
         return [folder]
     recordings = sorted(path.parent for path in folder.rglob(DESCRIPTION))
@@ -132,9 +131,9 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _name(path: Path, parts: int) -> str:
-    """Return an id made of the last parts of a path, without what is not allowed in ids.
+    """Return an id made from the last parts of a path, in characters allowed in ids.
 
-    Of `video.mp4`, as data sets name files, only the folders count.
+    A file called `video`, as in many datasets, is named after its folders only.
     """
     last = path.name if path.is_dir() else path.stem
     end = len(path.parts) - 1

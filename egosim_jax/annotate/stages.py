@@ -1,11 +1,11 @@
-"""Stages of an annotation: from the frames of a clip to a triplet and its scene.
+"""First stages of an annotation: hands, silhouettes, cameras, lens and depth (then `scene`).
 
-    hands -> silhouettes -> cameras -> depth -> scale -> plate -> scene -> caption
+    hands -> silhouettes -> cameras -> lens -> depth -> scale -> plate -> scene -> caption
 
-Each is a function of the record so far, the estimators and the configuration, which returns the
-record with its fields added, and notes on what was chosen and why. What the recording knows
-(cameras, hands, depth, caption) is taken instead of estimated. A clip that no camera can be
-estimated for is refused; nothing is guessed silently.
+A stage is a function of the record so far, the estimators and the configuration. It returns the
+record with additional fields, and notes on its choices and their reasons. Recorded cameras, hands,
+depth and captions take precedence over estimates. A clip without cameras is refused: nothing is
+guessed silently.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from egosim_jax.types import Cameras, InputError
 
 SIDES = ("left", "right")
 MAX_MIRRORED = 0.35
-"""Largest share of a hand's frames in which its joints may be those of the other side."""
+"""Maximum fraction of a hand's frames in which its joints look like the other side's."""
 KEY_FRAMES = 6
-"""Frames that a fused scene is made of."""
+"""Number of frames in a fused scene."""
 HAND_PHRASES = ("hand", "arm")
-"""Names of hands and arms for a network that segments."""
+"""Names of hands and arms for a segmentation network."""
 FLASH_S = 0.3
-"""Shortest time for which a second hand is seen, in seconds."""
+"""Minimum time in seconds for which a second hand must be visible."""
 HOLD_S = 0.5
-"""Time for which the silhouette of a hand that is not found stays, in seconds."""
+"""Time in seconds for which the silhouette of a lost hand is kept."""
 Run = Callable[[Record, Estimators, AnnotateConfig], Record]
 
 
@@ -53,22 +53,22 @@ class Stage:
     """One step of an annotation."""
 
     name: str
-    """Name, which is also that of its file."""
+    """Name of the stage and of its file."""
     run: Run
     """Function that adds fields to the record."""
     stored: tuple[str, ...] = ()
-    """Fields that are stored, so that an interrupted clip resumes after this stage."""
+    """Fields to store; an interrupted clip resumes after this stage."""
 
 
-def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `hands`. Raises `RefusedError` if too few frames show one."""
+def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `hands`. Raises `RefusedError` if too few frames show a hand."""
     given = record.recording.joints_m
     if given is not None and record.recording.kind == "human":
         hands, source = _project_given(record, given), "recording"
     elif given is not None:
         return record.add("hands", {"source": "recording", "kind": record.recording.kind})
     else:
-        tracks = drop_flashes(parts.hands(record.frames), record.fps)
+        tracks = drop_flashes(estimators.hands(record.frames), record.fps)
         hands, source = _on_side(tracks, config.side), "estimated"
     seen = visible(hands)
     shown = int(np.any(seen, axis=1).sum())
@@ -81,12 +81,12 @@ def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
     }
     if hands.mirrored is not None:
         notes["mirrored"] = {side: int(hands.mirrored[:, n].sum()) for n, side in enumerate(SIDES)}
-    least = config.cutting.quality.min_hands
-    if share < least:
+    limit = config.cutting.quality.min_hands
+    if share < limit:
         raise RefusedError(
             "hands",
             f"hands: visible in {shown} of {len(seen)} frames, less than "
-            f"{least:.0%}. (--min-hands)",
+            f"{limit:.0%}. (--min-hands)",
             {"visible": share},
         )
     _check_sides(hands, seen, config.side)
@@ -94,28 +94,28 @@ def find_hands(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
 
 
 def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
-    """Raise `RefusedError` if a hand is often drawn as the mirror of itself, unless asked for."""
+    """Raise `RefusedError` if the side of a hand is often ambiguous and was not given."""
     if hands.mirrored is None or side != "auto":
         return
     shares = hands.mirrored.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     if (worst := float(shares.max())) > MAX_MIRRORED:
         raise RefusedError(
             "hands",
-            f"hands: the joints of the {SIDES[int(shares.argmax())]} hand are those of the other "
-            f"side in {worst:.0%} of its frames, more than {MAX_MIRRORED:.0%}: its fingers are "
-            "hidden. Give the side if there is one hand. (--side)",
+            f"hands: the {SIDES[int(shares.argmax())]} hand has the joints of the other side in "
+            f"{worst:.0%} of its frames, more than {MAX_MIRRORED:.0%}: its fingers are hidden. "
+            "Give the side if there is one hand. (--side)",
             {"mirrored": worst},
         )
 
 
-def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `object_ids` and `names`: hands and arms, and objects where a network segments."""
-    if parts.segmenter is not None:
+def draw_silhouettes(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `object_ids` and `names`: hands and arms, and with a network also objects."""
+    if estimators.segmenter is not None:
         phrases = config.phrases or record.recording.names
-        if not phrases and parts.captioner is not None:
-            phrases = parts.captioner(record.frames)[1]
+        if not phrases and estimators.captioner is not None:
+            phrases = estimators.captioner(record.frames)[1]
         asked = tuple(dict.fromkeys((*phrases, *HAND_PHRASES)))
-        ids, names = parts.segmenter(record.frames, asked, record.hands)
+        ids, names = estimators.segmenter(record.frames, asked, record.hands)
         return record.add(
             "silhouettes",
             {"masks": config.masks, "phrases": list(asked)},
@@ -137,10 +137,10 @@ def draw_silhouettes(record: Record, parts: Estimators, config: AnnotateConfig) 
 
 
 def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
-    """Return tracks without second hands that are found for a moment only.
+    """Return tracks without second hands that appear only for a moment.
 
-    A hand that is seen for less than 0.3 s while the other one is seen, and not for half a second
-    before and after, is the other one again.
+    If a hand is found for less than 0.3 s, not within 0.5 s before or after, and always together
+    with the other hand, it is a second detection of the other hand.
     """
     found = visible(hands)
     dropped = np.zeros_like(found)
@@ -160,10 +160,10 @@ def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
 
 
 def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
-    """Return tracks in which a hand stays where it was found last, or first, for half a second.
+    """Return tracks in which a lost hand keeps its nearest detection in time for 0.5 s.
 
-    For silhouettes only, so that a hand that is entering, leaving or not found for a moment is not
-    taken for the scene.
+    For silhouettes only: a hand that enters, leaves or is lost for a moment must not become part of
+    the scene.
     """
     joints_px, joints_hand_m = hands.joints_px.copy(), hands.joints_hand_m.copy()
     found, frames = visible(hands), np.arange(len(hands.presence))
@@ -177,8 +177,8 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
     return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
 
 
-def find_cameras(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `estimate`: what the recording knows, or what the ladder accepts; else refuse."""
+def find_cameras(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `estimate`: recorded or estimated cameras. Raises `RefusedError` without cameras."""
     from egosim_jax.perception.cameras import CameraLadder
     from egosim_jax.perception.depth.triangulate import triangulate_frames
 
@@ -195,13 +195,13 @@ def find_cameras(record: Record, parts: Estimators, config: AnnotateConfig) -> R
             ),
         )
         return record.add("cameras", _camera_notes(estimate, "recording"), estimate=estimate)
-    focal, source, estimator = record.device_focal_px, "estimated", parts.cameras
+    focal, source, estimator = record.device_focal_px, "estimated", estimators.cameras
     if config.focal_px is not None:
         focal, source = config.focal_px * record.plan.scale, "--focal"
     elif record.intrinsics is not None:
         focal, source = float(record.intrinsics[0, 0]), "recording"
     if source != "estimated" and isinstance(estimator, CameraLadder):
-        estimator = replace(estimator, focal_px=focal)  # known, not only likely
+        estimator = replace(estimator, focal_px=focal)  # exact; the argument below is a guess
     estimate = estimator(record.frames, record.moving, focal_px=focal)
     if estimate.cameras is None:
         verdict = estimate.verdict
@@ -209,8 +209,8 @@ def find_cameras(record: Record, parts: Estimators, config: AnnotateConfig) -> R
     return record.add("cameras", _camera_notes(estimate, source), estimate=estimate)
 
 
-def undistort_clip(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Replace frames, hands and silhouettes by those of the pinhole camera, if the lens is none."""
+def undistort_clip(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Undistort frames, hands and silhouettes if the lens is not a pinhole."""
     from egosim_jax.perception.cameras import undistort, undistort_pixels
 
     estimate, hands = record.require("estimate"), record.hands
@@ -228,8 +228,8 @@ def undistort_clip(record: Record, parts: Estimators, config: AnnotateConfig) ->
     )
 
 
-def find_depth(record: Record, parts: Estimators, config: AnnotateConfig) -> Record:
-    """Add `depth` of the first frame, and of key frames for a fused scene."""
+def find_depth(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `depth` of the first frame or, for a fused scene, of all key frames."""
     wanted = depth_frames(record, config)
     maps = [_given_depth(record, frame) for frame in wanted]
     if all(depth is not None for depth in maps):
@@ -241,26 +241,26 @@ def find_depth(record: Record, parts: Estimators, config: AnnotateConfig) -> Rec
             metric=True,
         )
         return record.add("depth", {"source": "recording"}, depth=depth)
-    depth = parts.depth(record.frames, record.moving, record.require("estimate"), wanted)
+    depth = estimators.depth(record.frames, record.moving, record.require("estimate"), wanted)
     confident = float(depth.confident.mean())
     notes = {"source": config.depth, "reason": depth.reason, "confident": confident}
     return record.add("depth", notes, depth=depth)
 
 
 def depth_frames(record: Record, config: AnnotateConfig) -> list[int]:
-    """Return the frames whose depth is needed: the first, or key frames for a fused scene."""
+    """Return the frames with depth: the first one or, for a fused scene, the key frames."""
     if config.state == "first":
         return [0]
     return sorted({int(k) for k in np.linspace(0, len(record.frames) - 1, KEY_FRAMES)})
 
 
 def visible(hands: HandTracks) -> Bool[np.ndarray, "f 2"]:
-    """Return in which frames each hand was found."""
+    """Return True for each frame and hand that was found."""
     return np.asarray(np.isfinite(hands.joints_px).all(axis=(2, 3)))
 
 
 def _on_side(hands: HandTracks, side: Side) -> HandTracks:
-    """Return tracks with all hands on one side, the most confident of each frame, if asked."""
+    """Return tracks with only the most confident hand of each frame, on the given side."""
     if side == "auto":
         return hands
     own = LEFT if side == "left" else RIGHT
@@ -278,12 +278,12 @@ def _on_side(hands: HandTracks, side: Side) -> HandTracks:
 
 
 def _source_frames(record: Record) -> np.ndarray:
-    """Return the frame of the recording that each frame of the clip is."""
+    """Return the recording's frame number of each frame of the clip."""
     return record.plan.indices(0, len(record.frames))
 
 
 def _given_cameras(record: Record) -> Cameras | None:
-    """Return the recording's cameras at the rate and size of the clip."""
+    """Return the recording's cameras at the clip's frame rate and size, if it has any."""
     known, intrinsics = record.recording.world_from_camera, record.intrinsics
     if known is None or intrinsics is None:
         return None
@@ -296,18 +296,18 @@ def _given_cameras(record: Record) -> Cameras | None:
 
 
 def _cameras_of_given_hands(record: Record) -> Cameras:
-    """Return the recording's cameras. Raises `InputError` if it knows hands alone."""
+    """Return the recording's cameras. Raises `InputError` if it has only hands."""
     cameras = _given_cameras(record)
     if cameras is None:
         raise InputError(
-            "The recording has hands, but not the poses and intrinsics of its cameras: all are "
-            "needed. Import it with them, or without hands."
+            "The recording has hands without camera poses and intrinsics: all are needed. Import "
+            "it with cameras, or without hands."
         )
     return cameras
 
 
 def _given_points(record: Record) -> SparsePoints | None:
-    """Return the recording's points with their observations in the pixels of the clip."""
+    """Return the recording's points with observations in pixels of the clip, if it has any."""
     points = record.recording.points
     if points is None or points.frames is None or points.pixels_px is None:
         return None
@@ -327,7 +327,7 @@ def _given_points(record: Record) -> SparsePoints | None:
 
 
 def _given_depth(record: Record, frame: int) -> np.ndarray | None:
-    """Return the recording's depth of a frame of the clip, in meters at the clip's size."""
+    """Return the recorded depth of a clip's frame in meters, at the clip's size, if known."""
     import cv2
 
     depth = record.recording.read_depth(int(_source_frames(record)[frame]))
@@ -341,7 +341,7 @@ def _given_depth(record: Record, frame: int) -> np.ndarray | None:
 
 
 def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:
-    """Return the recording's joints as tracks in the pixels of the clip."""
+    """Return the recording's joints as tracks in pixels of the clip."""
     cameras = _cameras_of_given_hands(record)
     joints = joints_m[_source_frames(record)][:, :2]
     local = transform(rearrange(invert(cameras.world_from_camera), "f a b -> f 1 a b"), joints)
@@ -370,7 +370,7 @@ def _camera_notes(estimate: CameraEstimate, focal_source: str) -> dict[str, Any]
 
 
 def joints_in_world(record: Record) -> np.ndarray:
-    """Return the joints in the world in meters: the recording's, or lifted from pixels."""
+    """Return the world joints in meters: recorded, or lifted from pixels."""
     from egosim_jax.perception.hands import lift
 
     given = record.recording.joints_m

@@ -1,4 +1,4 @@
-"""Episodes of real scenes: the state of an annotated clip, and its hands and cameras as actions."""
+"""Episodes of real scenes: an annotated clip gives the state, and its hands and cameras actions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from egosim_jax.types import JOINTS, Action, Cameras, GroundTruth, InputError, K
 
 
 def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) -> Episode:
-    """Return an episode of an annotated clip, at the length, size and rate of a model's clips.
+    """Return an episode made from an annotated clip, with the length, size and rate of `video`.
 
-    The first action starts in the clip's first frame, each other one in the last frame of the one
-    before. Frames are the nearest in time, resized without keeping the aspect, as in training, and
-    are the ground truth. Raises `InputError` if the clip was refused, or is too short.
+    Consecutive actions share a frame: the last frame of one is the first of the next. The
+    ground-truth frames are the nearest in time, resized without keeping the aspect ratio, as in
+    training.
+    Raises `InputError` if the clip was refused or is too short.
     """
     about = read_json(folder / ANNOTATION)
     row = about.get("row") if isinstance(about, dict) else None
@@ -72,16 +73,17 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     )
 
 
-def nearest_frames(count: int, have: float, want: float) -> np.ndarray:
-    """Return the frames nearest in time to those at another rate."""
-    times = np.arange(int((count - 1) * want / have + 1e-6) + 1) * have / want
+def nearest_frames(count: int, source_fps: float, target_fps: float) -> np.ndarray:
+    """Return the source frames nearest in time to the frames at a target rate."""
+    last = int((count - 1) * target_fps / source_fps + 1e-6)  # not one less by rounding
+    times = np.arange(last + 1) * source_fps / target_fps
     return np.minimum(np.floor(times + 0.5).astype(int), count - 1)
 
 
 def resized_intrinsics(
     intrinsics_px: np.ndarray, size: tuple[int, ...], video: VideoSpec
 ) -> np.ndarray:
-    """Return intrinsics of images that were resized along each axis."""
+    """Return the intrinsics of images resized to a model's size, each axis by its own factor."""
     scale = np.array([video.width / size[1], video.height / size[0]])
     resized = intrinsics_px.copy()
     resized[:2] *= scale[:, None]
@@ -90,6 +92,6 @@ def resized_intrinsics(
 
 
 def _reachable(joints_m: np.ndarray) -> np.ndarray:
-    """Return the hands of a clip; without any, one that is missing from all frames."""
+    """Return the hands; if no frame shows one, only the first, which is missing throughout."""
     present = np.isfinite(joints_m).all(axis=(2, 3)).any(axis=0)
     return joints_m if present.any() else joints_m[:, :1]

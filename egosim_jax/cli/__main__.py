@@ -1,10 +1,10 @@
-"""`egosim`: generate clips, simulate a world, evaluate, prepare data, train, convert weights."""
+"""The program `egosim`: its subcommands, its start page and its entry point."""
 
 from __future__ import annotations
 
 from egosim_jax.runtime import interrupts
 
-interrupts.expect()
+interrupts.expect()  # before the slow imports, during which Ctrl-C may already come
 
 import sys
 from collections.abc import Sequence
@@ -59,11 +59,11 @@ egosim: an egocentric world simulator in JAX
   egosim simulate                            three clips of a scene, with the model in the package
   egosim play                                the same world by hand, in the browser
   egosim generate --config tabletop          one clip; --metadata FILE generates your own
-  egosim data annotate VIDEO --out DIR       a scene, cameras and hands from your own video
+  egosim data annotate VIDEO --out DIR       scene, cameras and hands from your own video
   egosim episode make --out DIR              an episode to edit: scene, cameras, hands, prompts
-  egosim serve                               sessions that a policy steps, over a websocket or HTTP
-  egosim models list                         released weights to fetch and convert
-  egosim train debug --out DIR               a training of minutes; egosim train --help lists all
+  egosim serve                               a world for policies to step, over websocket or HTTP
+  egosim models list                         models, and where their weights are
+  egosim train debug --out DIR               train for minutes; egosim train --help lists all
   egosim doctor                              devices, versions, extras and weights
 
 egosim --help describes all commands, egosim COMMAND --help one with its options."""
@@ -94,7 +94,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _with_programs() -> Any:
-    """Return the commands along with those of `PROGRAMS`, which a shell completes, too."""
+    """Return all commands, including `PROGRAMS`, for the shell completion of tyro."""
     found: list[Any] = [Commands]
     for name, module in PROGRAMS.items():
         kind = make_dataclass(name, [("command", import_module(module).Commands)])

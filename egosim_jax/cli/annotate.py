@@ -1,4 +1,4 @@
-"""`egosim data annotate`: clips with prior, mask, hands and caption from recorded videos."""
+"""`egosim data annotate`: make annotated clips from recorded videos."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 class Annotate:
     """Make clips with prior, mask, hands, first frame and caption from recorded videos.
 
-    VIDEO is a video file, a recording (`egosim data import`), or a folder of either. Hands,
-    cameras, depth and scale are estimated, without network weights unless a folder of them is
-    given; what a recording knows is taken from it. Writes a folder for each clip, a metadata.csv
-    that `data pack`, `generate` and `train` read, report.json, and index.html to look at. A video
-    that gives no clip is reported with the reason (exit code 3). The same command resumes an
-    interrupted one. Prints the folder.
+    VIDEO is a video file, a recording (`egosim data import`), or a folder of either. Values in a
+    recording are used; hands, cameras, depth and scale that it lacks are estimated. No network
+    weights are needed unless an option names their folder. Writes a folder for each clip,
+    report.json, index.html, and a metadata.csv that `data pack`, `generate` and `train` read. A
+    video without a usable clip is reported with the reason (exit code 3). The same command resumes
+    an interrupted run. Prints the folder.
     """
 
     help_groups: ClassVar[HelpGroups] = {
@@ -52,77 +52,77 @@ class Annotate:
     out: Path
     """Folder of the clips, metadata.csv and the report."""
     config: str | None = None
-    """Model whose size, rate and length the clips have; those of the video if not given."""
+    """Model whose size, frame rate and length the clips get, instead of the video's."""
     size: tuple[int, int] | None = None
     """Height and width of the clips, multiples of 16."""
     fps: float | None = None
-    """Frames per second of the clips, by default the video's, up to 60."""
+    """Frames per second of the clips; by default the video's, at most 60."""
     num_frames: int | None = None
-    """Frames of a clip, 4k + 1, by default all."""
+    """Number of frames in a clip, 4k + 1; by default all."""
     clips: bool = False
-    """Cut videos into clips by shot; each clip must be sharp, moving, and show hands."""
+    """Cut videos at shot changes; keep clips that are sharp, moving and show hands."""
     min_hands: float = 0.5
-    """Smallest fraction of frames in which a hand is visible."""
+    """Minimum fraction of frames in which a hand is visible."""
     min_sharpness: float = 15.0
-    """Smallest sharpness: median over frames of the Laplacian's variance at 320 pixels."""
+    """Minimum sharpness: variance of the Laplacian at 320 pixels, median over frames."""
     max_black: float = 0.0
-    """Largest fraction of black frames."""
+    """Maximum fraction of black frames."""
     min_motion: float = 0.005
-    """Smallest motion of what moves fastest, in widths of the image per second."""
+    """Minimum speed of the fastest motion, in image widths per second."""
     max_motion: float = 1.5
-    """Largest motion of the camera, in widths of the image per second."""
+    """Maximum speed of the camera motion, in image widths per second."""
     min_prior_gain: float = -2.0
-    """Smallest PSNR of the prior in decibels, compared with that of the first frame repeated."""
+    """Minimum PSNR of the prior minus PSNR of the repeated first frame, in decibels."""
     hand_weights: Path | None = None
     """Folder of the hand networks; fetched at first use if not given."""
     offline: bool = False
-    """Fetch nothing: refuse if something is missing."""
+    """Download nothing: stop with an error if files are missing."""
     side: Literal["auto", "left", "right"] = "auto"
-    """Side of all hands, instead of what is recognized."""
+    """Side of all hands; auto: as detected."""
     masks: str = "geometry"
     """Silhouettes of hands and objects: geometry, sam3=FOLDER, or a tracker with --detector.
 
     Trackers are grounded-sam3=FOLDER, grounded-sam2=FOLDER and grounded-edgetam=FOLDER."""
     detector: Path | None = None
-    """Folder of Grounding DINO, which finds what a tracker follows."""
+    """Folder of Grounding DINO, which detects the objects for a tracker."""
     device: str = "auto"
     """Device of the networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
-    """Floating-point type of the networks, but for Depth Anything 3, which chooses its own."""
+    """Floating-point type of the networks; Depth Anything 3 chooses its own."""
     phrases: tuple[str, ...] = ()
-    """Objects to segment, by name."""
+    """Names of the objects to segment."""
     cameras: str = "ladder"
-    """Cameras: ladder, of methods without weights, or depth-anything-3=FOLDER."""
+    """Cameras: ladder (methods without weights, tried in turn) or depth-anything-3=FOLDER."""
     focal: float | None = None
-    """Focal length of the video in its pixels, instead of estimating it."""
+    """Focal length in pixels of the video, instead of an estimate."""
     rung: ChosenRung | None = None
-    """Only method of cameras to try."""
+    """Camera method to try, instead of all of the ladder."""
     depth: str = "sweep"
     """Depth: sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER.
 
-    files are FOLDER/ID/000000.png (16 bits, millimeters) or .npy (meters), by frame."""
+    files: one FOLDER/ID/000000.png (16 bits, millimeters) or .npy (meters) per frame."""
     scale: float | None = None
-    """Meters per unit of the cameras, instead of estimating it from the hands."""
+    """Meters per unit of the cameras, instead of an estimate from the hands."""
     camera_height: float | None = None
-    """Height in meters of the camera above the table or floor, to take the scale from."""
+    """Height in meters of the camera above the table or floor, from which the scale follows."""
     state: Literal["first", "fused"] = "first"
-    """Scene of the prior: from the first frame, as EgoSim trains, or fused from key frames."""
+    """Scene of the prior: the first frame, as in EgoSim's training, or fused key frames."""
     caption: str | None = None
-    """Caption of all clips, or qwen=FOLDER to write one for each."""
+    """Caption of all clips, or qwen=FOLDER to caption each clip by Qwen."""
     renderer: RendererName = "jax"
     """Renderer of prior and hands."""
     split: str = "train"
-    """Value of the column split of metadata.csv, for all clips."""
+    """Value of the column `split` in metadata.csv, for all clips."""
     workers: int = 1
     """Number of worker processes."""
     ray: str | None = None
     """Run on a Ray cluster: auto for a local one, or its address."""
     ray_gpus: tuple[float, float] = (0.0, 0.0)
-    """GPUs of an actor for hands and masks, and of one for the other stages."""
+    """GPUs per actor: for hands and masks, and for the other stages."""
     ray_actors: tuple[int, int] = (1, 1)
-    """Largest number of actors for hands and masks, and for the other stages."""
+    """Maximum number of actors: for hands and masks, and for the other stages."""
     seed: int = 0
-    """Seed of what is random."""
+    """Random seed."""
 
     def run(self) -> int:
         """Scan the videos, annotate their clips and write the report."""
@@ -148,7 +148,7 @@ class Annotate:
         return self._finish(report)
 
     def _annotate(self, jobs: Sequence[Job], config: AnnotateConfig) -> Iterator[str]:
-        """Annotate clips here or on Ray; yield the status of each."""
+        """Annotate clips on this machine or on Ray; yield the status of each."""
         from egosim_jax.annotate import run
 
         if self.ray is None:

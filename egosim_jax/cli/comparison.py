@@ -24,41 +24,41 @@ Network = Literal["alex", "vgg"]
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Clips, baselines and measures of a table."""
+    """Clips, baselines and measures of a comparison."""
 
     help_groups: ClassVar[HelpGroups] = {
         "measures": ("lpips", "dreamsim", "regions", "hands", "cameras", "depth", "fvd", "device"),
         "page": ("baselines", "page_clips"),
     }
     metadata: Path
-    """CSV or JSONL in EgoSim's columns, with video."""
+    """CSV or JSONL with EgoSim's columns, including video."""
     generated: tuple[str, ...]
     """Folders of {id}.mp4, each as DIR or NAME=DIR.
 
-    A clip may also be in the subfolder of its dataset or split. The results.jsonl of a folder, if
-    it has one, lists its clips and windows. Differences are from the first folder."""
+    A clip may also be in a subfolder named after its dataset or split. If a folder has a
+    results.jsonl, it lists the clips and windows. Paired differences are from the first folder."""
     where: str | None = None
-    """Take rows whose column has this value, for instance split=test."""
+    """Select rows by the value of a column, for instance split=test."""
     baselines: tuple[Baseline, ...] = ("prior", "prior_fit", "still")
     """Baselines without a model: the prior, the prior with fitted colors, and frame 0 repeated."""
     lpips: tuple[Network, ...] = ("alex",)
-    """Networks of LPIPS, which needs the extra `metrics`."""
+    """Networks of LPIPS (extra `metrics`)."""
     dreamsim: Path | None = None
-    """Folder of DreamSim's ensemble, as its release v0.2.0-checkpoints is unpacked."""
+    """Folder of DreamSim's ensemble: its unpacked release v0.2.0-checkpoints."""
     regions: bool = False
-    """Also PSNR near the drawn hands, and of the object where object_mask_video.mp4 has it."""
+    """Also PSNR near the drawn hands, and of the object if there is an object_mask_video.mp4."""
     hands: bool = False
-    """Also hands detected in both videos: IoU, keypoint error and recall (extra `video`)."""
+    """Also IoU, keypoint error and recall of the hands detected in both videos (extra `video`)."""
     cameras: bool = False
-    """Also the camera path, estimated from both videos (extra `video`)."""
+    """Also the error of the camera path, estimated from both videos (extra `video`)."""
     depth: Path | None = None
-    """Folder of Depth Anything V2 (metric) or 3, for the depth error (extra `networks`)."""
+    """Folder of Depth Anything V2 (metric) or 3: also the depth error (extra `networks`)."""
     fvd: Path | None = None
-    """Folder of a VideoMAE, for the Fréchet video distance (extra `networks`)."""
+    """Folder of a VideoMAE: also the Fréchet video distance (extra `networks`)."""
     device: str = "auto"
-    """Device of these networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
+    """Device of the networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     page_clips: int = 8
-    """Most clips of each group that the page shows; 0: neither page nor image."""
+    """Maximum number of clips of each group on the page; 0: no page and no scores.png."""
 
     def read_clips(self) -> list[ClipFiles]:
         """Read the selected rows of the metadata."""
@@ -75,7 +75,7 @@ class Options:
         return methods
 
     def measures(self, networks: Sequence[Network]) -> tuple[list[Measure], list[str]]:
-        """Return the measures, and why others are unavailable."""
+        """Return the available measures, and the reason for each unavailable one."""
         from egosim_jax.evaluation.measures import DreamSimDistance, LpipsDistance, Pixels
         from egosim_jax.evaluation.metrics import lpips
         from egosim_jax.evaluation.metrics.dreamsim import DreamSim
@@ -134,7 +134,7 @@ class Options:
         networks: Sequence[Network],
         **result: Any,
     ) -> Evaluation:
-        """Compare, print, and write all files of the table to a folder."""
+        """Compare the clips, print the table and write its files to a folder."""
         from egosim_jax.evaluation import pages
         from egosim_jax.evaluation.files import draw, write_files
         from egosim_jax.evaluation.metrics.dreamsim import MISSING

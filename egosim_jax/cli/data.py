@@ -1,4 +1,4 @@
-"""`egosim data`: import recordings; make, pack, encode, draw, check and describe shards."""
+"""`egosim data`: import and annotate recordings; make, encode and inspect shards."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_c
 
 
 def _grid(name: str | None) -> VideoGrid:
-    """Return the latent grid of a model, Wan's without a name."""
+    """Return the latent grid of a model; Wan's if `name` is None."""
     if name is None:
         return WAN_GRID
     from egosim_jax import configs
@@ -38,44 +38,45 @@ class Pack:
     """
 
     metadata: Path
-    """CSV or JSONL in EgoSim's columns; or a list of DWM, .txt.
+    """CSV or JSONL with EgoSim's columns, or a DWM list (.txt).
 
-    They are video, ego_prior_video, hand_keypoint_video, first_frame, prompt and video_id."""
+    The columns: video, ego_prior_video, hand_keypoint_video, first_frame, prompt and video_id."""
     out: Path
     """Folder of the shards."""
     where: str | None = None
-    """Take rows whose column has this value, for instance split=test."""
+    """Select rows by the value of a column, for instance split=test."""
     limit: int | None = None
     """Maximum number of clips."""
     prompts: Prompts = "prompts_rewrite"
-    """Captions of a list of DWM.
+    """Captions to read from a DWM list.
 
-    prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
-    has none; prompts: the original ones, of the paper's evaluation."""
+    prompts_rewrite: rewritten captions, as in the released models, or the original caption where
+    there is no rewritten one; prompts: original captions, as in the paper's evaluation."""
     size: tuple[int, int] | None = None
-    """Height and width of decoded frames to store instead of the files.
+    """Height and width of decoded frames, stored instead of the source files.
 
-    For small models, whose training step is shorter than decoding."""
+    Use it for small models, whose training step is shorter than decoding."""
     num_frames: int = 61
-    """With a size, number of frames to store of each clip, from the first."""
+    """With --size, number of frames to store of each clip."""
     resampling: Literal["first", "stride", "linspace", "rate"] = "first"
-    """With a size, the frames to take.
+    """With --size, frames to take.
 
-    first: without gaps; stride: as many frames apart as fit, as DWM's loader; linspace: from
-    the first to the last, as DWM's encoder; rate: at about --fps, as the evaluation of DWM."""
+    first: the first frames, without gaps; stride: at the largest even spacing, as DWM's loader;
+    linspace: from the first to the last, as DWM's encoder; rate: at about --fps, as DWM's
+    evaluation."""
     fps: int = 8
     """With --resampling rate, frame rate of the model."""
     shard_megabytes: int = 256
     """Maximum size of a shard file in MiB."""
     overwrite: bool = False
-    """Replace the shards that the folder holds."""
+    """Replace the shards in the folder."""
     decoding: Literal["accurate", "official"] = "accurate"
-    """With a size, color decoding; official: as in EgoSim's loader, a gray level darker."""
+    """With --size, color decoding; official: as in EgoSim's loader, one gray level darker."""
     config: str | None = None
-    """Name of a model whose latent grid the clips must fit, by default Wan's."""
+    """Name of a model whose latent grid the clips must fit; by default Wan's."""
 
     def run(self) -> int:
-        """Check and pack clip after clip."""
+        """Check and pack each clip."""
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.data.pack import pack
         from egosim_jax.io.digest import sha256
@@ -118,7 +119,7 @@ class Pack:
         if (value := getattr(self, name)) != getattr(Pack, name):
             raise InputError(
                 f"--{name.replace('_', '-')} {value} has no effect without {without}: give it, or "
-                "leave this out."
+                "omit this option."
             )
 
 
@@ -126,16 +127,16 @@ class Pack:
 class Encode:
     """Encode shards of clips once, so that training reads latents and embeddings.
 
-    Every window of a clip becomes a record. A clip that cannot be read is reported and skipped
-    (exit code 3). The same command resumes an interrupted one. Several processes share the work,
-    each with its own devices and all with the same OUT: start them with Slurm or Open MPI, or set
+    Every window of a clip becomes a record. An unreadable clip is reported and skipped (exit code
+    3). The same command resumes an interrupted run. Several processes, each with its own devices,
+    can share the work if they have the same OUT. Start them by Slurm or Open MPI, or set
     JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID for each. Prints the folder.
     """
 
     config: str
     """Name of the model."""
     weights: Path
-    """Folder of weights, from which the autoencoder and the frozen encoders are used."""
+    """Folder of weights with the autoencoder and the frozen encoders."""
     shards: Path
     """Folder of shards of videos or frames, with targets."""
     out: Path
@@ -143,16 +144,16 @@ class Encode:
     stride: int = 1
     """Frames between the windows of a clip."""
     batch_size: int | None = None
-    """Windows that a process encodes together: a multiple of its devices, one each by default."""
+    """Windows per batch of a process: a multiple of its devices; by default one per device."""
     shard_windows: int = 64
-    """Windows in a shard file, best a multiple of the batch size.
+    """Windows per shard file, preferably a multiple of the batch size.
 
     An interruption loses at most one shard."""
     decoding: Literal["accurate", "official"] = "accurate"
-    """Color decoding of videos; official: as in EgoSim's loader, a gray level darker."""
+    """Color decoding of videos; official: as in EgoSim's loader, one gray level darker."""
 
     def run(self) -> int:
-        """Encode shard after shard."""
+        """Encode all shards."""
         import jax
 
         from egosim_jax import configs
@@ -186,9 +187,9 @@ class Encode:
 
 @dataclass(frozen=True, kw_only=True)
 class Make:
-    """Make shards of clips of a procedural world, in parallel. Prints the folder.
+    """Make shards of clips from a procedural world, in parallel. Prints the folder.
 
-    The same command resumes an interrupted one.
+    The same command resumes an interrupted run.
     """
 
     world: Annotated[Literal["tabletop"], tyro.conf.Positional]
@@ -196,42 +197,41 @@ class Make:
     out: Path
     """Folder of the shards."""
     scenes: int = 8
-    """Number of scenes, of consecutive seeds."""
+    """Number of scenes; their seeds are consecutive."""
     clips: int = 1
-    """Consecutive clips of each scene."""
+    """Number of consecutive clips per scene."""
     seed: int = 0
     """Seed of the first scene."""
     kind: Literal["human", "robot", "mixed"] = "human"
-    """Human hands or a robot gripper; mixed: the gripper where the seed is a multiple of four."""
+    """Human hands or a robot gripper; mixed: a gripper if the seed is a multiple of four."""
     frames: int = 17
-    """Frames of a clip, 4k + 1."""
+    """Number of frames in a clip, 4k + 1."""
     height: int = 96
-    """Rows in pixels, a multiple of 16."""
+    """Height in pixels, a multiple of 16."""
     width: int = 160
-    """Columns in pixels, a multiple of 16."""
+    """Width in pixels, a multiple of 16."""
     fps: int = 8
-    """Frame rate of the clips in frames per second."""
+    """Frames per second of the clips."""
     black_cloths: int = 0
-    """Maximum number of black cloths on a table, which in a prior look like unobserved places."""
+    """Maximum number of black cloths on a table, which look like holes in the prior."""
     attempts: float = 0.0
-    """Share of the scenes in which a policy may fail and the head turns, not a script."""
+    """Fraction of scenes with a policy that may fail and head turns, not a script."""
     fixed_camera: bool = False
-    """Leave the camera where it is in the first frame."""
+    """Keep the camera at its first pose."""
     prior: Literal["state", "static"] = "state"
     """Rendering of the scene along the camera path.
 
-    state: points of the scene's state, with holes, as EgoSim's; static: the scene exactly as it was
-    in the first frame, as DWM's."""
+    state: the points of the scene state, with holes, as in EgoSim; static: the exact scene of the
+    first frame, as in DWM."""
     hands: Literal["skeleton", "mesh", "mask"] = "skeleton"
-    """Rendering of the hands: skeletons as EgoSim's, shaded meshes as DWM's, or their binary mask.
-    """
+    """Rendering of the hands: skeletons (EgoSim), shaded meshes (DWM), or their binary mask."""
     workers: int = os.cpu_count() or 1
     """Number of worker processes."""
     config: str | None = None
-    """Name of a model whose latent grid the clips must fit, by default Wan's."""
+    """Name of a model whose latent grid the clips must fit; by default Wan's."""
 
     def run(self) -> int:
-        """Make scene after scene."""
+        """Make all scenes."""
         from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 
         check_counts({"--workers": self.workers})
@@ -256,16 +256,16 @@ class Make:
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Verify shards: hashes, counts, shapes, every video.
+    """Verify shards: hashes, counts, shapes and every video.
 
-    Prints one line per problem; exit code 3 if there is any.
+    Prints one line per problem. Exit code 3 if there are problems.
     """
 
     shards: Path
     """Folder of the shards."""
 
     def run(self) -> int:
-        """Check shard after shard."""
+        """Check all shards."""
         from egosim_jax.data.check import check
         from egosim_jax.data.manifest import read_manifest
 
@@ -289,13 +289,13 @@ class Look:
     out: Path
     """Image to write, .png or .jpg."""
     by: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN [COLUMN ...]")] = ()
-    """Draw the first clip of each combination of values of these columns, for instance verb."""
+    """Columns such as verb: draw the first clip of each combination of their values."""
     limit: int = 12
     """Maximum number of clips."""
     streams: tuple[Literal["target", "prior", "hands"], ...] = ("target", "prior", "hands")
     """Videos of each clip, from top to bottom."""
     moments: int = 6
-    """Number of frames of each clip."""
+    """Number of frames to draw per clip."""
     width: int = 240
     """Width of a frame in pixels."""
 
@@ -326,7 +326,7 @@ class Stats:
     """Folder of the shards."""
 
     def run(self) -> int:
-        """Read every record and print two tables."""
+        """Read all records and print two tables."""
         from rich.console import Console
         from rich.table import Table
 
@@ -361,7 +361,7 @@ class Stats:
 
 @dataclass(frozen=True, kw_only=True)
 class Data:
-    """Prepare data: recordings, annotated clips, clips of a procedural world, and shards."""
+    """Prepare data: import and annotate recordings, make procedural clips, pack shards."""
 
     command: (
         Annotated[Annotate, tyro.conf.subcommand("annotate")]

@@ -37,25 +37,25 @@ EXTRAS = {
     "tensorboardX": "tensorboard",
     "wandb": "wandb",
 }
-"""Extras by the module that they install."""
+"""Optional module -> extra that installs it."""
 NATIVE = ("open3d", "cv2", "av")
-"""Modules that need system libraries."""
+"""Modules that need system libraries, and so can be installed but not importable."""
 HERE = Path("weights")
-"""Default folder that is searched for weights."""
+"""Folder to search for weights by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
-    """Report devices, versions, extras and weights, and what each model needs in memory.
+    """Report devices, versions, extras and weights, and the memory that each model needs.
 
     Exit code 1 if a required module cannot be imported.
     """
 
     weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of weights to report, by default those in ./weights and those that were fetched."""
+    """Folders of weights to report; by default all in ./weights and all fetched ones."""
 
     def run(self) -> int:
-        """Print versions, devices, memory and what is missing."""
+        """Print versions, devices, memory and missing modules."""
         import jax
         from rich.console import Console
 
@@ -82,7 +82,7 @@ class Doctor:
 
 
 def _default_folders() -> Iterator[Path]:
-    """Yield the folders in ./weights, then those of fetched releases."""
+    """Yield the folders in ./weights, then the fetched releases."""
     from egosim_jax import configs
     from egosim_jax.io.hub import fetched_folder, is_fetched
 
@@ -92,10 +92,10 @@ def _default_folders() -> Iterator[Path]:
 
 
 def _version(package: str) -> str:
-    """Return the version of a package; another one may have its module, as OpenCV has several."""
+    """Return the version of a package."""
     try:
         return metadata.version(package)
-    except metadata.PackageNotFoundError:
+    except metadata.PackageNotFoundError:  # its module may still exist: OpenCV has several packages
         return "not installed"
 
 
@@ -137,7 +137,7 @@ def _print_models(console: Console, folders: list[Path]) -> None:
 
 
 def _bytes(config: ModelConfig) -> int:
-    """Return the size of the weights of a model in the dtypes in which its networks compute."""
+    """Return the size of a model's weights in bytes, in the compute dtypes of its networks."""
     import jax.numpy as jnp
     from flax import nnx
 
@@ -152,7 +152,7 @@ def _bytes(config: ModelConfig) -> int:
 
 
 def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
-    """Yield a table row for each network of a folder of weights."""
+    """Yield a table row for each network in a folder of weights."""
     from egosim_jax.io.mapped import read_metadata
     from egosim_jax.io.weights import hashes
 

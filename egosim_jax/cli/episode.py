@@ -18,20 +18,17 @@ if TYPE_CHECKING:
     from egosim_jax.simulation import episode as episodes
     from egosim_jax.types import Action, Cameras, SceneState
 
-IMAGES = 6
-"""Frames of each video on a contact sheet."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class MakeEpisode:
     """Make an episode of the tabletop world, or of your own cameras, hands and scene.
 
-    Without --actions it is drawn by the seed, at the length and size of a model's clips, with
-    ground truth. With --actions there is one .npz or .json file per clip, in meters and OpenCV
-    axes: world_from_camera (f, 4, 4), intrinsics_px (3, 3), joints_m (f, hands, 21 or 3, 3), null
-    or NaN where a hand is missing. Intrinsics are those of the clip's size, in pixels: scale them
-    with the video. A .json file may also have a prompt. The scene is given by --state, or by
-    --image, without hands, and its --depth, seen from the first camera.
+    Without --actions, the seed determines scene and actions, and the episode has ground truth.
+    With --actions, give one .npz or .json file per clip, in meters and OpenCV axes:
+    world_from_camera (f, 4, 4), intrinsics_px (3, 3), joints_m (f, hands, 21 or 3, 3), null or NaN
+    where a hand is missing. Intrinsics are in pixels of the clips: scale them with the video. A
+    .json file may also have a prompt. Give the scene by --state, or by --image (without hands) and
+    --depth, both seen from the first camera.
     """
 
     out: Path
@@ -39,9 +36,9 @@ class MakeEpisode:
     config: str = "tabletop"
     """Model whose length, size and frame rate the clips have."""
     seed: int | None = None
-    """Seed of scene and actions in the tabletop world; 0 if not given."""
+    """Seed of scene and actions in the tabletop world; by default 0."""
     clips: int | None = None
-    """Number of clips of the tabletop world; 3 if not given."""
+    """Number of clips in the tabletop world; by default 3."""
     robot: bool = False
     """Use a robot gripper instead of human hands in the tabletop world."""
     actions: tuple[Path, ...] = ()
@@ -59,10 +56,7 @@ class MakeEpisode:
         """Make, check and write the episode."""
         check_counts({"--clips": self.clips})
         check_seed(self.seed or 0)
-        episode = self._own() if self.actions else self._tabletop()
-        episode.save(self.out)
-        print(f"{self.out}: {summary(episode)}")
-        return ExitCode.DONE
+        return _save(self._own() if self.actions else self._tabletop(), self.out)
 
     def _tabletop(self) -> episodes.Episode:
         from egosim_jax import configs
@@ -85,7 +79,7 @@ class MakeEpisode:
         given = {"clips": self.clips, "seed": self.seed, "robot": self.robot or None}
         if names := [name for name, value in given.items() if value is not None]:
             raise InputError(
-                f"--{names[0]} is of the tabletop world: the files of --actions have their own "
+                f"--{names[0]} is for the tabletop world: the files of --actions have their own "
                 f"clips and hands. Remove --{names[0]} or --actions."
             )
         if self.prompts and len(self.prompts) != len(self.actions):
@@ -105,23 +99,21 @@ class MakeEpisode:
         return episode
 
     def _scene(self, cameras: Cameras) -> tuple[SceneState, np.ndarray | None]:
-        """Return the state, and the image at the size of the clips if there is one."""
+        """Return the state, and the image, if given, at the size of the clips."""
         from egosim_jax.data.transforms import resize_video
         from egosim_jax.io.images import read_image
-        from egosim_jax.state.snapshot import load, read_ply
 
         image = None if self.image is None else read_image(self.image)
         size = cameras.height, cameras.width
         frame = None if image is None else resize_video(image[None], *size)[0]
         if self.state is not None and self.depth is None:
-            read = read_ply if self.state.suffix == ".ply" else load
-            return read(self.state), frame
+            return _read_state(self.state), frame
         if image is not None and self.depth is not None and self.state is None:
             return self._lift(image, self.depth, cameras), frame
         raise InputError("The scene must be given once: by --state, or by --image and --depth.")
 
     def _lift(self, image: np.ndarray, depth: Path, cameras: Cameras) -> SceneState:
-        """Return the state of the image and its depth, seen from the first camera."""
+        """Return the points of an RGB-D image taken by the first camera."""
         import numpy as np
 
         from egosim_jax.io.untrusted.npz import read_arrays
@@ -135,7 +127,7 @@ class MakeEpisode:
             )
         scale = np.array([image.shape[1] / cameras.width, image.shape[0] / cameras.height, 1])
         intrinsics = cameras.intrinsics_px * scale[:, None]
-        intrinsics[:2, 2] += (scale[:2] - 1) / 2
+        intrinsics[:2, 2] += (scale[:2] - 1) / 2  # pixel centers are at integer coordinates
         return state_from_depth(image, depth_m, intrinsics, cameras.world_from_camera[0])
 
 
@@ -143,8 +135,8 @@ class MakeEpisode:
 class FromAnnotation:
     """Make an episode of a recorded video, from a clip that `egosim data annotate` accepted.
 
-    The scene is that of the clip's first frame, the actions are its cameras and hands, and the
-    ground truth is the video, cut into clips of the model's length at its size and frame rate.
+    The scene is the clip's first frame, and the actions are its cameras and hands. The ground truth
+    is the video, cut into clips of the model's length, size and frame rate.
     """
 
     clip: Annotated[Path, tyro.conf.Positional]
@@ -154,7 +146,7 @@ class FromAnnotation:
     config: str = "real_tiny"
     """Model whose length, size and frame rate the clips have."""
     clips: int | None = None
-    """Number of clips; as many as the video is long if not given."""
+    """Number of clips; by default as many as fit into the video."""
 
     def run(self) -> int:
         """Read the clip, make, check and write the episode."""
@@ -163,18 +155,16 @@ class FromAnnotation:
 
         check_counts({"--clips": self.clips})
         episode = episode_from(self.clip, configs.get(self.config).video, clips=self.clips)
-        episode.save(self.out)
-        print(f"{self.out}: {summary(episode)}")
-        return ExitCode.DONE
+        return _save(episode, self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FromLeRobot:
-    """Make an episode of a LeRobot dataset of version 3.0 that has hands and cameras.
+    """Make an episode from a LeRobot dataset (version 3.0) that has hands and cameras.
 
-    `egosim data export --to lerobot` writes such datasets, with the scene of each episode; others
-    need the features that docs/serving.md names, and a --state. Of a dataset with videos only,
-    import and annotate a video instead (docs/video.md).
+    `egosim data export --to lerobot` writes such datasets, including the scene of each episode.
+    Other datasets need the features listed in docs/serving.md, and a --state. If a dataset has only
+    videos, import and annotate a video instead (docs/video.md).
     """
 
     dataset: Annotated[Path, tyro.conf.Positional]
@@ -182,38 +172,33 @@ class FromLeRobot:
     out: Path
     """Folder to write, or a file whose name ends in .zip."""
     episode: int = 0
-    """Number of the episode."""
+    """Number of the episode in the dataset."""
     config: str = "tabletop"
     """Model whose length, size and frame rate the clips have."""
     state: Path | None = None
     """Folder of a state, or a .ply of colored points, instead of the dataset's own scene."""
     clips: int | None = None
-    """Number of clips; as many as the episode is long if not given."""
+    """Number of clips; by default as many as fit into the episode."""
 
     def run(self) -> int:
         """Read the dataset, make, check and write the episode."""
         from egosim_jax import configs
         from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
-        from egosim_jax.state.snapshot import load, read_ply
 
         check_counts({"--clips": self.clips})
-        state = None
-        if self.state is not None:
-            state = (read_ply if self.state.suffix == ".ply" else load)(self.state)
+        state = None if self.state is None else _read_state(self.state)
         video = configs.get(self.config).video
         episode = episode_from_lerobot(
             self.dataset, self.episode, video, state=state, clips=self.clips
         )
-        episode.save(self.out)
-        print(f"{self.out}: {summary(episode)}")
-        return ExitCode.DONE
+        return _save(episode, self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckEpisode:
     """Validate an episode: files, joints, units, cameras, frame of reference.
 
-    Prints a summary, or what is wrong and how to fix it.
+    Prints a summary, or the first problem and its fix.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -222,7 +207,7 @@ class CheckEpisode:
     """Model that the clips must fit in length, size and frame rate."""
 
     def run(self) -> int:
-        """Load the episode, which checks all of it."""
+        """Load the episode, which checks every file."""
         from egosim_jax import configs
         from egosim_jax.cli.simulate import check_fits
         from egosim_jax.simulation.episode import Episode
@@ -236,27 +221,26 @@ class CheckEpisode:
 
 @dataclass(frozen=True, kw_only=True)
 class ShowEpisode:
-    """Draw an episode's inputs: the view of the state with the hands of each clip.
+    """Draw an episode's inputs: the rendered initial state with the hands of each clip.
 
-    Writes one contact sheet: a row of the first state along the cameras of the clip, with the hands
-    drawn over it, and a row of the ground truth if there is one.
+    Writes one contact sheet. Each clip has a row with the initial state and the hands, seen from
+    the clip's cameras, and a row of the ground truth if there is one.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or .zip of the episode."""
     out: Path | None = None
-    """Image to write; NAME.png in the current folder if not given."""
+    """Image to write; by default NAME.png in the current folder."""
     renderer: RendererName = "jax"
     """Renderer of the view and the hands."""
 
     def run(self) -> int:
         """Render and write the contact sheet."""
+        from egosim_jax.cli.simulate import sheet_moments
         from egosim_jax.data.sheet import SheetClip, draw_sheet
         from egosim_jax.simulation.episode import Episode
 
         episode = Episode.load(self.path)
-        last = episode.shape[0] - 1
-        moments = [last * k // (IMAGES - 1) for k in range(IMAGES)]
         truths = episode.ground_truth or (None,) * len(episode.actions)
         sheet = []
         for number, (action, truth) in enumerate(
@@ -268,7 +252,7 @@ class ShowEpisode:
             title = f"{number}: {action.prompt}   ({', '.join(videos)})"
             sheet.append(SheetClip(title, list(videos.values())))
         out = self.out or Path(f"{self.path.stem}.png")
-        draw_sheet(sheet, out, moments=moments)
+        draw_sheet(sheet, out, moments=sheet_moments(episode.shape[0]))
         print(out)
         return ExitCode.DONE
 
@@ -283,8 +267,21 @@ class ShowEpisode:
         return np.where((depth_m < view.depth_m)[..., None], hands, view.frames)
 
 
+def _read_state(path: Path) -> SceneState:
+    from egosim_jax.state.snapshot import load, read_ply
+
+    return (read_ply if path.suffix == ".ply" else load)(path)
+
+
+def _save(episode: episodes.Episode, out: Path) -> int:
+    """Check and write the episode; print its summary."""
+    episode.save(out)
+    print(f"{out}: {summary(episode)}")
+    return ExitCode.DONE
+
+
 def summary(episode: episodes.Episode) -> str:
-    """Return one line about an episode."""
+    """Return a one-line description of an episode."""
     frames, height, width = episode.shape
     known = "with" if episode.ground_truth else "without"
     return (

@@ -1,4 +1,4 @@
-"""`egosim evaluate`: scores of generated clips against the recorded ones."""
+"""`egosim evaluate`: score generated clips against the recorded ones."""
 
 from __future__ import annotations
 
@@ -14,26 +14,25 @@ from egosim_jax.runtime.command import ExitCode
 class Evaluate(Options):
     """Compare generated clips with the recorded ones by PSNR, SSIM, LPIPS and other measures.
 
-    Every {id}.mp4 is compared with the ground truth of its metadata row over the same frames, all
-    at one size; so are the baselines and, if there is an {id}_vae.mp4, the ground truth through the
-    autoencoder. Frame 0 is excluded, because there the repeated frame is the ground truth. A clip
-    of another length than most is skipped (exit code 3). Prints a table for each split with spreads
-    and paired differences; writes report.json (with the protocol), metrics.jsonl, scores.csv,
-    table.tex, scores.png and index.html. Scores are cached by content: the same command computes
-    what is new.
+    Every {id}.mp4 is compared with the ground truth of its metadata row, over the same frames and
+    at one size. The baselines are compared, too, and {id}_vae.mp4 (the ground truth through the
+    autoencoder) if there is one. Frame 0 is excluded, because it is given. A clip whose length
+    differs from most clips is skipped (exit code 3). Prints a table for each split with spreads and
+    paired differences. Writes report.json (with the protocol), metrics.jsonl, scores.csv,
+    table.tex, scores.png and index.html. Scores are cached by content: a repeated command computes
+    only new ones.
     """
 
     size: Literal["output", "target"] = "output"
-    """Size of the comparison: of the first folder's clips, or of the recorded video.
+    """Image size of the comparison: output, the first folder's clips; target, the recorded video.
 
-    That of the output flatters small ones: compare methods whose outputs differ in size at that of
-    the target."""
+    Small outputs score too well at their own size: choose target if methods differ in size."""
     out: Path | None = None
-    """Folder of the report, by default that of the first folder's clips."""
+    """Folder of the report; by default the first folder of clips."""
 
     def run(self) -> int:
-        """Compare clip after clip, then summarize."""
-        from egosim_jax.evaluation.methods import Folder
+        """Compare all clips, then summarize."""
+        from egosim_jax.evaluation.methods import Folder, autoencoded
         from egosim_jax.evaluation.result import SHOWN
         from egosim_jax.evaluation.scoring import Protocol
 
@@ -41,10 +40,8 @@ class Evaluate(Options):
         first = folders[0]
         if len(folders) == 1 and "=" not in self.generated[0]:
             folders = [replace(first, name="generated", title="generated")]
-        title = "ground truth through the autoencoder"
-        vae = Folder(path=first.path, name="vae", title=title, suffix="_vae", optional=True)
         evaluation = self.compare(
-            [*folders, vae],
+            [*folders, autoencoded(first.path)],
             self.read_clips(),
             protocol=Protocol(size=self.size),
             out=self.out or first.path,

@@ -1,4 +1,4 @@
-"""`egosim experiment`: documented experiments, each by one command that resumes."""
+"""`egosim experiment`: run a documented experiment by one command that resumes."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ MODULES = {
     RealTiny: "real_tiny",
     Debug: "debug",
 }
-"""Module of `egosim_jax.experiments`, and name on the command line, of each experiment."""
+"""Config -> module of `egosim_jax.experiments`, which is also its name on the command line."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Repeat a documented experiment: training, generation and its table, by one command."""
+    """Repeat a documented experiment, from training to its table, by one command."""
 
     command: (
         Annotated[Tabletop, tyro.conf.subcommand("tabletop")]

@@ -1,4 +1,4 @@
-"""`egosim data export`: recorded sessions as LeRobot datasets, training shards or recordings."""
+"""`egosim data export`: convert recorded sessions to LeRobot, training shards or Rerun."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from egosim_jax.types import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Export the sessions of `egosim serve` or `egosim play` to LeRobot, training shards or Rerun.
+    """Export sessions of `egosim serve` or `egosim play` to LeRobot, training shards or Rerun.
 
-    lerobot: a dataset of version 3.0, an episode for each stretch between resets (extra `video`).
-    shards: a clip for each step, whose target is the generated clip. rerun: OUT/SESSION.rrd of each
-    session, for `egosim view` (extra `viewer`). A damaged session is reported and skipped (exit
-    code 3). Prints OUT.
+    lerobot: a dataset (version 3.0) with one episode per reset (extra `video`). shards: one clip
+    per step; its target is the generated clip. rerun: OUT/SESSION.rrd per session, for `egosim
+    view` (extra `viewer`). A damaged session is reported and skipped (exit code 3). Prints OUT.
     """
 
     sessions: Annotated[Path, tyro.conf.Positional]
@@ -31,9 +30,9 @@ class Export:
     to: Literal["lerobot", "shards", "rerun"] = "lerobot"
     """Format to write."""
     session: tuple[str, ...] = ()
-    """Ids of the sessions; all if not given."""
+    """Ids of the sessions; by default all."""
     config: str = "tabletop"
-    """Name of the model whose latent grid the shards must fit."""
+    """Name of a model whose latent grid the shards must fit."""
 
     def run(self) -> int:
         """Read the sessions and write them."""

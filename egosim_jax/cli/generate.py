@@ -1,4 +1,4 @@
-"""`egosim generate`: clips from a metadata file of conditions."""
+"""`egosim generate`: generate clips from a metadata file of conditions."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Generate:
     """Generate a clip for each row of a metadata file, or for scenes of the tabletop world.
 
     Writes {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | ground truth), contact_sheet.png (the
-    same rows of the first clips), results.jsonl, config.json and environment.json.
-    Prints the path of each clip.
+    same videos of the first clips), results.jsonl, config.json and environment.json. Prints the
+    path of each clip.
     """
 
     help_groups: ClassVar[HelpGroups] = {
@@ -38,56 +38,56 @@ class Generate:
     config: str
     """Name of the model (`egosim models list`)."""
     metadata: Path | None = None
-    """CSV or JSONL in EgoSim's columns, or a list of DWM; without it, scenes of the tabletop world.
+    """CSV or JSONL with EgoSim's columns, or a DWM list; by default scenes of the tabletop world.
 
-    The columns are ego_prior_video, hand_keypoint_video, first_frame, prompt, video_id, and video
-    if the ground truth is known. Scenes are written to OUT/scenes."""
+    The columns: ego_prior_video, hand_keypoint_video, first_frame, prompt, video_id, and video if
+    the ground truth is known. Tabletop scenes are written to OUT/scenes."""
     robot: bool = False
-    """Make the scene with a robot gripper instead of human hands."""
+    """Use a robot gripper instead of human hands in the tabletop world."""
     out: Path | None = None
-    """Folder to write to; runs/CONFIG_SEED if not given."""
+    """Folder to write to; by default runs/CONFIG_SEED."""
     weights: Path | None = None
-    """Folder of weights, by default those that ship with the package or were fetched.
+    """Folder of weights; by default the shipped or fetched ones.
 
-    The model `debug` has random ones."""
+    The model `debug` has random weights."""
     lora: Path | None = None
-    """LoRA of the video transformer, in PEFT's, diffusers', kohya's or ComfyUI's names.
+    """LoRA of the video transformer, with PEFT, diffusers, kohya or ComfyUI names.
 
-    A file, or DWM's folder of one with weights in full."""
+    A file, or DWM's folder of a LoRA and fully trained weights."""
     lora_scale: float | None = None
     """Strength of the LoRA."""
     video_id: tuple[str, ...] = ()
-    """Take only these clips."""
+    """Ids of the clips to generate; by default all."""
     where: str | None = None
-    """Take rows whose column has this value, for instance split=test."""
+    """Select rows by the value of a column, for instance split=test."""
     limit: int | None = None
-    """Maximum number of clips; without metadata, number of scenes, of consecutive seeds."""
+    """Maximum number of clips; without --metadata, number of scenes, with consecutive seeds."""
     start: Annotated[tuple[int, ...], tyro.conf.arg(metavar="FRAME [FRAME ...]")] = (0,)
-    """First frame of the window that is generated; several make several clips, {id}_{frame}."""
+    """First frame of the generated window; each of several makes a clip {id}_{frame}."""
     prompts: Prompts = "prompts_rewrite"
-    """Captions of a list of DWM.
+    """Captions to read from a DWM list.
 
-    prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
-    has none; prompts: the original ones, of the paper's evaluation."""
+    prompts_rewrite: rewritten captions, as in the released models, or the original caption where
+    there is no rewritten one; prompts: original captions, as in the paper's evaluation."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     sampling: str | None = None
-    """Named sampling of the model, such as `released` or `paper` of DWM; None: the default one.
+    """Named sampling settings of the model, such as `released` or `paper` of DWM.
 
-    It may set steps, solver, guidance and prompt; --steps and --solver change it."""
+    They may set steps, solver, guidance and prompt; --steps and --solver override them."""
     strength: float | None = None
-    """Share of the steps to take, from the prior with that much noise (SDEdit), such as 0.75.
+    """Start from the prior with this fraction of the noise, such as 0.75 (SDEdit).
 
-    The prior is then no condition."""
+    Only this fraction of the steps runs. The prior is then not a condition."""
     solver: Solver | None = None
-    """Sampler, instead of the model's.
+    """Solver, instead of the model's.
 
-    wan: UniPC with Wan's noise levels and integer timesteps; dpmpp_2m: DPM-Solver++ (2M), whose SDE
-    form adds noise at each step."""
+    wan: UniPC with Wan's noise levels and integer timesteps; dpmpp_2m: DPM-Solver++ (2M);
+    dpmpp_2m_sde: its SDE form, which adds noise at each step."""
     seed: int = 0
-    """Seed from which each clip's noise is derived, and without metadata the scene."""
+    """Seed of the noise and, without --metadata, of the first scene."""
     batch_size: int | None = None
-    """Clips generated together, over all devices: a multiple of mesh.data x mesh.fsdp, its default.
+    """Clips generated together on all devices; by default, or a multiple of, mesh.data x mesh.fsdp.
     """
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
     """Layout of the devices; by default each generates separate clips.
@@ -95,22 +95,23 @@ class Generate:
     Less time for one clip: --mesh.data 1 --mesh.context -1. Weights too large for one device:
     --mesh.data 1 --mesh.fsdp -1."""
     lenient: bool = False
-    """Repair input as the official loader does.
+    """Repair input as EgoSim's loader does, instead of rejecting it.
 
-    It repeats or cuts frames, resizes videos, and treats all pixels as observed without a mask."""
+    Repeats or cuts frames, resizes videos, and treats all pixels as observed if a mask is missing.
+    """
     decoding: Literal["accurate", "official"] = "accurate"
-    """Color decoding of videos; official: as in EgoSim's loader, a gray level darker."""
+    """Color decoding of videos; official: as in EgoSim's loader, one gray level darker."""
     baseline: Literal["no_hands", "hand_mask", "sdedit"] | None = None
-    """Generate a baseline of the model: without hands, with their mask, or by SDEdit.
+    """Baseline to generate: without hands, with a mask of the hands, or by SDEdit.
 
-    SDEdit begins with the noised prior, at the model's strength or 0.75."""
+    SDEdit starts from the noised prior, at --strength or 0.75."""
     skip_existing: bool = False
-    """Skip clips whose video exists; one that was made of other inputs is refused."""
+    """Skip clips whose video exists; stop if it was made from other inputs."""
     reconstruct: bool = False
-    """Also write {id}_vae.mp4, the ground truth through the autoencoder: the upper bound."""
+    """Also write {id}_vae.mp4, the ground truth through the autoencoder: an upper bound."""
 
     def run(self) -> int:
-        """Check everything, compile, generate."""
+        """Check all options, compile and generate."""
         from egosim_jax.generation.batch import BatchJob
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.worlds.tabletop.dataset import write_scenes
@@ -162,17 +163,17 @@ class Generate:
             raise InputError(f"--start must be at least 0, not {min(self.start)}.")
         if self.robot and self.metadata is not None:
             raise InputError(
-                "--robot is of the tabletop world: the clips of --metadata have their own hands. "
+                "--robot is for the tabletop world: the clips of --metadata have their own hands. "
                 "Omit one of them. (--robot, --metadata)"
             )
         if self.prompts != "prompts_rewrite" and self.metadata is None:
             raise InputError(
-                f"--prompts {self.prompts} is of a list of DWM: scenes of the tabletop world have "
-                "one caption. Give a list, or leave this out. (--prompts, --metadata)"
+                f"--prompts {self.prompts} is for a DWM list: scenes of the tabletop world have "
+                "one caption. Give a list, or omit this option. (--prompts, --metadata)"
             )
         if self.lora is None and self.lora_scale is not None:
             raise InputError(
-                "--lora-scale is the strength of a LoRA: name its file as well. (--lora)"
+                "--lora-scale is the strength of a LoRA: give its file as well. (--lora)"
             )
         if self.lora is not None and self._weights is None:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
@@ -190,7 +191,7 @@ class Generate:
         return windows_of(clips, self.start)
 
     def _model(self) -> ModelConfig:
-        """Return the config of the model with the options applied."""
+        """Return the model config with the options applied."""
         from egosim_jax import configs
         from egosim_jax.conditioning.baselines import STRENGTH
         from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
@@ -220,7 +221,7 @@ class Generate:
 
     @property
     def _weights(self) -> Path | None:
-        """Folder of the weights; None for random ones."""
+        """Folder of the weights; None for random weights."""
         from egosim_jax import configs
 
         if self.weights is None and configs.allows_random_weights(self.config):

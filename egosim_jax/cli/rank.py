@@ -1,4 +1,4 @@
-"""`egosim rank`: candidate actions by the goal that their generated videos reach."""
+"""`egosim rank`: rank candidate actions by how well their generated videos reach a goal."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from egosim_jax.types import InputError, check_counts, check_seed
 
 @dataclass(frozen=True, kw_only=True)
 class Rank:
-    """Generate candidate actions and rank them by an image or a text of the goal.
+    """Generate a video of each candidate action, and rank the actions by a goal image or text.
 
-    By the image, the score is the negative LPIPS of the last frame (extra `metrics`); by the
-    text, the similarity of the video by X-CLIP (extra `networks`). Writes the clips of each seed to
-    OUT/SEED, and OUT/ranking.json; prints the ranking, best first.
+    With a goal image, the score is the negative LPIPS of the last frame (extra `metrics`). With a
+    goal text, it is the X-CLIP similarity of the video (extra `networks`). Writes the clips of each
+    seed to OUT/SEED, and OUT/ranking.json. Prints the ranking, best first.
     """
 
     config: str
     """Name of the model."""
     actions: Path
-    """CSV or JSONL in EgoSim's columns: a row for each candidate, with its hands and prompt."""
+    """CSV or JSONL with EgoSim's columns: one row per candidate, with its hands and prompt."""
     out: Path
-    """Folder to write to; the same command resumes."""
+    """Folder to write to; the same command resumes an interrupted run."""
     goal_image: Path | None = None
-    """Image of the goal, of the shape of the model's clips."""
+    """Image of the goal, at the size of the model's clips."""
     goal_text: str | None = None
     """Text that describes the goal."""
     xclip: Path | None = None
-    """Folder of an X-CLIP model, such as microsoft/xclip-base-patch32, for a text."""
+    """Folder of an X-CLIP model for --goal-text, such as microsoft/xclip-base-patch32."""
     weights: Path | None = None
-    """Folder of weights, by default those that ship with the package or were fetched."""
+    """Folder of weights; by default the shipped or fetched ones."""
     lora: Path | None = None
     """LoRA of the video transformer."""
     sampling: str | None = None
-    """Named sampling of the model, as in `generate`."""
+    """Named sampling settings of the model, as in `generate`."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     seeds: int = 3
-    """Repetitions of each candidate with different noise."""
+    """Number of clips per candidate, with different noise."""
     seed: int = 0
     """First seed of the noise."""
     batch_size: int | None = None
-    """Clips generated together, over all devices."""
+    """Clips generated together on all devices."""
 
     def run(self) -> int:
-        """Check the goal, generate every candidate, rank."""
+        """Check the goal, generate all candidates, rank them."""
         from egosim_jax import configs
         from egosim_jax.data.metadata import read_metadata
         from egosim_jax.data.windows import windows_of
@@ -67,8 +67,8 @@ class Rank:
             )
         if self.goal_image is not None and self.xclip is not None:
             raise InputError(
-                "An image is compared by LPIPS, not by X-CLIP: omit the network, or give a text "
-                "of the goal. (--xclip, --goal-image)"
+                "An image is compared by LPIPS, not by X-CLIP: omit --xclip, or give a goal "
+                "text. (--xclip, --goal-image)"
             )
         config = configs.get(self.config)
         if self.goal_image is not None:

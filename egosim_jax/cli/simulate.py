@@ -1,4 +1,4 @@
-"""`egosim simulate`: several clips in a row, each in the world that the previous one left."""
+"""`egosim simulate`: generate clips in sequence; each changes the scene state of the next."""
 
 from __future__ import annotations
 
@@ -22,21 +22,22 @@ if TYPE_CHECKING:
     from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.types import Action, GroundTruth, SceneState
 
-IMAGES = 6
-"""Frames of each video on the contact sheet."""
+SHEET_FRAMES = 6
+"""Number of frames of each video on a contact sheet."""
 CLIPS = 3
-"""Clips of the tabletop world if `--clips` is not given."""
+"""Default number of clips in the tabletop world."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Act several times in a scene that remembers what was done: an episode, or the tabletop world.
+    """Act several times in a scene that keeps its changes: an episode, or the tabletop world.
 
-    Each clip is generated from a view of the state, read back into 3D, and fused into it. Writes
-    for each clip clip_N.mp4 and clip_N_cmp.mp4 (view | hands | generated | ground truth), the state
-    before the first and after each as state_N.ply and state_N.png, contact_sheet.png, report.json
-    and, if Rerun is installed, simulation.rrd for `egosim view`. Clips are scored where the episode
-    has ground truth, as in the tabletop world. An interrupted run is resumed.
+    Each clip is generated from a view of the scene state; perception then updates the state from
+    the clip. Writes clip_N.mp4 and clip_N_cmp.mp4 (view | hands | generated | ground truth) for
+    each clip; state_N.ply and state_N.png before the first clip and after each; contact_sheet.png;
+    report.json; and, if Rerun is installed, simulation.rrd for `egosim view`. Clips are scored if
+    the episode has ground truth, as in the tabletop world. The same command resumes an interrupted
+    run.
     """
 
     help_groups: ClassVar[HelpGroups] = {
@@ -46,29 +47,29 @@ class Simulate:
     config: str = "tabletop"
     """Name of the model (`egosim models list`)."""
     episode: Path | None = None
-    """Folder or .zip of an episode (`egosim episode make`); the tabletop world if not given."""
+    """Folder or .zip of an episode (`egosim episode make`); by default the tabletop world."""
     clips: int | None = None
-    """Number of clips; all of the episode, or 3 of the tabletop world, if not given."""
+    """Number of clips; by default all of the episode, or 3 in the tabletop world."""
     seed: int = 0
     """Seed of the noise, and of scene and actions in the tabletop world."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     perception: str = "classical"
-    """Perception pipeline by name, with its options, which 'NAME --help' lists.
+    """Perception pipeline, with its options: classical, networks, recorded, oracle or MODULE:NAME.
 
-    classical, networks, recorded, oracle, or a registered one, MODULE:NAME."""
+    MODULE:NAME is a pipeline of your own. 'NAME --help' lists the options of a pipeline."""
     update: Literal["full", "none"] = "full"
-    """Update the state from the clips, or keep it as it was before the first."""
+    """Update the state after each clip, or keep the initial state."""
     renderer: RendererName = "jax"
     """Renderer of the view and the hands; numpy is the slow reference."""
     robot: bool = False
-    """Simulate a robot gripper instead of human hands in the tabletop world."""
+    """Use a robot gripper instead of human hands in the tabletop world."""
     first_frame: Path | None = None
-    """First frame of the first clip; that of the episode if not given."""
+    """Image for the first frame of the first clip; by default the episode's."""
     out: Path | None = None
-    """Folder to write to; runs/simulate_SEED if not given."""
+    """Folder to write to; by default runs/simulate_SEED."""
     weights: Path | None = None
-    """Folder of weights, by default those that ship with the package or were fetched."""
+    """Folder of weights; by default the shipped or fetched ones."""
 
     def run(self) -> int:
         """Simulate; write videos, states and scores."""
@@ -90,7 +91,7 @@ class Simulate:
         if self.update == "none" and self.perception != Simulate.perception:
             raise InputError(
                 f"--perception {self.perception} has no effect with --update none: give --update "
-                "full, or leave this out."
+                "full, or omit this option."
             )
         share_with_jax()
         config = configs.get(self.config)
@@ -110,7 +111,7 @@ class Simulate:
             "weights": hashes(weights),
             "episode": fingerprint(episode),
         }
-        Journal(folder, outputs=OUTPUTS)  # a damaged one is refused before the weights are loaded
+        Journal(folder, outputs=OUTPUTS)  # refuses a damaged journal before the weights are loaded
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
         simulator = Simulator(
@@ -134,7 +135,7 @@ class Simulate:
 
         if self.episode is not None:
             if self.robot:
-                raise InputError("--robot is of the tabletop world: an episode has its own hands.")
+                raise InputError("--robot is for the tabletop world: an episode has its own hands.")
             episode = Episode.load(self.episode)
             check_fits(episode, video, self.config)
         else:
@@ -168,14 +169,19 @@ class Simulate:
 
 def check_fits(episode: Episode, video: VideoSpec, config: str) -> None:
     """Raise `InputError` unless an episode has the length, size and rate of a model's clips."""
-    have = (*episode.shape, episode.fps)
-    want = (video.frames, video.height, video.width, video.fps)
-    if have != want:
+    frames, height, width = episode.shape
+    own = f"{frames} frames of {width}x{height} at {episode.fps} fps"
+    model = f"{video.frames} of {video.width}x{video.height} at {video.fps} fps"
+    if (*episode.shape, episode.fps) != (video.frames, video.height, video.width, video.fps):
         raise InputError(
-            f"The episode has clips of {have[0]} frames of {have[2]}x{have[1]} at {have[3]} fps, "
-            f"and {config} generates {want[0]} of {want[2]}x{want[1]} at {want[3]} fps: they must "
-            "be equal. Choose another model (--config), or make the episode for this one."
+            f"The episode has clips of {own}, and {config} generates {model}: they must be equal. "
+            "Choose another model (--config), or make the episode for this one."
         )
+
+
+def sheet_moments(frames: int) -> list[int]:
+    """Return the evenly spaced frames of a video that a contact sheet shows."""
+    return [(frames - 1) * k // (SHEET_FRAMES - 1) for k in range(SHEET_FRAMES)]
 
 
 @dataclass(frozen=True)
@@ -220,8 +226,7 @@ class _Outputs:
             then = time.monotonic()
         if recording is not None:
             recording.close(state)
-        last = self.episode.shape[0] - 1
-        moments = [last * k // (IMAGES - 1) for k in range(IMAGES)]
+        moments = sheet_moments(self.episode.shape[0])
         draw_sheet(sheet, folder / "contact_sheet.png", moments=moments)
         return report
 

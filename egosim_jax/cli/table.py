@@ -1,4 +1,4 @@
-"""`egosim table`: the papers' tables of any folders of clips."""
+"""`egosim table`: make a paper's table from folders of clips."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Name = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class TableCommand(Options):
-    """Make a table of EgoSim's or DWM's paper from folders of clips, by whomever they were made.
+    """Make a table of the EgoSim or DWM paper from folders of clips of any model.
 
-    Clips are grouped by the column dataset of the metadata and compared in the paper's definitions,
-    and its figures are separate rows. Prints the tables with spreads and paired differences;
-    writes report.json, metrics.jsonl, scores.csv (a row per clip), table.tex, scores.png and
-    index.html with the clips in columns. Scores are cached by content: the same command computes
-    what is new.
+    Clips are grouped by a metadata column (dataset) and compared by the paper's definitions. The
+    paper's own figures are separate rows. Prints the tables with spreads and paired differences.
+    Writes report.json, metrics.jsonl, scores.csv (one row per clip), table.tex, scores.png and
+    index.html with the clips in columns. Scores are cached by content: a repeated command computes
+    only new ones.
     """
 
     name: Annotated[Name, tyro.conf.Positional]
@@ -42,7 +42,7 @@ class TableCommand(Options):
     """Folder of the report."""
 
     def run(self) -> int:
-        """Compare clip after clip, then summarize."""
+        """Compare all clips, then summarize."""
         from egosim_jax.evaluation.methods import Folder
         from egosim_jax.evaluation.tables import TABLES
 
@@ -51,7 +51,7 @@ class TableCommand(Options):
         clips = [c for c in self.read_clips() if c.extra.get(table.group) in table.groups]
         if not clips:
             raise InputError(
-                f"No clip belongs to this table: its column {table.group} must be one of "
+                f"No clip belongs to this table: the column {table.group} must be one of "
                 f"{', '.join(table.groups)}. (--metadata)"
             )
         evaluation = self.compare(

@@ -1,4 +1,4 @@
-"""`egosim data static`, `align`, `mix` and `to-dwm`: triplets of static scenes."""
+"""`egosim data static`, `align`, `to-dwm`, `mix` and `from-caches`: DWM's static-scene data."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Static:
-    """Make a triplet of DWM: a static scene, hand meshes, and the recorded video if there is one.
+    """Make a DWM triplet: a static scene, hand meshes, and the recorded video if there is one.
 
-    The scene is rendered along the cameras of the action, or is the first frame of the recorded
-    video, repeated, if the camera is fixed. The files are those of `data pack`; other clips of the
-    folder keep their rows in metadata.csv. Prints its path.
+    The scene is rendered along the action's cameras. For a fixed camera without --scene, it is the
+    first frame of the recorded video, repeated. `data pack` reads the files. Other clips in the
+    folder keep their rows in metadata.csv. Prints the path of metadata.csv.
     """
 
     action: Path
-    """File of cameras and hands, .npz or .json as of `episode make`; hands left before right."""
+    """Cameras and hands, .npz or .json, as for `episode make`; left hand before right."""
     out: Path
     """Folder of the triplet and of metadata.csv."""
     video_id: str
     """Id of the triplet."""
     height: int
-    """Rows of a frame in pixels, that the intrinsics are of."""
+    """Height in pixels of the frames and the intrinsics."""
     width: int
-    """Columns of a frame in pixels."""
+    """Width in pixels of the frames and the intrinsics."""
     scene: Path | None = None
-    """Folder of a state, or a .ply of colored points or triangles; none for a fixed camera."""
+    """Folder of a state, or a .ply of colored points or triangles; omit it for a fixed camera."""
     video: Path | None = None
-    """Recorded video, of the length and size of the action."""
+    """Recorded video, with the length and size of the action."""
     prompt: str | None = None
-    """Caption, instead of that in the file."""
+    """Caption, instead of the one in the file."""
     mano_poses: Path | None = None
-    """.npz of the hands as global_orient, hand_pose, translation_m and betas of MANO.
+    """MANO parameters of the hands, .npz: global_orient, hand_pose, translation_m, betas.
 
-    They replace the meshes of the keypoints."""
+    MANO meshes replace the meshes made from the keypoints."""
     mano_right: Path | None = None
-    """MANO_RIGHT.pkl from mano.is.tue.mpg.de, which is read without executing it."""
+    """MANO_RIGHT.pkl from mano.is.tue.mpg.de; it is read without executing its code."""
     mano_left: Path | None = None
-    """MANO_LEFT.pkl; without it, left hands are mirrored right ones."""
+    """MANO_LEFT.pkl; by default left hands are mirrored right hands."""
     add_mean: bool = False
-    """Take the poses of MANO as relative to its mean pose."""
+    """Add MANO's mean pose to the hand poses."""
     fps: int | None = None
-    """Frame rate in frames per second; None: that of the recorded video, or 8 without one."""
+    """Frames per second; by default the recorded video's, or 8 without a video."""
 
     def run(self) -> int:
-        """Read, render and write."""
+        """Read the inputs, render and write the triplet."""
         from egosim_jax.data.clips import write_clips
         from egosim_jax.generation.export import repeated, static_of, static_triplet
         from egosim_jax.io.video import read_video
@@ -76,8 +76,8 @@ class Static:
             static = repeated(target, action.cameras)
         else:
             raise InputError(
-                "There is no scene: give one, or the video of a fixed camera, whose first frame is "
-                "repeated. (--scene, --video)"
+                "There is no scene: give one, or give the video of a fixed camera, whose first "
+                "frame is then repeated. (--scene, --video)"
             )
         triplet = static_triplet(
             action, static, video_id=self.video_id, meshes=self._meshes(), target=target
@@ -93,8 +93,7 @@ class Static:
             return None
         if self.mano_poses is None or self.mano_right is None:
             raise InputError(
-                "Hands of MANO need its model and their poses: give both. (--mano-right, "
-                "--mano-poses)"
+                "MANO hands need a model and poses: give both. (--mano-right, --mano-poses)"
             )
         left = None if self.mano_left is None else read_mano(self.mano_left)
         poses, right = read_poses(self.mano_poses), read_mano(self.mano_right)
@@ -103,26 +102,26 @@ class Static:
 
 @dataclass(frozen=True, kw_only=True)
 class Align:
-    """Compare the priors of clips with their recorded videos, and find the shift between both.
+    """Compare priors with their recorded videos, and find the pixel shift between them.
 
-    For each clip the PSNR of the prior is printed, which is the baseline of copying it, and what
-    the best shift by whole pixels adds: inside a margin of the largest shift, with and without it.
-    Videos must agree in length and size. Exit code 3 if a clip is skipped.
+    Prints the PSNR of each prior, which is the score of copying it, and the gain of the best shift
+    by whole pixels. The gain compares PSNR with and without the shift, both without a margin of
+    --most-px. Videos must agree in length and size. Exit code 3 if a clip is skipped.
     """
 
     metadata: Path
-    """CSV or JSONL in EgoSim's columns, with video; or a list of DWM, .txt."""
+    """CSV or JSONL with EgoSim's columns, including video; or a DWM list (.txt)."""
     where: str | None = None
-    """Take rows whose column has this value, for instance split=test."""
+    """Select rows by the value of a column, for instance split=test."""
     limit: int | None = None
     """Maximum number of clips."""
     most_px: int = 12
-    """Largest shift along each axis in pixels."""
+    """Maximum shift along each axis in pixels."""
     out: Path | None = None
-    """File of the results to write, .json."""
+    """File to write the results to, .json."""
 
     def run(self) -> int:
-        """Align clip after clip."""
+        """Align all clips and print their shifts."""
         import dataclasses
         import sys
 
@@ -165,10 +164,10 @@ class Align:
 
 @dataclass(frozen=True, kw_only=True)
 class ToDwm:
-    """Write shards of frames or videos as DWM's folders, with a list. Prints the list.
+    """Write shards of frames or videos as DWM's folders and list. Prints the path of the list.
 
-    The folders are videos, videos_static, videos_hands, prompts and prompts_rewrite below OUT/NAME;
-    `--metadata LIST` of every command reads them.
+    The folders are videos, videos_static, videos_hands, prompts and prompts_rewrite in OUT/NAME.
+    Every command reads them by `--metadata LIST`.
     """
 
     shards: Path
@@ -176,23 +175,23 @@ class ToDwm:
     out: Path
     """Root of the folders."""
     name: str
-    """Name of the dataset, which is that of its folder and of its list."""
+    """Name of the dataset, its folder and its list."""
     fps: int | None = None
-    """Frame rate in frames per second; None: that of the shards.
+    """Frames per second; by default as recorded in the shards.
 
-    Frames that `data pack` took by another rule than rate do not say theirs."""
+    Shards have no frame rate if `data pack` took frames by another --resampling than rate."""
     limit: int | None = None
     """Maximum number of clips."""
     caches: str | None = None
-    """Name of a model for which the caches of latents and captions are written, too.
+    """Name of a model: also write its caches of latents and captions.
 
     The folders are video_latents, static_video_latents, hand_video_latents and
-    prompt_embeds_rewrite; `data from-caches` reads them."""
+    prompt_embeds_rewrite. `data from-caches` reads them."""
     weights: Path | None = None
     """With --caches, folder of weights with the VAE and the text encoder."""
 
     def run(self) -> int:
-        """Write clip after clip."""
+        """Write all clips, then their caches if asked for."""
         from itertools import islice
 
         from egosim_jax.data.dwm import write_folders
@@ -218,12 +217,12 @@ class ToDwm:
         return ExitCode.DONE
 
     def _cached_model(self) -> ModelConfig | None:
-        """Return the model whose caches are asked for, if any."""
+        """Return the model of --caches, if given."""
         if self.caches is None and self.weights is None:
             return None
         if self.caches is None or self.weights is None:
             raise InputError(
-                f"Caches are made by a model with its weights: give both, not --caches "
+                f"Caches are made by a model with weights: give both, not --caches "
                 f"{self.caches} with --weights {self.weights}. (--caches, --weights)"
             )
         from egosim_jax import configs
@@ -235,22 +234,22 @@ class ToDwm:
 
 
 def _one_rate(known: Collection[Fraction], given: int | None, *, of: str) -> Fraction:
-    """Return the frame rate that is known or given. Raises `InputError` for none, or for several.
+    """Return the one frame rate of all videos: `known` from the input, or given by --fps.
 
-    `of` is the option that it is known of.
+    Raises `InputError` if there is no rate, or more than one. `of` is the option of the input.
     """
     rates = {*known} if given is None else {*known, Fraction(given)}
     if not rates:
-        raise InputError(f"The clips do not say their frame rate: give it. (--fps, {of})")
+        raise InputError(f"The clips have no frame rate: give it. (--fps, {of})")
     if len(known) > 1:
         raise InputError(
             f"The videos have {_listed(rates)} frames per second: all must have one rate. Pack "
-            f"those of each rate into other shards. ({of})"
+            f"separate shards for each rate. ({of})"
         )
     if len(rates) > 1:
         raise InputError(
             f"The videos have {_listed(known)} frames per second, not {given}: their frames must "
-            f"keep this rate. Leave it out. (--fps, {of})"
+            f"keep this rate. Omit --fps. (--fps, {of})"
         )
     return rates.pop()
 
@@ -263,16 +262,15 @@ def _listed(rates: Collection[Fraction]) -> str:
 class Mix:
     """Mix shards by weight for training, such as rendered and recorded ones. Prints the folder.
 
-    The folder holds only the names of the others and their weights; training reads it by the option
-    --latents.
+    The folder holds only the paths of the shards and their weights. Training reads it by --latents.
     """
 
     shards: tuple[Path, ...]
-    """Folders of shards, with records of one kind and size."""
+    """Folders of shards; their records must agree in kind and size."""
     out: Path
     """Folder of the mixture."""
     weights: tuple[float, ...] = ()
-    """Share of each folder in the training samples; its number of records if not given."""
+    """Weight of each folder in the training samples; by default its number of records."""
 
     def run(self) -> int:
         """Check the folders and write the mixture."""
@@ -292,30 +290,30 @@ class Mix:
 
 @dataclass(frozen=True, kw_only=True)
 class FromCaches:
-    """Make latents shards of DWM's caches of moments and embeddings. Prints the folder.
+    """Make latents shards from DWM's caches of moments and embeddings. Prints the folder.
 
-    The first clip is encoded as well and compared with its caches, which are refused if they are of
+    The first clip is also encoded and compared with its caches. They are refused if they come from
     another VAE or text encoder.
     """
 
     config: str
     """Name of the model."""
     weights: Path
-    """Folder of weights with the VAE and the text encoder that the caches were made with."""
+    """Folder of weights with the VAE and the text encoder of the caches."""
     metadata: Path
-    """List of DWM, .txt."""
+    """DWM list, .txt."""
     out: Path
     """Folder of the latents shards."""
     prompts: Prompts = "prompts_rewrite"
-    """Captions of the list, of whose first lines the caches must be.
+    """Captions of the list; the caches must contain embeddings of their first lines.
 
-    prompts_rewrite: the rewritten ones, of the released models, and the original one of a clip that
-    has none; prompts: the original ones, of the paper's evaluation."""
+    prompts_rewrite: rewritten captions, as in the released models, or the original caption where
+    there is no rewritten one; prompts: original captions, as in the paper's evaluation."""
     limit: int | None = None
     """Maximum number of clips."""
 
     def run(self) -> int:
-        """Check the first clip, then read cache after cache."""
+        """Check the first clip, then read all caches."""
         from egosim_jax import configs
         from egosim_jax.data.dwm import read_list
         from egosim_jax.data.metadata import select

@@ -1,4 +1,4 @@
-"""`egosim view`: draw a scene state, open a simulation, or make the page of a training."""
+"""`egosim view`: draw a scene state, open a simulation, or make the page of a training run."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Draw a state or a point cloud, open a simulation in Rerun, or make a page of a training.
+    """Draw a state or a point cloud, open a simulation in Rerun, or make a page of a training run.
 
-    PATH is the folder of a simulation or its simulation.rrd (needs the extra `viewer`), a folder
-    that holds a state, such as OUT/clip_1/state, a PLY of colored points, such as EgoSim's, or the
-    folder of a training, which may still run: curves, sample clips and settings on one HTML page.
+    PATH is one of: the folder of a simulation, or its simulation.rrd (extra `viewer`); the folder
+    of a state, such as OUT/clip_1/state; a PLY file of colored points; the folder of a training
+    run, finished or not. The page shows curves, sample clips and settings.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or file to view."""
     out: Path | None = None
-    """Image or page to write; by default NAME.png here, or index.html in a training's folder."""
+    """File to write; by default NAME.png here, or index.html in the folder of a training run."""
     up: Up | None = None
-    """Axis of the world that points up; z in the tabletop world and -y elsewhere if not given."""
+    """World axis that points up; by default z in the tabletop world and -y elsewhere."""
     host: str = "127.0.0.1"
-    """Address that the Rerun viewer listens on; by default only this machine can reach it."""
+    """Address of the Rerun viewer; by default only this machine can reach it."""
 
     def run(self) -> int:
         """Draw the state, open the viewer, or write the page."""
@@ -47,7 +47,7 @@ class View:
             self._refuse_out("a recording is opened")
             return _open(recording, self.host)
         if (self.path / "report.json").exists() and (page := self.path / PAGE).exists():
-            self._refuse_out(f"{page} exists")  # of an evaluation, or of annotated clips
+            self._refuse_out(f"{page} exists")  # of an evaluation or of annotated clips
             print(page)
             return ExitCode.DONE
         if (self.path / JOURNAL).exists():
@@ -71,7 +71,7 @@ class View:
 
     def _refuse_out(self, why: str) -> None:
         if self.out is not None:
-            raise InputError(f"--out {self.out} would not be written, as {why}: leave it out.")
+            raise InputError(f"--out {self.out} would not be written, as {why}: omit it.")
 
     def _state(self) -> SceneState:
         from egosim_jax.state.snapshot import DESCRIPTION, load, read_ply

@@ -1,9 +1,22 @@
 """Evaluation of generated clips: scores against the ground truth by method, and their tables.
 
-Every {id}.mp4 of one or several folders is compared with the recorded video of its metadata row
-over the same frames, all at one size; so are baselines: the prior, the prior with a least-squares
-color fit, and the first frame of the ground truth repeated. Frame 0 is excluded unless the protocol
-says otherwise, because there the repeated frame is the ground truth.
+Every {id}.mp4 in one or several folders is compared with the recorded video of its metadata row,
+over the same frames and at one size. Baselines are compared, too: the prior, the prior with a
+least-squares color fit, and the first frame of the ground truth repeated. Frame 0 is excluded
+unless the protocol says otherwise, because it is given. Experiments (`experiments`) do not belong
+here.
+
+    evaluate     compare a folder of clips with their ground truth
+    methods      rows of a table: folders of clips, and baselines
+    measures     columns of a table: pixels, LPIPS, DreamSim
+    estimated    columns that need estimates: regions, depth, cameras, hands
+    fvd          Fréchet video distance
+    scoring      Protocol, Scoring: score methods on clips, with a cache
+    result       Evaluation: summaries, paired differences, report
+    tables       the papers' tables
+    files        report.json, metrics.jsonl, scores.csv, table.tex, scores.png
+    pages        index.html
+    metrics      the formulas, on arrays
 """
 
 from __future__ import annotations
@@ -15,7 +28,7 @@ from typing import Literal
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.evaluation.files import write_files
 from egosim_jax.evaluation.measures import standard
-from egosim_jax.evaluation.methods import BASELINES, Folder
+from egosim_jax.evaluation.methods import BASELINES, Folder, autoencoded
 from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.evaluation.scoring import CACHE, Protocol, ScoreCache, Scoring
 
@@ -29,23 +42,17 @@ def evaluate(
     size: Literal["output", "target"] = "output",
     out: Path | None = None,
 ) -> Evaluation:
-    """Compare the clips of a folder with their ground truth, along with the baselines.
+    """Compare the clips in a folder, and the baselines, with their ground truth.
 
-    The folder's {id}_vae.mp4, the ground truth through the autoencoder, are compared where they
-    exist. Writes the files of `write_files` to `out`, by default the folder of the clips. A clip
-    that cannot be compared is skipped. Raises `InputError` if all are.
+    {id}_vae.mp4 (the ground truth through the autoencoder) is compared, too, if it exists. Writes
+    the files of `write_files` to `out`, by default the folder of the clips. Clips that cannot be
+    compared are skipped. Raises `InputError` if no clip can be compared.
     """
     out = out or generated
     methods = [
         Folder(path=generated, name="generated", title="generated"),
         *BASELINES.values(),
-        Folder(
-            path=generated,
-            name="vae",
-            title="ground truth through the autoencoder",
-            suffix="_vae",
-            optional=True,
-        ),
+        autoencoded(generated),
     ]
     scoring = Scoring(
         methods=methods,

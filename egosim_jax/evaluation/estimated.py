@@ -1,7 +1,7 @@
 """Measures that need an estimate from both videos: depth, cameras, hands, and regions.
 
-EgoSim has published no formula of its depth and camera errors: all definitions here are ours. An
-estimate of the ground truth is made once and shared by all methods.
+EgoSim has not published the formulas of its depth and camera errors: all definitions here are ours.
+Estimates of the ground truth are made once and shared by all methods.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from egosim_jax.perception.estimates import (
 
 NAN = float("nan")
 DEPTH_FRAMES = 8
-"""Frames of a clip whose depth is compared, evenly spaced."""
+"""Number of evenly spaced frames whose depth is compared."""
 DRAWN_LEVEL = 32
-"""Least level of a pixel of the hand video that counts as drawn."""
+"""Minimum level of a drawn pixel in the hand video; lower levels are compression noise."""
 REGION_MARGIN = 0.03
 """Margin around the drawn hands as a fraction of the width."""
 OBJECT_MASK = "object_mask_video.mp4"
-"""Optional video next to the prior: white where the object acted on is."""
+"""Optional video next to the prior, white on the manipulated object."""
 _UNKNOWN = CameraEstimate(
     cameras=None, metric=False, verdict=Verdict(rung="refused", reason="not estimated", figures={})
 )
 
 
 def hand_region(truth: GroundTruth) -> Bool[np.ndarray, "f h w"]:
-    """Return the pixels near the drawn hands of the conditions."""
+    """Return the pixels near the hands drawn in the conditions."""
     import cv2
 
     drawn = read_at(truth.window.files.hands, _shape(truth), truth.window.start).max(axis=-1)
@@ -65,7 +65,7 @@ def _object_mask(window: Window) -> Path:
 
 @dataclass(frozen=True)
 class Regions:
-    """PSNR near the hands and, where there is a mask, of the object acted on."""
+    """PSNR near the hands and, if there is a mask, of the manipulated object."""
 
     @property
     def columns(self) -> Mapping[str, Column]:
@@ -80,19 +80,18 @@ class Regions:
         """Definitions by key."""
         return {
             "hand_psnr": "dB over the pixels within 3 % of the width of the drawn hands, all "
-            "frames of "
-            "a clip together",
+            "frames of a clip together",
             "object_psnr": f"dB over the white pixels of {OBJECT_MASK}, all frames of a clip "
             "together",
         }
 
     def settings(self, window: Window) -> Any:
-        """Return the parameters of the regions, and the hashes of the files that have them."""
+        """Return the parameters of the regions, and the hashes of their files."""
         files = [p for p in (window.files.hands, _object_mask(window)) if p.exists()]
         return DRAWN_LEVEL, REGION_MARGIN, [sha256(path) for path in files]
 
     def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that computes both; NaN for an absent region."""
+        """Return a function that computes both measures; NaN for a missing region."""
         regions = {"hand_psnr": hand_region(truth), "object_psnr": self._object(truth)}
         first = truth.first
 
@@ -121,9 +120,7 @@ class DepthError:
     @property
     def columns(self) -> Mapping[str, Column]:
         """Headings by key."""
-        return {
-            "depth_error": Column("depth error % (ours)", "{:.2f}", "lower"),
-        }
+        return {"depth_error": Column("depth error % (ours)", "{:.2f}", "lower")}
 
     @property
     def definitions(self) -> Mapping[str, str]:
@@ -131,8 +128,7 @@ class DepthError:
         return {
             "depth_error": "ours; mean |depth - ground truth| / ground truth in percent over "
             f"{DEPTH_FRAMES} frames, both estimated by the depth network; depth of unknown scale "
-            "is "
-            "first multiplied by the ratio of the medians",
+            "is first multiplied by the ratio of the medians",
         }
 
     def settings(self, window: Window) -> Any:
@@ -163,7 +159,7 @@ class DepthError:
 
 @dataclass(frozen=True, eq=False)
 class CameraError:
-    """Errors of the camera path between estimates of both videos."""
+    """Camera path errors between estimates of both videos."""
 
     estimator: CameraEstimator
     """Camera estimator, which needs no weights."""
@@ -182,8 +178,7 @@ class CameraError:
         """Definitions by key."""
         return {
             "camera_rotation": "ours; RMS angle between rotations since the first frame, both "
-            "paths "
-            "estimated from the videos without the pixels near hands",
+            "paths estimated from the videos without the pixels near hands",
             "camera_error": "ours; RMS distance between positions since the first frame, each path "
             "divided by its largest distance from there; not measured where the true camera stays",
             "camera_ate": "ours; RMS distance between positions since the first frame after the "
@@ -191,11 +186,11 @@ class CameraError:
         }
 
     def settings(self, window: Window) -> Any:
-        """Return the estimator's options, and the hash of the hands that are ignored."""
+        """Return the estimator's options, and the hash of the hands, which are ignored."""
         return self.estimator, DRAWN_LEVEL, REGION_MARGIN, sha256(window.files.hands)
 
     def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that estimates cameras; NaN where they cannot be."""
+        """Return a function that estimates cameras and compares them; NaN if it fails."""
         moving = hand_region(truth)
         wanted = self.estimator(truth.frames, moving).cameras
 
@@ -217,7 +212,7 @@ class CameraError:
 
 @dataclass(frozen=True, eq=False)
 class HandScores:
-    """Hands found in both videos."""
+    """Agreement of the hands detected in both videos."""
 
     estimator: HandEstimator
     """Hand detector."""
@@ -236,14 +231,11 @@ class HandScores:
         """Definitions by key."""
         return {
             "hand_iou": "ours; IoU of the convex hulls of the keypoints detected in both videos, "
-            "mean "
-            "over frames with a hand in the ground truth",
+            "mean over frames with a hand in the ground truth",
             "keypoint_error": "ours; mean distance of the keypoints of hands detected in both "
-            "videos, "
-            "in percent of the width",
+            "videos, in percent of the width",
             "hand_recall": "ours; share of the hands detected in the ground truth that are "
-            "detected in "
-            "the video",
+            "detected in the video",
         }
 
     def settings(self, window: Window) -> Any:

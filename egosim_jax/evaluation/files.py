@@ -30,11 +30,11 @@ _LATEX = {
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$",
 }  # fmt: skip
 ARROWS = {"higher": "↑", "lower": "↓"}
-"""Mark of the better direction of a measure."""
+"""Arrow for the better direction of a measure."""
 
 
 def write_files(evaluation: Evaluation, out: Path) -> None:
-    """Write all files of an evaluation but the image to a folder."""
+    """Write all files of an evaluation except the image."""
     lines: dict[str, dict] = {}
     for row in evaluation.rows:
         window = row.window
@@ -49,7 +49,7 @@ def write_files(evaluation: Evaluation, out: Path) -> None:
 
 
 def finite(value: Any) -> Any:
-    """Return a value for JSON with null for what could not be measured (NaN)."""
+    """Return a value for JSON, with null for NaN and infinity."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -58,7 +58,7 @@ def finite(value: Any) -> Any:
 
 
 def to_csv(evaluation: Evaluation) -> str:
-    """Return a row per clip and method."""
+    """Return CSV with a row per clip and method."""
     buffer = io.StringIO()
     table = csv.writer(buffer, lineterminator="\n")
     table.writerow(
@@ -87,7 +87,7 @@ def to_csv(evaluation: Evaluation) -> str:
 
 
 def to_latex(evaluation: Evaluation) -> str:
-    """Return a table of each group, with the protocol as its caption."""
+    """Return a LaTeX table of each group, with the protocol in its caption."""
     tables = []
     for group in evaluation.summaries():
         headings = evaluation.headings(group)

@@ -1,4 +1,4 @@
-"""Measures of a table: groups of columns that are computed together from a pair of videos."""
+"""Measures of a table: each computes some columns together from a pair of videos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egosim_jax.evaluation.metrics.image import clip_psnr, color_drift, psnr, ss
 from egosim_jax.evaluation.metrics.report import DEFINITIONS
 
 VERSION = 1
-"""Version of all measures; another one makes cached scores invalid."""
+"""Version of all measures; a change invalidates cached scores."""
 
 
 class Column(NamedTuple):
@@ -29,23 +29,23 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class GroundTruth:
-    """Ground truth of a window, with which the videos of all methods are compared."""
+    """Ground truth of a window, the reference of all methods."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """All frames of the window, the first one included."""
+    """All frames of the window, including the first."""
     first: int
-    """First frame that counts."""
+    """First frame that is compared."""
     window: Window
     """Clip and window."""
 
     @property
     def counted(self) -> UInt8[np.ndarray, "g h w 3"]:
-        """Frames that count."""
+        """Frames that are compared."""
         return self.frames[self.first :]
 
 
 Scorer = Callable[[np.ndarray], Mapping[str, float]]
-"""Function that returns the values by key of a video of as many frames as the ground truth."""
+"""Function from a video, as long as the ground truth, to its values by key."""
 
 
 @runtime_checkable
@@ -63,11 +63,11 @@ class Measure(Protocol):
         ...
 
     def settings(self, window: Window) -> Any:
-        """Return what else the values depend on, such as the hash of weights or of other files."""
+        """Return other inputs of the values, such as hashes of weights, for the cache key."""
         ...
 
     def against(self, truth: GroundTruth) -> Scorer:
-        """Return the comparison with a ground truth, about which everything is computed once."""
+        """Return a scorer for this ground truth, which is processed only once."""
         ...
 
 
@@ -91,18 +91,16 @@ class Pixels:
         return {
             **{key: DEFINITIONS[key] for key in ("psnr", "ssim")},
             "psnr_clip": "dB; one mean squared error over all frames, pixels and channels of a "
-            "clip, "
-            "as torchmetrics computes PSNR and DWM reports it",
-            "color_drift": "levels of 255; |mean RGB of the last frame - that of the ground "
-            "truth|, "
-            "mean over channels",
+            "clip, as torchmetrics computes PSNR and DWM reports it",
+            "color_drift": "levels of 255; |mean RGB of the last frame - mean RGB of the ground "
+            "truth there|, mean over channels",
         }
 
     def settings(self, window: Window) -> Any:
-        """Return nothing."""
+        """Return None: the values depend only on both videos."""
 
     def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that computes all four."""
+        """Return a function that computes all four measures."""
 
         def score(video: np.ndarray) -> Mapping[str, float]:
             pair = video[truth.first :], truth.counted
@@ -139,7 +137,7 @@ class LpipsDistance:
         return {f"lpips_{self.name}": lpips.definition(self.name)}
 
     def settings(self, window: Window) -> Any:
-        """Return the config, which has the hash of the weights."""
+        """Return the config, which includes the hash of the weights."""
         return self.network.config
 
     def against(self, truth: GroundTruth) -> Scorer:
@@ -152,7 +150,7 @@ class LpipsDistance:
 
 @dataclass(frozen=True, eq=False)
 class DreamSimDistance:
-    """DreamSim by given weights."""
+    """DreamSim distance."""
 
     network: DreamSim
     """Loaded network."""
@@ -183,7 +181,7 @@ class DreamSimDistance:
 
 
 def standard() -> Sequence[Measure]:
-    """Return PSNR, SSIM and, if its package is installed, LPIPS with AlexNet."""
+    """Return the default measures: pixels and, if its package is installed, LPIPS (AlexNet)."""
     alex = lpips.load_if_installed("alex")
     return [Pixels()] if alex is None else [Pixels(), LpipsDistance(alex)]
 

@@ -1,7 +1,7 @@
-"""Methods of a table: folders of clips, by whomever they were made, and baselines without a model.
+"""Methods of a table: folders of clips from any model, and baselines without a model.
 
-A method returns a video of a window at a wanted length and size. The baselines derive theirs from
-the clip's own files.
+A method returns a video of a window at a requested length and size. The baselines make it from the
+clip's own files.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError
 
 MAX_BORDER_PX = 8
-"""Most rows or columns by which a video may exceed the wanted size and is cropped to its center."""
+"""Maximum number of extra rows or columns of a video that is cropped instead of resized."""
 FIT = (
     "Pillow LANCZOS, the image stretched to the size of the comparison; a video that exceeds it "
     f"by at most {MAX_BORDER_PX} rows and columns has a border, and is cropped to its center"
@@ -45,28 +45,28 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """Key of a method in reports."""
+        """Key of the method in reports."""
         ...
 
     @property
     def title(self) -> str:
-        """Name of a method in tables."""
+        """Name of the method in tables."""
         ...
 
     def sources(self, window: Window) -> tuple[Path, ...]:
-        """Return the files that determine the video, in addition to the ground truth."""
+        """Return the files, other than the ground truth, on which the video depends."""
         ...
 
     def video(
         self, window: Window, shape: Shape, target: UInt8[np.ndarray, "f h w 3"]
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Return the video of a window. Raises `InputError` if there is none."""
+        """Return the video of a window. Raises `InputError` if it is missing."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Folder:
-    """Clips in a folder: {id}.mp4, in it or in the subfolder of the clip's dataset or split."""
+    """Clips in a folder: {id}.mp4, there or in a subfolder named after the dataset or split."""
 
     path: Path
     """Folder of generated clips."""
@@ -75,13 +75,13 @@ class Folder:
     title: str
     """Name of the folder in tables."""
     suffix: str = ""
-    """End of the file names, before .mp4."""
+    """Suffix of the file names before .mp4."""
     optional: bool = False
-    """True if missing clips are not a problem."""
+    """True if clips may be missing."""
 
     @classmethod
     def parse(cls, text: str) -> Folder:
-        """Parse NAME=DIR, or DIR, which is named as its last part. Raises `InputError`."""
+        """Parse NAME=DIR or DIR, whose last part is then the name. Raises `InputError`."""
         name, equals, path = text.rpartition("=")
         folder = Path(path)
         name = name if equals else folder.resolve().name
@@ -95,7 +95,7 @@ class Folder:
         return cls(path=folder, name=name, title=name)
 
     def file(self, window: Window) -> Path:
-        """Return the path of a window's clip, that in the folder itself if there is none."""
+        """Return the path of a window's clip; in the folder itself if no subfolder has it."""
         name = f"{window.output_id}{self.suffix}.mp4"
         columns = (window.files.extra.get(column, "") for column in ("dataset", "split"))
         below = [self.path / value / name for value in columns if is_safe_id(value)]
@@ -112,7 +112,7 @@ class Folder:
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """The prior, copied; or with one affine map of its colors fitted to the ground truth."""
+    """The copied prior, optionally with an affine color map fitted to the ground truth."""
 
     fitted: bool = False
     """True to fit the colors."""
@@ -147,12 +147,18 @@ class Still:
     """Name of the baseline in tables."""
 
     def sources(self, window: Window) -> tuple[Path, ...]:
-        """Return nothing: the ground truth determines it."""
+        """Return no files: the video depends only on the ground truth."""
         return ()
 
     def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
         """Return the first frame at all frames."""
         return np.broadcast_to(target[:1], target.shape)
+
+
+def autoencoded(path: Path) -> Folder:
+    """Return the method of the {id}_vae.mp4 in a folder: an upper bound for its model."""
+    title = "ground truth through the autoencoder"
+    return Folder(path=path, name="vae", title=title, suffix="_vae", optional=True)
 
 
 BASELINES: dict[str, Method] = {
@@ -164,7 +170,7 @@ BASELINES: dict[str, Method] = {
 
 
 def check_names(methods: Sequence[Method]) -> None:
-    """Raise `InputError` if two methods have one name."""
+    """Raise `InputError` if two methods have the same name."""
     names = [method.name for method in methods]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
@@ -179,7 +185,7 @@ def read_at(
 ) -> UInt8[np.ndarray, "f h w 3"]:
     """Read frames from `start`, fitted to a shape. Raises `InputError` if there are too few.
 
-    With `border`, a narrow border around the image is cut off.
+    With `border`, a narrow border around the image is cropped instead of resized.
     """
     fit = partial(_fit, height=shape.height, width=shape.width, border=border)
     frames = read_video(path, start=start, stop=start + shape.frames, each=fit).frames

@@ -1,8 +1,8 @@
 """A self-contained HTML page of an evaluation: tables, protocol, and clips of all methods.
 
-Each clip is one small video with the methods in equal columns, so that they cannot run apart. The
-page loads nothing: its content security policy allows inline data alone, and the template escapes
-every value.
+Each clip is one small video with a column for each method, which keeps the methods in step. The
+page loads no other files: its content security policy allows only inline data, and the template
+escapes every value.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from egosim_jax.types import InputError
 
 PAGE, TEMPLATE = "index.html", "page.html"
 PANEL_PX = 224
-"""Width of one video of a clip in pixels."""
+"""Width of one column in pixels."""
 EVERY, CRF = 2, 30
-"""Shown are every second frame, at this quality of x264."""
+"""Frame step, and x264 quality, of the videos on the page."""
 MISSING = (
     "the page cannot be written: it needs jinja2, which is not installed. Install "
     "egosim-jax[metrics]."
@@ -46,7 +46,7 @@ class ShownClip(NamedTuple):
     title: str
     prompt: str
     names: list[str]
-    """Titles of the columns of its video."""
+    """Titles of the video's columns."""
     video: str
     """Video as a data URI."""
     scores: list[list[str]]
@@ -54,14 +54,14 @@ class ShownClip(NamedTuple):
 
 
 def can_be_written() -> bool:
-    """Return whether jinja2, which a page needs, is installed."""
+    """Return True if jinja2, which a page needs, is installed."""
     return find_spec("jinja2") is not None
 
 
 def write_page(
     evaluation: Evaluation, methods: Sequence[Method], path: Path, *, title: str, clips: int
 ) -> None:
-    """Write the page of an evaluation with its first clips, at most so many of each group."""
+    """Write the page of an evaluation, with at most `clips` clips of each group."""
     import jinja2
 
     template = resources.files("egosim_jax.evaluation").joinpath(TEMPLATE).read_text("utf-8")

@@ -1,4 +1,4 @@
-"""The result of an evaluation: summaries by group and method, paired differences, protocol."""
+"""Result of an evaluation: summaries by group and method, paired differences, protocol."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ KNOWN = {
     "lpips_vgg": Column("LPIPS-VGG", "{:.4f}", "lower"),
     "dreamsim": Column("DreamSim", "{:.4f}", "lower"),
 }
-"""Columns that published rows may have although they were not measured."""
+"""Columns that published rows may have without being measured here."""
 SHOWN = ("psnr", "ssim", "lpips_alex")
-"""Columns of printed tables by default; files have all."""
+"""Default columns of printed tables; files have all columns."""
 Summaries = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """Number of clips, mean and spread of each measure by group and method."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Scores of methods on clips, and what they mean."""
+    """Scores of methods on clips, with their definitions and protocol."""
 
     rows: Sequence[Row]
     """Scores of each clip and method."""
     titles: Mapping[str, str]
-    """Names of the methods in tables, by name."""
+    """Titles of the methods in tables, by name."""
     columns: Mapping[str, Column]
     """Measured columns by key."""
     shown: Sequence[str]
-    """Keys of the columns of tables."""
+    """Keys of the columns in tables."""
     definitions: Mapping[str, str]
     """Definitions by key."""
     protocol: Protocol
     group: str = "split"
-    """Column of the metadata by whose values clips are summarized separately."""
+    """Metadata column; each of its values is a separate group."""
     groups: Mapping[str, str] = field(default_factory=dict)
     """Titles of some groups."""
     published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
-    """Published figures by group, row and column, which others measured on other clips."""
+    """Published figures by group, row and column; their authors used other clips."""
     source: str = ""
     """Source of the published figures."""
     unavailable: Sequence[str] = ()
@@ -79,7 +79,7 @@ class Evaluation:
 
     @property
     def measured(self) -> list[str]:
-        """Keys of the columns that any row has."""
+        """Keys of the columns that at least one row has."""
         keys = (key for row in self.rows for key in row.scores if not is_feature(key))
         return list(dict.fromkeys(keys))
 
@@ -103,7 +103,7 @@ class Evaluation:
         return {"clips": len(scores), **summarize(scores, self.measured), **fvd}
 
     def differences(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-        """Return how each method differs from the first one on the same clips, by group."""
+        """Return the paired differences of each method from the first method, by group."""
         found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
         reference, *others = self.titles
         for group, by_method in self._grouped().items():
@@ -122,9 +122,9 @@ class Evaluation:
         return found
 
     def by_index(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the summaries of each method over the first, second, ... window of all clips.
+        """Return the summaries of each method over the first, second, ... windows of all clips.
 
-        Empty unless a clip has several windows, as in continuous generation.
+        Empty unless some clip has several windows, as in continuous generation.
         """
         starts: dict[str, set[int]] = {}
         for row in self.rows:
@@ -142,7 +142,7 @@ class Evaluation:
         }
 
     def _grouped(self) -> dict[str, dict[str, list[Row]]]:
-        """Return the rows by group, sorted by name, and method."""
+        """Return the rows by group (sorted by name) and method."""
         grouped: dict[str, dict[str, list[Row]]] = {}
         for row in self.rows:
             grouped.setdefault(self.group_of(row), {}).setdefault(row.method, []).append(row)
@@ -153,7 +153,7 @@ class Evaluation:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Scores and protocol, the contents of report.json."""
+        """Scores and protocol: the contents of report.json."""
         return {
             "definitions": {
                 **self.definitions,
@@ -179,14 +179,14 @@ class Evaluation:
         }
 
     def table(self, group: str) -> dict[str, Mapping[str, Mapping[str, float]]]:
-        """Return the rows of a group's table by title, published figures last.
+        """Return the rows of a group's table by title; published figures are last.
 
-        The title of a method that has fewer clips than others says how many.
+        If a method has fewer clips than others, its title includes their number.
         """
         methods = self.summaries()[group]
-        most = max(summary["clips"] for summary in methods.values())
+        total = max(summary["clips"] for summary in methods.values())
         rows = {
-            _title(self.titles[name], summary["clips"], most): {
+            _title(self.titles[name], summary["clips"], total): {
                 key: summary[key] for key in self.shown if key in summary
             }
             for name, summary in methods.items()
@@ -208,7 +208,7 @@ class Evaluation:
         return f"{self.groups.get(group, group)}, {count} clips"
 
     def print(self) -> None:
-        """Print a table and the paired differences of each group, and the protocol."""
+        """Print the table and paired differences of each group, and the protocol."""
         differences = self.differences()
         for group in self.summaries():
             headings = {key: (c.heading, c.form) for key, c in self.headings(group).items()}
@@ -227,7 +227,7 @@ class Evaluation:
             print(line)
 
     def notes(self) -> list[str]:
-        """Return protocol, definitions and sources in lines of text."""
+        """Return protocol, definitions and sources as lines of text."""
         protocol = self.report["protocol"]
         last = " or ".join(map(str, protocol["last_frames"]))
         sizes = ", ".join(protocol["pixels"])
@@ -247,5 +247,5 @@ class Evaluation:
         return lines + ([f"published: {self.source}"] if self.published else [])
 
 
-def _title(name: str, clips: int, most: int) -> str:
-    return name if clips == most else f"{name}, {clips} of {most} clips"
+def _title(name: str, clips: int, total: int) -> str:
+    return name if clips == total else f"{name}, {clips} of {total} clips"

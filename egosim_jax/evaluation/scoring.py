@@ -1,8 +1,8 @@
-"""Scores of clips by method: which frames and sizes are compared, and what is computed once.
+"""Score methods on clips: choose the compared frames and size, and cache the scores.
 
-Scores are cached by content: the hash of a method's files and of the ground truth, the compared
-frames and size, and the measure. Running again after a clip, a method or a measure was added
-computes what is new.
+The cache key is the content: hashes of the method's files and of the ground truth, the compared
+frames and size, and the measure. After you add clips, methods or measures, only new scores are
+computed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 
 CACHE = "scores_cache.jsonl"
-"""File of the cached scores in the folder of a report."""
+"""Name of the cache file in the folder of a report."""
 Scores = Mapping[str, float]
 """Values of one clip by measure."""
 
@@ -39,15 +39,15 @@ class Protocol:
     """Frames and size at which clips are compared."""
 
     size: Literal["output", "target"] = "output"
-    """Size of the comparison: of the first method's output, or of the ground truth."""
+    """Image size of the comparison: the first method's output, or the ground truth."""
     lengths: Literal["usual", "common"] = "usual"
-    """Frames that count: all of clips of the usual length, or those that all methods have."""
+    """Compared frames: all, for clips of the most frequent length; or all that every method has."""
     frame_0: bool = False
-    """True if frame 0 counts, although it is given to the model."""
+    """True to compare also frame 0, which is given to the model."""
 
     @property
     def first(self) -> int:
-        """First frame that counts."""
+        """First frame that is compared."""
         return 0 if self.frame_0 else 1
 
     def describe(self) -> str:
@@ -65,19 +65,19 @@ class Row:
     """Scores of one method on one clip."""
 
     window: Window
-    """Clip and window that were compared."""
+    """Compared clip and window."""
     method: str
     """Name of the method."""
     shape: Shape
-    """Number of frames, with frame 0, and size of the comparison."""
+    """Number of frames, including frame 0, and image size of the comparison."""
     source: str
-    """Size and length of the method's own video in words."""
+    """Size and length of the method's own video as text."""
     scores: Scores
 
 
 @dataclass(frozen=True)
 class ScoreCache:
-    """Scores by content hash, in a file of JSON lines."""
+    """Scores by content hash, in a JSON Lines file."""
 
     path: Path
     """File to read and to append to."""
@@ -94,11 +94,11 @@ class ScoreCache:
         }
 
     def get(self, key: str) -> Scores | None:
-        """Return the scores of a key, or None."""
+        """Return the scores of a key, or None if they are unknown."""
         return self._known.get(key)
 
     def put(self, key: str, scores: Scores) -> None:
-        """Add scores, on disk when this returns."""
+        """Add scores; they are on disk when this returns."""
         self._known[key] = dict(scores)
         plain = {name: None if np.isnan(value) else value for name, value in scores.items()}
         append_line(self.path, {"key": key, "scores": plain})
@@ -106,7 +106,7 @@ class ScoreCache:
 
 @dataclass(frozen=True, kw_only=True)
 class Scoring:
-    """Comparison of methods with the ground truth, clip by clip."""
+    """Comparison of methods with the ground truth of each clip."""
 
     methods: Sequence[Method]
     """Rows of the table."""
@@ -115,7 +115,7 @@ class Scoring:
     protocol: Protocol
     cache: ScoreCache
     skipped: list[str] = field(default_factory=list)
-    """Clips that were not compared, with the reasons."""
+    """Clips that were not compared, with reasons."""
 
     @property
     def folders(self) -> list[Folder]:
@@ -143,7 +143,7 @@ class Scoring:
         return rows
 
     def _windows(self, clips: Sequence[ClipFiles]) -> list[Window]:
-        """Return the generated windows of some clips; note why others were not generated."""
+        """Return the generated windows of the clips; note the reasons of missing ones."""
         rows = {files.video_id: files for files in clips}
         windows: dict[str, Window] = {}
         for folder in self.folders:
@@ -218,7 +218,7 @@ class Scoring:
         return rows
 
     def _scores(self, method: Method, truth: _Truth) -> Scores:
-        """Return the scores of a method on one window; what is cached is not computed."""
+        """Return the scores of a method on one window, cached or computed."""
         content = {
             "version": VERSION,
             "target": truth.digest,
@@ -243,7 +243,7 @@ class Scoring:
 
 
 class _Truth:
-    """Ground truth of a window, decoded when a score is not cached."""
+    """Ground truth of a window, decoded only if a score is not cached."""
 
     def __init__(self, path: Path, window: Window, shape: Shape, first: int):
         self.path, self.window, self.shape, self.first = path, window, shape, first
@@ -257,7 +257,7 @@ class _Truth:
         return GroundTruth(frames=frames, first=self.first, window=self.window)
 
     def scorer(self, measure: Measure) -> Scorer:
-        """Return the comparison by a measure, made once."""
+        """Return the scorer of a measure, made once."""
         if id(measure) not in self._scorers:
             self._scorers[id(measure)] = measure.against(self.known)
         return self._scorers[id(measure)]

@@ -1,8 +1,8 @@
 """The papers' tables: their groups, columns, protocol and published figures.
 
-The published figures were measured by their authors on other and more clips. EgoSim has published
-neither its evaluation code nor formulas of its depth and camera errors (arXiv 2604.01001), so these
-have separate columns; DWM's definitions are those of its public code (arXiv 2512.17907).
+The authors measured the published figures on other, and more, clips. EgoSim has published neither
+its evaluation code nor the formulas of its depth and camera errors (arXiv 2604.01001): these have
+separate columns. DWM's definitions are from its public code (arXiv 2512.17907).
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Table:
     shown: tuple[str, ...]
     """Keys of the columns."""
     group: str
-    """Column of the metadata whose values are the table's groups."""
+    """Metadata column whose values are the groups."""
     groups: Mapping[str, str]
-    """Titles of the groups; clips of others are not taken."""
+    """Titles of the groups; other clips are ignored."""
     protocol: Protocol
     lpips: Literal["alex", "vgg"]
     """Network of LPIPS."""

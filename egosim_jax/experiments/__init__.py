@@ -1,1 +1,10 @@
-"""Documented experiments: one module per experiment, named as its `egosim experiment` command."""
+"""Documented experiments; each is a command `egosim experiment NAME` that resumes.
+
+A module `NAME` has `run(settings)`, which trains or loads models, generates, compares and draws.
+Metrics and reports of any generated clips belong to `evaluation`.
+
+    config         settings of all experiments, which are also the command-line options
+    scenes         held-out clips of the tabletop world and their scores
+    training       make clips, train a denoiser, cache videos
+    dwm_variants   models of the experiment dwm; dwm_training trains them
+"""

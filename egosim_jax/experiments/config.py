@@ -2,139 +2,160 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+from egosim_jax.types import check_counts, check_seed
+
+if TYPE_CHECKING:
+    from egosim_jax.generation.generator import Generator
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelExperiment:
-    """Settings of every experiment with a trained model."""
+    """Settings of every experiment that uses a trained model."""
 
     out: Path
-    """Folder of the report and the images of the experiment."""
+    """Folder of the report and images."""
     first_scene: int
     """Seed of the first scene."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
-    """Folder of weights, by default those that ship with the package."""
+    """Folder of weights; by default the shipped ones."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
+
+    def open(self) -> Generator:
+        """Open the folder, which must be new or have equal settings, and load the generator."""
+        from egosim_jax import configs
+        from egosim_jax.generation.generator import Generator
+        from egosim_jax.io.run import open_folder
+        from egosim_jax.io.weights import hashes
+
+        check_counts({"--steps": self.steps})
+        check_seed(self.first_scene, name="--first-scene")
+        config = configs.get(self.config)
+        config = replace(config, steps=self.steps or config.steps)
+        weights = configs.weights_of(self.config, self.weights)
+        record = {"experiment": self, "model": config, "weights": hashes(weights)}
+        open_folder(self.out, record, mutable=["experiment.weights"])
+        return Generator.load(config, weights)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tabletop(ModelExperiment):
-    """Generate held-out tabletop scenes with all conditions and without each, and compare.
+    """Generate held-out tabletop scenes with all conditions and without each one, and compare.
 
-    Prints a table for human hands and one for the robot, along with the prior copied, the first
-    frame repeated and the ground truth through the autoencoder. Writes report.json and a contact
-    sheet of each.
+    Prints a table for human hands and one for the robot. Further rows are the copied prior, the
+    repeated first frame, and the ground truth through the autoencoder. Writes report.json and two
+    contact sheets.
     """
 
     scenes: int = 24
-    """Scenes of each kind of hands."""
+    """Number of scenes with human hands, and with the robot."""
     first_scene: int = 100
-    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+    """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
     seeds: int = 2
-    """Repetitions of each clip with different noise."""
+    """Number of repetitions of each clip with different noise."""
     batch_size: int = 8
-    """Number of clips that are generated together."""
+    """Number of clips generated together."""
     black_cloths: int = 0
-    """Maximum number of black cloths on a table, which in a prior look like unobserved places."""
+    """Maximum number of black cloths on a table, which look like holes in the prior."""
     worst: int | None = None
-    """Scenes of each kind on a sheet of the worst ones, with what each lacks; None: no sheet."""
+    """Number of worst scenes to draw, with the goals that they miss; None: no such sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Continuous(ModelExperiment):
     """Simulate held-out sequences with and without state updates, and compare clip by clip.
 
-    Prints a table for each method and the differences from no update, writes report.json and
-    curves.png. Each sequence is a simulation in a separate folder; the same command resumes an
+    Prints a table for each method, and the differences from no update. Writes report.json and
+    curves.png. Each sequence is a simulation in its own folder. The same command resumes an
     interrupted experiment.
     """
 
     sequences: int = 12
-    """Number of sequences, of consecutive seeds."""
+    """Number of sequences; their seeds are consecutive."""
     clips: int = 10
-    """Clips of each sequence."""
+    """Number of clips per sequence."""
     first_scene: int = 600
-    """Seed of the first sequence; the shipped model was trained on those from 1000 on."""
+    """Seed of the first sequence; the shipped model was trained on seeds from 1000 on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Update(ModelExperiment):
     """Carry an object in held-out scenes, update the state, and compare it with the ground truth.
 
-    A row each for the oracle at 832 x 480 and at the model's size, and for classical perception of
-    ground-truth, of generated and of gray frames. Prints a table and writes report.json.
+    The rows: the oracle at 832 x 480 and at the model's size, and classical perception of
+    ground-truth, generated and gray frames. Prints a table and writes report.json.
     """
 
     scenes: int = 24
     """Number of scenes in which an object is carried."""
     first_scene: int = 600
-    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+    """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LookAway(ModelExperiment):
     """Move an object, look elsewhere, look back: is it where it was left?
 
-    In view, or by a hand out of view; with the state updated by the oracle, by classical
-    perception, and not at all. Prints a table and the differences from no update, writes
+    A hand moves the object in view, or out of view. The state is updated by the oracle, by
+    classical perception, or not at all. Prints a table and the differences from no update. Writes
     report.json and contact_sheet.png. The same command resumes an interrupted experiment.
     """
 
     scenes: int = 12
     """Number of scenes in which an object is carried."""
     first_scene: int = 300
-    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+    """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Policies(ModelExperiment):
-    """Rank policies with faults by success in the generated world, and compare with the true one.
+    """Rank imperfect policies by success in the generated world and in the true world; compare.
 
     Each policy carries an object to a goal in the same scenes. Prints success and agreement
-    (Pearson, Spearman, MMRV) with intervals, writes report.json, ranking.png and contact_sheet.png.
+    (Pearson, Spearman, MMRV) with intervals. Writes report.json, ranking.png and contact_sheet.png.
     The same command resumes an interrupted experiment.
     """
 
     scenes: int = 24
     """Number of scenes in which an object is carried."""
     first_scene: int = 400
-    """Seed of the first scene; the shipped model was trained on those from 1000 on."""
+    """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
     perception: str = "classical"
-    """Perception pipeline that reads success from the generated clips, by name with its options."""
+    """Perception pipeline that measures success in generated clips, with its options."""
     batch_size: int = 5
-    """Number of clips that are generated together."""
+    """Number of clips generated together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hyperparameters:
-    """Hyper-parameters of one training; the learning rate has a warm-up and a cosine decay."""
+    """Hyperparameters of one training; the learning rate has a warm-up and a cosine decay."""
 
     steps: int
-    """Number of training updates in the experiment."""
+    """Number of training updates."""
     learning_rate: float
-    """Peak learning rate of the training."""
+    """Peak learning rate."""
     warmup: int
-    """Updates of linear warm-up."""
+    """Number of updates of linear warm-up."""
     optimizer: Literal["adamw", "muon"] = "muon"
     """Name of the optimizer."""
     batch_size: int = 4
-    """Clips per training update in the experiment."""
+    """Number of clips per update."""
     seed: int = 0
     """Seed of the initial weights, the order of the clips and the noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Embodiment:
-    """Train on human hands, then on a few clips of a robot: all weights, and a LoRA.
+    """Train on human hands, then on a few robot clips: all weights, or a LoRA.
 
-    A further model is trained on the robot clips alone. Prints the scores of each on held-out robot
-    clips; writes report.json, contact_sheet.png and curves.png. The same command resumes an
+    Another model is trained only on the robot clips. Prints the scores of each model on held-out
+    robot clips. Writes report.json, contact_sheet.png and curves.png. The same command resumes an
     interrupted experiment.
     """
 
@@ -143,62 +164,62 @@ class Embodiment:
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
-    """Folder of weights whose autoencoder is used, by default those that ship with the package."""
+    """Folder of weights with the autoencoder; by default the shipped ones."""
     human_scenes: int = 400
-    """Scenes of human hands to train on, one clip of each."""
+    """Number of scenes with human hands to train on, one clip each."""
     robot_scenes: int = 24
-    """Scenes of the robot to train on, one clip of each."""
+    """Number of robot scenes to train on, one clip each."""
     held_out: int = 24
-    """Scenes of the robot to validate on and to generate, one clip of each."""
+    """Number of robot scenes to validate on and to generate, one clip each."""
     first_scene: int = 5000
-    """Seed of the first scene; the shipped autoencoder was trained on those from 1000 to 1999."""
+    """Seed of the first scene; the shipped autoencoder was trained on seeds 1000 to 1999."""
     human: Hyperparameters = Hyperparameters(steps=1200, learning_rate=2e-3, warmup=50)
     """Training on human clips, from random weights."""
     full: Hyperparameters = Hyperparameters(steps=200, learning_rate=5e-4, warmup=10)
-    """Training of all weights of the human model on robot clips."""
+    """Training of all weights on robot clips, from the human model."""
     lora: Hyperparameters = Hyperparameters(
         steps=200, learning_rate=2e-3, warmup=10, optimizer="adamw"
     )
-    """Training of a LoRA of the human model on robot clips."""
+    """Training of a LoRA on robot clips, from the human model."""
     scratch: Hyperparameters = Hyperparameters(steps=200, learning_rate=2e-3, warmup=50)
     """Training on robot clips from random weights."""
     rank: int = 16
     """Rank of the LoRA."""
     dropout: float = 0.15
-    """Probability with which each condition is dropped in training."""
+    """Dropout probability of each condition in training."""
     steps: int = 10
     """Denoising steps of the generated clips."""
     batch_size: int = 8
-    """Clips encoded, and generated, together."""
+    """Number of clips encoded, and generated, together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rank(ModelExperiment):
-    """Rank candidate actions by an image of the goal, and compare with what they truly reach.
+    """Rank candidate actions by a goal image, and compare with the ranking by true videos.
 
     Each goal is the last frame of one of several actions in a held-out scene. Prints how often the
-    ranking by generated videos finds that action, and the rank correlation with the ranking by true
-    videos; also for the ground truth through the autoencoder. Writes report.json.
+    ranking by generated videos finds this action, and the rank correlation with the ranking by true
+    videos. The ground truth through the autoencoder is another row. Writes report.json.
     """
 
     goals: int = 24
-    """Number of goals, each in another scene."""
+    """Number of goals, each in a different scene."""
     candidates: int = 4
-    """Actions for each goal."""
+    """Number of actions per goal."""
     first_scene: int = 400
     """Seed of the first scene."""
     seeds: int = 2
-    """Repetitions of each clip with different noise."""
+    """Number of repetitions of each clip with different noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DWM:
-    """Train DWM and its ablations in miniature on static twins of tabletop clips, and compare.
+    """Train DWM and its ablations in miniature on static versions of tabletop clips, and compare.
 
-    Trains an autoencoder, a base that paints masked places, a base that continues a first frame,
-    and from these DWM, a model without hands and the ablations. Prints a table for moving cameras
-    and one for fixed ones, with the paper's figures; writes report.json and contact sheets. The
-    same command resumes an interrupted experiment.
+    Trains an autoencoder, an inpainting base, an image-to-video base, and from the bases DWM, a
+    model without hands and the ablations. Prints a table for moving cameras and one for fixed
+    cameras, with the paper's figures. Writes report.json and contact sheets. The same command
+    resumes an interrupted experiment.
     """
 
     out: Path
@@ -206,13 +227,13 @@ class DWM:
     config: str = "dwm_tabletop"
     """Name of the model."""
     only: tuple[str, ...] = ()
-    """Train and compare only these models, along with the bases; by default all."""
+    """Models to train and compare, besides DWM; by default all."""
     moving_scenes: int = 240
-    """Scenes with a moving camera to train on, one clip of each."""
+    """Number of scenes with a moving camera to train on, one clip each."""
     fixed_scenes: int = 96
-    """Scenes with a fixed camera to train on, one clip of each."""
+    """Number of scenes with a fixed camera to train on, one clip each."""
     held_out: int = 24
-    """Scenes with a moving camera to generate, and as many with a fixed one."""
+    """Number of held-out scenes with a moving camera, and with a fixed one."""
     first_scene: int = 20000
     """Seed of the first scene."""
     autoencoder: Hyperparameters = Hyperparameters(
@@ -228,19 +249,19 @@ class DWM:
     )
     """Training of each model from its base."""
     rank: int | None = 48
-    """Rank of the LoRA by which a base is adapted; None: all weights are trained."""
+    """Rank of the LoRA that adapts a base; None: all weights are trained."""
     products: Literal["bfloat16"] | None = "bfloat16"
-    """Dtype to which the denoisers round the factors of products; None: the model's."""
+    """Dtype of the factors of matrix products in the denoisers; None: the model's."""
     text_dropout: float = 0.1
-    """Probability with which a prompt is dropped in training."""
+    """Dropout probability of the prompt in training."""
     seeds: int = 2
-    """Repetitions of each clip with different noise."""
+    """Number of repetitions of each clip with different noise."""
     steps: int = 4
     """Denoising steps of the generated clips."""
     strength: float = 0.75
-    """Strength of SDEdit: share of the steps that it takes, from the noised static video."""
+    """Strength of SDEdit: fraction of the steps, from the noised static video."""
     batch_size: int = 8
-    """Clips encoded, and generated, together."""
+    """Number of clips encoded, and generated, together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,24 +269,24 @@ class RealTiny:
     """Train `real_tiny` on the train split, generate both splits, compare, and draw a sheet."""
 
     metadata: Path
-    """CSV or JSONL in EgoSim's columns, with video and split; clips of 61 frames."""
+    """CSV or JSONL with EgoSim's columns, including video and split; clips of 61 frames."""
     out: Path
     """Folder of the run."""
     start: tuple[int, ...] = (0, 22, 44)
-    """First frames of the windows that are generated."""
+    """First frames of the generated windows."""
     seed: int = 0
     """Seed of the generated clips."""
     batch_size: int = 5
-    """Number of clips that are generated together."""
+    """Number of clips generated together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Debug:
-    """Do the same with `debug` on sample clips, in a few minutes, to see that everything runs."""
+    """Do the same with the model `debug` on synthetic clips: a test run of a few minutes."""
 
     out: Path
     """Folder of the run."""
     steps: int = 20
-    """Updates of the autoencoder, and as many of the denoiser."""
+    """Number of updates of the autoencoder, and of the denoiser."""
     seed: int = 0
     """Seed of the generated clips."""

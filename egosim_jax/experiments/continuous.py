@@ -1,4 +1,4 @@
-"""`egosim experiment continuous`: ablation of the state updates, clip after clip."""
+"""`egosim experiment continuous`: ablation of the state updates over consecutive clips."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from egosim_jax.evaluation.metrics.loop import DEFINITIONS, MEASURES, score_step
 from egosim_jax.evaluation.metrics.report import Summary, paired_differences, print_table, summarize
 from egosim_jax.experiments.config import Continuous
-from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_json
@@ -24,14 +23,14 @@ from egosim_jax.types import check_counts
 from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
 Scores = Sequence[Mapping[str, float]]
-"""Scores of one sequence, clip by clip."""
+"""Scores of the clips of one sequence."""
 NOT_UPDATED = "no update"
 METHODS: dict[str, str | None] = {
     "update, oracle": "oracle",
     "update, classical": "classical",
     NOT_UPDATED: None,
 }
-"""Names of the methods, and their perception."""
+"""Method -> perception pipeline."""
 DIFFERENCES = {
     "differences": "from no update, clip by clip of the same sequences; mean and 95 % interval by "
     "the paired bootstrap"
@@ -39,9 +38,9 @@ DIFFERENCES = {
 
 
 def run(settings: Continuous) -> None:
-    """Simulate the scenes with each update of the state and compare them."""
+    """Simulate the sequences by each method and compare them."""
     check_counts({"--sequences": settings.sequences, "--clips": settings.clips})
-    generator = open_experiment(settings)
+    generator = settings.open()
     seeds = range(settings.first_scene, settings.first_scene + settings.sequences)
     jobs = [(method, seed) for seed in seeds for method in METHODS]
     scores: dict[str, list[Scores]] = {method: [] for method in METHODS}
@@ -74,9 +73,14 @@ def run(settings: Continuous) -> None:
     print(settings.out / "curves.png")
 
 
+def folder_name(method: str) -> str:
+    """Return the name of a method's folder."""
+    return method.replace(", ", "_").replace(" ", "_")
+
+
 def _simulate(settings: Continuous, generator: Generator, method: str, seed: int) -> Scores:
     """Return the scores of one sequence, cached in its folder."""
-    folder = settings.out / method.replace(", ", "_").replace(" ", "_") / str(seed)
+    folder = settings.out / folder_name(method) / str(seed)
     path = folder / "scores.json"
     if path.exists():
         return read_json(path)

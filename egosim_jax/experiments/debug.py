@@ -11,7 +11,7 @@ from egosim_jax.train.recipes import DEBUG
 
 
 def run(settings: Debug) -> None:
-    """Train, generate, compare, draw."""
+    """Train, generate, compare and draw."""
     recipe = replace(
         DEBUG,
         out=settings.out,

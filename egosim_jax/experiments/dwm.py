@@ -1,13 +1,14 @@
 """`egosim experiment dwm`: DWM, its baselines and its ablations in miniature.
 
-Static twins of the tabletop world take the place of rendered scenes (a moving head) and of
-recordings (a tripod). The model is adapted from a base that paints masked places, as DWM is.
+Static versions of tabletop clips replace DWM's rendered scenes (moving head) and recordings (fixed
+camera). The model is adapted from an inpainting base, as DWM is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -18,7 +19,6 @@ from egosim_jax.evaluation.metrics.report import paired_differences, print_table
 from egosim_jax.experiments.config import DWM
 from egosim_jax.experiments.dwm_training import Training, changed
 from egosim_jax.experiments.dwm_variants import PAPER, VARIANTS, Camera, Hands
-from egosim_jax.experiments.embodiment import train_config
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
@@ -32,15 +32,15 @@ from egosim_jax.experiments.scenes import (
     reconstruct,
 )
 from egosim_jax.experiments.tabletop import over_seeds, summarize_runs
+from egosim_jax.experiments.training import cached_videos, train_config
 from egosim_jax.generation.generator import Generator
-from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError, check_counts, check_seed
 
 CAMERAS: tuple[Camera, ...] = ("moving", "fixed")
 REFERENCE = "full"
-"""Model that all others are compared with."""
+"""Model with which all others are compared."""
 OTHERS = {
     "hands_dropped": "DWM, its hands dropped",
     "sdedit": "SDEdit of the base",
@@ -48,7 +48,7 @@ OTHERS = {
     "first frame repeated": "first frame repeated",
     "autoencoder": "ground truth through the autoencoder",
 }
-"""Titles of the rows that no training gives."""
+"""Titles of the rows without an own training."""
 SHOWN = ("full", "no_hands", "sdedit")
 """Models on the contact sheets."""
 REPORT_DEFINITIONS = {
@@ -64,7 +64,7 @@ Table = dict[str, dict[str, dict[str, float]]]
 
 
 def run(settings: DWM) -> None:
-    """Make clips, train, generate, compare, draw."""
+    """Make clips, train, generate, compare and draw."""
     chosen = _check(settings)
     training = Training(settings)
     sdedit = replace(training.base_model("inpaint"), strength=settings.strength)
@@ -104,11 +104,11 @@ def _check(settings: DWM) -> tuple[str, ...]:
     check_counts({f"--{name.replace('_', '-')}": getattr(settings, name) for name in counts})
     check_seed(settings.first_scene, name="--first-scene")
     for stage in (settings.autoencoder, settings.base, settings.adaptation):
-        train_config(stage)
-    ConditionDropout(text=settings.text_dropout)
+        train_config(stage)  # raises for invalid values
+    ConditionDropout(text=settings.text_dropout)  # raises, too
     if unknown := sorted({*settings.only} - {*VARIANTS}):
         raise InputError(
-            f"There is no model {', '.join(unknown)} to compare: it must be of "
+            f"There is no model {', '.join(unknown)} to compare: choose from "
             f"{', '.join(VARIANTS)}. (--only)"
         )
     return tuple(n for n in VARIANTS if not settings.only or n in (REFERENCE, *settings.only))
@@ -147,10 +147,9 @@ def _compare(
                 training, camera, "hands_dropped", load, given, without="hands"
             )
     load = generators[REFERENCE]
+    path = _videos_file(training, f"{camera}_autoencoder")
     videos["autoencoder"] = [
-        _cached(
-            training, f"{camera}_autoencoder", lambda: reconstruct(load(), scenes, batch_size=size)
-        )
+        cached_videos(path, lambda: reconstruct(load(), scenes, batch_size=size), total=len(scenes))
     ]
     videos |= {name: [frames] for name, frames in baselines(scenes).items()}
     scores = {
@@ -168,7 +167,7 @@ def _compare(
 
 
 def _differences(by_scene: Mapping[str, Sequence[Mapping[str, float]]]) -> Table:
-    """Return how DWM differs from each other method on the same scenes, by measure."""
+    """Return the paired differences of DWM from each other method, by measure."""
     ours = by_scene[REFERENCE]
     return {
         name: paired_differences(ours, scenes, [m for m in MEASURES if m in ours[0]])
@@ -186,29 +185,22 @@ def _generated(
     *,
     without: DroppedCondition | None = None,
 ) -> list[Videos]:
-    """Return the videos of a model for each seed."""
+    """Return the generated videos of a model for each seed."""
     settings = training.settings
     return [
-        _cached(
-            training,
-            f"{camera}_{name}_{seed}",
+        cached_videos(
+            _videos_file(training, f"{camera}_{name}_{seed}"),
             lambda seed=seed: generate(
                 load(), scenes, batch_size=settings.batch_size, seed=seed, without=without
             ),
+            total=len(scenes),
         )
         for seed in range(settings.seeds)
     ]
 
 
-def _cached(training: Training, name: str, make: Callable[[], Iterable[np.ndarray]]) -> Videos:
-    """Load the videos of a method, or make and save them."""
-    path = training.out / "generated" / f"{name}.npy"
-    if not path.exists():
-        total = training.settings.held_out
-        videos = list(track(make(), f"generating {name}", total=total))
-        with atomic_write(path) as temporary:
-            np.save(temporary, np.stack(videos))
-    return list(np.load(path))
+def _videos_file(training: Training, name: str) -> Path:
+    return training.out / "generated" / f"{name}.npy"
 
 
 def _print_paper(titles: Mapping[str, str]) -> None:

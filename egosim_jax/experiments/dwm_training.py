@@ -1,14 +1,13 @@
-"""Clips, latents and trainings of `egosim experiment dwm`, each of which is made unless it exists.
+"""Clips, latents and trainings of `egosim experiment dwm`; existing ones are loaded.
 
     clips -> autoencoder -> latents -> base models -> DWM and its ablations
 
-A base model that paints masked places learns from clips whose own pixels are hidden: everything
-after the first frame, or a box. A base model of images sees the first frame, then black.
+The inpainting base learns from clips with hidden pixels: all after the first frame, or a box. The
+image-to-video base sees the first frame, then black.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +38,7 @@ from egosim_jax.experiments.dwm_variants import (
     poses_of,
     with_layout,
 )
-from egosim_jax.experiments.embodiment import train_config
+from egosim_jax.experiments.training import make_frames, train_config, train_denoiser
 from egosim_jax.generation.generator import batches
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_safetensors
@@ -47,26 +46,25 @@ from egosim_jax.rendering.mesh import hand_mask
 from egosim_jax.runtime.progress import track
 from egosim_jax.train import loop
 from egosim_jax.train.encode import Encoding
-from egosim_jax.train.fine_tuning import write_trained
 from egosim_jax.train.tasks.autoencoding import Autoencoding, latent_statistics
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import Triplet
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence
-from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
+from egosim_jax.worlds.tabletop.dataset import DatasetConfig
 
 Split = Camera | Literal["held_out"]
 CROP = (64, 80)
-"""Most rows and columns of the crops that the autoencoder is trained on."""
+"""Maximum height and width of the training crops of the autoencoder."""
 SPLITS = 10_000
-"""Seeds between the first scenes of two splits."""
+"""Distance between the first seeds of two splits."""
 FIRST_FRAME_SHARE = 0.6
-"""Share of the clips of the painting base of which only the first frame is shown."""
+"""Fraction of the inpainting base's clips that show only the first frame."""
 NO_PRIOR = 0.2
-"""Share of its samples in which nothing is shown, so that it generates from text alone."""
+"""Fraction of its samples without a prior, to learn generation from text alone."""
 
 
 class Training:
-    """Trainings of the experiment and the data that they read."""
+    """Trainings of the experiment and their data."""
 
     def __init__(self, settings: DWM):
         self.settings, self.out = settings, settings.out
@@ -88,9 +86,8 @@ class Training:
         return with_layout(self.config, BASES[base], base)
 
     def frames(self, split: Split) -> Path:
-        """Make the clips of a split with their static twins and hand meshes."""
-        out = self.out / "frames" / split
-        plan = DatasetConfig(
+        """Make the clips of a split, with static versions and hand meshes."""
+        config = DatasetConfig(
             seeds=tuple(self.seeds[split]),
             clips=1,
             spec=self.config.video,
@@ -99,14 +96,10 @@ class Training:
             hands="mesh",
             fixed_camera=split == "fixed",
         )
-        workers = os.cpu_count() or 1
-        scenes = make_shards(plan, out=out, workers=workers, grid=self.config.grid)
-        for _ in track(scenes, f"making {split}", total=len(plan.seeds)):
-            pass
-        return out
+        return make_frames(config, self.out / "frames" / split, grid=self.config.grid)
 
     def autoencoder(self) -> Path:
-        """Train the autoencoder; return its weights folder."""
+        """Train the autoencoder; return the folder of its weights."""
         out, path = self.out / "autoencoder", self.out / "autoencoder/weights/vae.safetensors"
         if not path.exists():
             frames = self.frames("moving")
@@ -126,7 +119,7 @@ class Training:
         return path.parent
 
     def latents(self, kind: Base | Hands, split: Split) -> Path:
-        """Encode the clips of a split as a kind of training needs them; return the shards."""
+        """Encode the clips of a split for a kind of training; return the shards."""
         out = self.out / "latents" / f"{kind}_{split}"
         if (out / MANIFEST).exists():
             return out
@@ -157,7 +150,7 @@ class Training:
         return out
 
     def mixture(self, kind: Base | Hands, cameras: Cameras) -> Path:
-        """Return shards of latents of clips with these cameras, drawn in proportion to weights."""
+        """Return latents shards of clips with these cameras, mixed by weight."""
         parts = {self.latents(kind, camera): weight for camera, weight in cameras}
         if len(parts) == 1:
             return next(iter(parts))
@@ -166,18 +159,18 @@ class Training:
         return out
 
     def clip(self, split: Split, seed: int) -> TabletopClip:
-        """Return the events of a clip, in tiny frames."""
+        """Return a clip of the world with the same events in tiny frames."""
         spec = replace(self.config.video, height=16, width=16)
         return next(make_sequence(seed, spec=spec, fixed_camera=split == "fixed"))
 
     def _encoded_as(self, kind: Base | Hands) -> ModelConfig:
-        """Return a model that reads the latents of a kind."""
+        """Return a model that reads latents of this kind."""
         if kind == "inpaint" or kind == "image":
             return self.base_model(kind)
         return VARIANTS["adaln_frame"].model(self.config, kind) if kind == "poses" else self.config
 
     def base(self, base: Base) -> Path:
-        """Train a base model from random weights; return its weights folder."""
+        """Train a base model from random weights; return the folder of its weights."""
         nothing = NO_PRIOR if base == "inpaint" else 0.0
         return self.train(
             f"base_{base}",
@@ -191,7 +184,7 @@ class Training:
         )
 
     def start(self, name: str, variant: Variant) -> Path:
-        """Write a base with the input channels of a variant; return its weights folder."""
+        """Write a base with a variant's input channels; return the folder of its weights."""
         folder, base = self.out / name / "start", self.base(variant.base)
         if not (folder / "vae.safetensors").exists():
             model = variant.model(self.config, name)
@@ -236,22 +229,21 @@ class Training:
         start: Path | None = None,
     ) -> Path:
         """Train a denoiser; return its weights folder, or the file of its LoRA."""
-        out, model = self.out / name, task.model
-        done = out / ("weights" if task.rank is None else "lora.safetensors")
-        # The networks that were not trained, as the autoencoder, are linked last.
-        if done.is_file() or (done / "vae.safetensors").exists():
-            return done
-        trained = loop.train(
-            task, train_config(stage), data=data, validation=validation, out=out, weights=start
+        return train_denoiser(
+            task,
+            stage,
+            data=data,
+            validation=validation,
+            out=self.out / name,
+            start=start,
+            others=self.autoencoder,
         )
-        origin = start or self.autoencoder()
-        return write_trained(trained, out, model=model, start=origin, rank=task.rank)
 
 
 def widen(networks: Networks, base: Path, widening: Widening) -> None:
-    """Fill a denoiser with the weights of a base that has some of its input channels.
+    """Fill a denoiser with the weights of a base that has fewer input channels.
 
-    The other channels do not count until they are trained; layers that the base lacks stay random.
+    New channels have zero weights; layers that the base lacks stay random.
     """
     known = read_safetensors(base / "dit.safetensors")
     state = nnx.state(networks.dit, nnx.Param)
@@ -273,9 +265,9 @@ def _clips(source: ShardReader) -> Iterator[Triplet]:
 
 
 def changed(clip: Triplet, kind: Base | Hands, events: TabletopClip | None = None) -> Triplet:
-    """Return a clip with the prior, mask and hands that a kind of training sees.
+    """Return a clip with the prior, mask and hands for a kind of training.
 
-    `events` are those of the clip, for its poses.
+    `events` is the clip in the world, from which hand poses are taken.
     """
     target = clip.target
     if events is not None:
@@ -284,7 +276,7 @@ def changed(clip: Triplet, kind: Base | Hands, events: TabletopClip | None = Non
         return replace(clip, hands=hand_mask(clip.hands))
     if kind == "mesh" or target is None:
         return clip
-    # Deterministic in the clip: the same clip is masked alike in every run.
+    # Seeded by the clip's id: a clip has the same mask in every run.
     rng = np.random.default_rng(list(clip.video_id.encode()))
     hidden = np.zeros(target.shape[:3], bool)
     if kind == "image" or rng.random() < FIRST_FRAME_SHARE:

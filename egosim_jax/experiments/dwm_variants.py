@@ -1,7 +1,7 @@
-"""Models that `egosim experiment dwm` compares: DWM, its baselines and its ablations.
+"""Models of `egosim experiment dwm`: DWM, its baselines and its ablations.
 
-Each is a value: the base that it starts from, its input channels, the hands that it reads and the
-clips that it is trained on. The figures of the paper are in `PAPER`.
+A model is described by its base, input channels, rendering of the hands and training clips. `PAPER`
+has the paper's figures.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from egosim_jax.models.cogvideox.motion import MotionDiTConfig
 from egosim_jax.worlds.tabletop import TabletopClip
 
 Base = Literal["inpaint", "image"]
-"""Base model: CogVideoX-Fun's, which paints masked places, or CogVideoX's, of a first frame."""
+"""Base model: CogVideoX-Fun's inpainting, or CogVideoX's image-to-video."""
 Hands = Literal["mesh", "mask", "poses"]
-"""Hands as shaded meshes, as the binary mask of them, or as joints that modulate the blocks."""
+"""Hands as shaded meshes, as their binary mask, or as joints that modulate the blocks."""
 Camera = Literal["moving", "fixed"]
-"""Clips by their camera: DWM's synthetic ones have a moving head, its real ones a tripod."""
+"""Camera of the clips: moving, as in DWM's synthetic clips, or fixed, as in its recordings."""
 
 Cameras = tuple[tuple[Camera, float], ...]
-"""Clips by their cameras, each with the weight with which it is mixed."""
+"""Cameras of the training clips, each with its weight in the mixture."""
 MOVING: Cameras = (("moving", 1.0),)
 MIXED: Cameras = (("moving", 5.0), ("fixed", 2.0))
-"""Hybrid of moving and fixed cameras."""
+"""Mixture of moving and fixed cameras."""
 
 SIDES, JOINTS = ("left", "right"), 21
 POSE_DIM = len(SIDES) * (1 + 3 * JOINTS)
-"""Numbers of the poses of both hands in a frame."""
+"""Number of values for the poses of both hands in a frame."""
 STATIC = replace(COGVIDEOX_INPAINT, mask_packing="observed")
-"""DWM without hands: 33 channels, the static scene observed everywhere."""
+"""DWM without hands: 33 channels; the static scene is observed everywhere."""
 IMAGE = ChannelLayout(parts=(("noisy", 16), ("prior", 16)), mask_prior=False)
 """CogVideoX's image-to-video model: 32 channels; the prior is the first frame, then black."""
 IMAGE_HANDS = ChannelLayout(parts=(("noisy", 16), ("prior", 16), ("hands", 16)), mask_prior=False)
@@ -48,27 +48,27 @@ BASES: Mapping[Base, ChannelLayout] = {"inpaint": COGVIDEOX_INPAINT, "image": IM
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """A model of the comparison; the default is DWM's own."""
+    """A model of the comparison; the default is DWM."""
 
     title: str
     """Name in the tables."""
     base: Base = "inpaint"
-    """Base model that it starts from."""
+    """Base model with the initial weights."""
     layout: ChannelLayout = DWM
     """Input channels of the denoiser."""
     hands: Hands = "mesh"
-    """Rendering of the hands that it reads."""
+    """Rendering of the hands."""
     data: Cameras = MIXED
-    """Clips that it is trained on."""
+    """Training clips."""
     poses: Literal["frame", "global"] | None = None
-    """Joints that modulate a token: those of its latent frame, or of all frames."""
+    """Joints that modulate a token: from its latent frame, or from all frames."""
     adapter: bool = True
     """Train a LoRA and the patch projection, not all weights."""
     trained: bool = True
-    """Train it; otherwise it is its base."""
+    """Train the model; otherwise it is its base."""
 
     def model(self, config: ModelConfig, name: str) -> ModelConfig:
-        """Return the model, of the sizes of a config."""
+        """Return the model with the sizes of a config."""
         model = with_layout(config, self.layout, name)
         if self.poses is None:
             return model
@@ -78,7 +78,7 @@ class Variant:
 
 
 def with_layout(config: ModelConfig, layout: ChannelLayout, name: str) -> ModelConfig:
-    """Return a model of other input channels under another name."""
+    """Return a model with other input channels and another name."""
     dit = replace(cast(CogVideoXDiTConfig, config.dit), in_channels=layout.channels)
     return replace(config, name=f"{config.name}_{name}", dit=dit, layout=layout)
 
@@ -86,7 +86,7 @@ def with_layout(config: ModelConfig, layout: ChannelLayout, name: str) -> ModelC
 def poses_of(clip: TabletopClip) -> Float32[np.ndarray, "f p"]:
     """Return the joints of left and right hand in each frame's camera, in decimeters.
 
-    Before the 21 joints of a hand comes 1, or 0 with zeros for a hand that is absent.
+    Each hand has a 1 and 21 joints, or zeros if it is absent.
     """
     poses = np.zeros((len(clip.joints_m), len(SIDES), 1 + 3 * JOINTS), np.float32)
     for index, side in enumerate(clip.sides):
@@ -125,7 +125,7 @@ VARIANTS: Mapping[str, Variant] = {
         title="from the image model, 0 updates", base="image", layout=IMAGE_HANDS, trained=False
     ),
 }
-"""Models by name, in the order in which they are trained and shown."""
+"""Models by name, in order of training and display."""
 
 Figures = Mapping[str, Mapping[str, float]]
 PAPER: Mapping[str, Figures] = {

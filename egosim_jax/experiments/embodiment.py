@@ -1,9 +1,8 @@
-"""`egosim experiment embodiment`: transfer from human hands to a robot by a few robot clips."""
+"""`egosim experiment embodiment`: transfer from human hands to a robot with few robot clips."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,19 +29,22 @@ from egosim_jax.experiments.scenes import (
     generate,
     reconstruct,
 )
+from egosim_jax.experiments.training import (
+    cached_videos,
+    make_frames,
+    train_config,
+    train_denoiser,
+)
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
-from egosim_jax.train import loop
-from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.encode import encode_shards
-from egosim_jax.train.fine_tuning import write_trained
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import InputError, Kind, check_counts, check_seed
-from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
+from egosim_jax.worlds.tabletop.dataset import DatasetConfig
 
 Videos = Mapping[str, Sequence[np.ndarray]]
 """Videos of all scenes by method."""
@@ -54,7 +56,7 @@ METHODS = {
     "lora": "human, then a LoRA",
     "scratch": "robot alone",
 }
-"""Titles in tables of the trained models, by field of the settings and folder."""
+"""Titles of the trained models, by field of the settings, which is also their folder."""
 LOSSES = {
     "before": ("loss before", "{:.3f}"),
     "after": ("loss after", "{:.3f}"),
@@ -68,7 +70,7 @@ REPORT_DEFINITIONS = {
 
 
 def run(settings: Embodiment) -> None:
-    """Make clips, train, generate, compare, draw."""
+    """Make clips, train, generate, compare and draw."""
     check_counts(
         {
             "--human-scenes": settings.human_scenes,
@@ -85,8 +87,8 @@ def run(settings: Embodiment) -> None:
     experiment = _Experiment(settings)
     if conditions_of(experiment.model)[1] == "mesh":
         raise InputError(
-            f"{settings.config} is conditioned on hand meshes, which robots do not have: take a "
-            "model of keypoints. (--config)"
+            f"{settings.config} is conditioned on hand meshes, which robots do not have: choose a "
+            "model conditioned on keypoints. (--config)"
         )
     record = {"experiment": settings, "weights": hashes(experiment.origin)}
     open_folder(settings.out, record, mutable=["experiment.out", "experiment.weights"])
@@ -111,26 +113,8 @@ def run(settings: Embodiment) -> None:
     _draw(settings.out, scenes, videos, validations)
 
 
-def train_config(stage: Hyperparameters) -> TrainConfig:
-    """Return the training settings, with eight validations; a kill costs 50 updates at most."""
-    every = max(1, stage.steps // 8)
-    return TrainConfig(
-        steps=stage.steps,
-        batch_size=stage.batch_size,
-        optimizer=OptimizerConfig(
-            name=stage.optimizer,
-            learning_rate=stage.learning_rate,
-            warmup_steps=stage.warmup,
-            schedule="cosine",
-        ),
-        seed=stage.seed,
-        save_every=min(every, 50),
-        validate_every=every,
-    )
-
-
 class _Experiment:
-    """Data, models and videos of the experiment, each of which is made unless it exists."""
+    """Data, models and videos of the experiment; existing ones are loaded."""
 
     def __init__(self, settings: Embodiment):
         self.settings, self.out = settings, settings.out
@@ -143,7 +127,7 @@ class _Experiment:
         self.unseen = range(self.robot.stop, self.robot.stop + settings.held_out)
 
     def train_all(self) -> dict[str, Path]:
-        """Train every model; return its weights folder, or the file of the LoRA."""
+        """Train all models; return the folder of their weights, or the file of the LoRA."""
         settings = self.settings
         human_data = self._encode("human", self.human, "human")
         robot_data = self._encode("robot", self.robot, "robot")
@@ -158,17 +142,19 @@ class _Experiment:
 
     def generate_all(self, trained: Mapping[str, Path], scenes: Sequence[HeldOutClip]) -> Videos:
         """Generate the held-out clips by each model; add the baselines."""
-        size = self.settings.batch_size
+        size, folder = self.settings.batch_size, self.out / "generated"
         videos = {
-            name: self._cached(
-                name,
+            name: cached_videos(
+                folder / f"{name}.npy",
                 lambda name=name: generate(self._generator(trained, name), scenes, batch_size=size),
+                total=len(scenes),
             )
             for name in METHODS
         }
-        reconstructed = self._cached(
-            "autoencoder",
+        reconstructed = cached_videos(
+            folder / "autoencoder.npy",
             lambda: reconstruct(self._generator(trained, "human"), scenes, batch_size=size),
+            total=len(scenes),
         )
         return {
             **videos,
@@ -177,13 +163,10 @@ class _Experiment:
         }
 
     def _encode(self, split: str, seeds: range, kind: Kind) -> Path:
-        """Make the clips of a split, and cache their latents."""
+        """Make the clips of a split and cache their latents."""
         config = DatasetConfig(seeds=tuple(seeds), clips=1, spec=self.model.video, kind=kind)
-        frames, latents = self.out / "frames" / split, self.out / "latents" / split
-        workers = os.cpu_count() or 1
-        scenes = make_shards(config, out=frames, workers=workers, grid=self.model.grid)
-        for _ in track(scenes, f"making {split}", total=len(seeds)):
-            pass
+        latents = self.out / "latents" / split
+        frames = make_frames(config, self.out / "frames" / split, grid=self.model.grid)
         encode_shards(
             self.model,
             self.origin,
@@ -205,39 +188,22 @@ class _Experiment:
         rank: int | None = None,
     ) -> Path:
         """Train one model, from a weights folder or from random weights."""
-        out, model, share = self.out / name, self.model, self.settings.dropout
-        done = out / ("weights" if rank is None else "lora.safetensors")
-        # The networks that were not trained, as the autoencoder, are linked last.
-        if done.is_file() or (done / "vae.safetensors").exists():
-            return done
-        trained = loop.train(
-            Denoising(
-                model=model,
-                dropout=ConditionDropout(prior=share, mask=share, hands=share, text=share),
-                rank=rank,
-            ),
-            train_config(stage),
+        share = self.settings.dropout
+        dropout = ConditionDropout(prior=share, mask=share, hands=share, text=share)
+        return train_denoiser(
+            Denoising(model=self.model, dropout=dropout, rank=rank),
+            stage,
             data=data,
             validation=self.out / "latents" / "held_out",
-            out=out,
-            weights=start,
+            out=self.out / name,
+            start=start,
+            others=lambda: self.origin,
         )
-        return write_trained(trained, out, model=model, start=start or self.origin, rank=rank)
 
     def _generator(self, trained: Mapping[str, Path], name: str) -> Generator:
         if name == "lora":
             return Generator.load(self.model, trained["human"], lora=trained[name])
         return Generator.load(self.model, trained[name])
-
-    def _cached(self, name: str, make: Callable[[], Iterable[np.ndarray]]) -> list[np.ndarray]:
-        """Load the videos of a method, or make and save them."""
-        path = self.out / "generated" / f"{name}.npy"
-        if not path.exists():
-            total = self.settings.held_out
-            videos = list(track(make(), f"generating, {name}", total=total))
-            with atomic_write(path) as temporary:
-                np.save(temporary, np.stack(videos))
-        return list(np.load(path))
 
 
 def _draw(
@@ -246,7 +212,7 @@ def _draw(
     videos: Videos,
     validations: Mapping[str, Validation],
 ) -> None:
-    """Draw the contact sheet and the curves."""
+    """Draw the contact sheet and the validation curves."""
     sheet = out / "contact_sheet.png"
     clips = [
         scene.on_sheet({name: videos[name][number] for name in METHODS})
@@ -267,7 +233,7 @@ def _validation(folder: Path) -> dict[int, float]:
 def _compare(
     scenes: Sequence[HeldOutClip], videos: Videos, validations: Mapping[str, Validation]
 ) -> dict[str, Summary]:
-    """Summarize each method over the scenes; trained ones also have losses."""
+    """Summarize each method over the scenes; trained models also have losses."""
     table = {}
     for name in track(videos, "comparing", total=len(videos)):
         losses = {}
@@ -287,7 +253,7 @@ def _verdict(title: str, validation: Validation) -> str:
 
 
 def draw_curves(validations: Mapping[str, Validation], path: Path) -> None:
-    """Plot the validation loss by step: on human clips left, on robot clips right."""
+    """Plot validation loss over steps: training on human clips (left) and robot clips (right)."""
     matplotlib.use("agg")
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)

@@ -1,8 +1,8 @@
 """`egosim experiment look_away`: is a change still there after looking elsewhere?
 
-Three clips in each scene. Seen: a hand carries an object, the wearer turns away, and turns back.
+Each scene has three clips. Seen: a hand carries an object, the wearer turns away, and turns back.
 Unseen: the wearer turns away, a hand carries the object out of view, the wearer turns back. The
-pipeline gets no hand that is out of view; only the true world executes it.
+model and perception get no hand that is out of view; only the true world executes its motion.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from egosim_jax.evaluation.metrics import region
 from egosim_jax.evaluation.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.evaluation.metrics.state_update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.experiments.config import LookAway
-from egosim_jax.experiments.continuous import METHODS
-from egosim_jax.experiments.model import open_experiment
+from egosim_jax.experiments.continuous import METHODS, folder_name
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, transform
 from egosim_jax.io.run import write_json
@@ -43,19 +42,19 @@ from egosim_jax.worlds.tabletop.attempts import LOOK_AROUND_PROMPT, turn_camera
 from egosim_jax.worlds.tabletop.clips import render_scenes
 
 CASES = ("seen", "unseen")
-"""Moves in view, and moves while the wearer looks elsewhere."""
+"""The object moves in view, or while the wearer looks elsewhere."""
 AWAY_DEGREES = 50.0
-"""Angle by which the wearer turns away, to the side where the object is not."""
+"""Angle in degrees of the wearer's turn away from the object."""
 OUTSIDE_DEGREES = 35.0
-"""Smallest horizontal angle to the view's axis of an object that is out of view."""
+"""Minimum horizontal angle between the optical axis and an object out of view."""
 FRAMES_BACK = 4
-"""Last frames of the last clip, which are scored."""
+"""Number of scored frames at the end of the last clip."""
 NEAR_PERCENT = 5.0
-"""Farthest a kept object may be from its true place in the image, in percent of the width."""
+"""Maximum image distance of a kept object from its true position, in percent of the width."""
 TRUE = "ground truth, classical"
-"""Row of the ground-truth frames and of the state that classical perception makes of them."""
+"""Row of the ground-truth frames, and of the state by classical perception of them."""
 SHEET_SCENES = 3
-"""Scenes of each case on the contact sheet."""
+"""Number of scenes of each case on the contact sheet."""
 MEASURES = {
     "kept": ("object where it was left %", "{:.0f}"),
     "region_psnr": ("region PSNR dB", "{:.2f}"),
@@ -65,22 +64,22 @@ MEASURES = {
 DEFINITIONS = {
     "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the image's width of its true "
     f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
-    "object_error": "distance of the centroid of the object, segmented by color among the colors "
-    "of all bodies, from that of its ground-truth ids, in percent of the width, median over those "
-    "frames",
-    "region_psnr": "dB over the pixels of those frames where the object is or was before the move",
+    "object_error": "distance between the object's centroid, segmented by color among the colors "
+    "of all bodies, and the centroid of its ground-truth ids, in percent of the width, median over "
+    "the same frames",
+    "region_psnr": "dB over the pixels of these frames where the object is or was before the move",
     "state_accuracy": "share of the object's points in the last state within 1 cm of its true "
-    "surface; 0 if there are none",
+    "surface; 0 without points",
     "seen, unseen": "the object is carried in view, or while the wearer looks elsewhere",
-    "ground truth": "frames of the true world, which test how the object is found, and the state "
-    "that classical perception makes of them",
+    "ground truth": "frames of the true world, which test the detection of the object, and the "
+    "state by classical perception of them",
     "differences": "from no update, on the same scenes; mean and 95 % interval",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Story:
-    """Three clips of one scene with their ground truth, and what the last one is scored by."""
+    """Three clips of one scene with their ground truth, and the reference of the last clip."""
 
     seed: int
     """Seed of the scene."""
@@ -89,9 +88,9 @@ class Story:
     target: str
     """Name of the carried object."""
     before: Bool[np.ndarray, "f h w"]
-    """Pixels of the last frames in which the object would be seen where it was at first."""
+    """Pixels of the last frames that show the object at its initial position."""
     background: UInt8[np.ndarray, "f h w 3"]
-    """Last frames without hands and object."""
+    """Last frames without hands and without the object."""
 
     def score(self, frames: UInt8[np.ndarray, "f h w 3"]) -> dict[str, float]:
         """Return every measure of a video of the last clip."""
@@ -118,9 +117,9 @@ class Story:
 
 
 def run(settings: LookAway) -> None:
-    """Simulate every story with each update of the state and compare what is seen at the end."""
+    """Simulate every story by each method and compare the last frames."""
     check_counts({"--scenes": settings.scenes})
-    generator = open_experiment(settings)
+    generator = settings.open()
     spec = generator.config.video
     seeds = list(islice(_seeds(settings, spec), settings.scenes))
     jobs = [(case, seed) for case in CASES for seed in seeds]
@@ -129,7 +128,7 @@ def run(settings: LookAway) -> None:
         story = make_story(seed, spec, case)
         found = {TRUE: story.score(story.clips[-1].frames) | _perceive_true(story, spec)}
         for method in METHODS:
-            folder = settings.out / case / method.replace(", ", "_").replace(" ", "_") / str(seed)
+            folder = settings.out / case / folder_name(method) / str(seed)
             found[method] = _simulate(story, generator, method, folder)
         for method, values in found.items():
             scores.setdefault(f"{case}: {method}", []).append(values)
@@ -170,7 +169,7 @@ def _simulate(story: Story, generator: Generator, method: str, folder: Path) -> 
 
 
 def _perceive_true(story: Story, spec: VideoSpec) -> dict[str, float]:
-    """Return the accuracy of the state that classical perception makes of the ground truth."""
+    """Return the accuracy of the state by classical perception of the ground truth."""
     perceive, state = registry.parse("classical").build(), story.clips[0].state
     for clip in story.clips:
         seen = Clip(frames=clip.frames, fps=spec.fps)
@@ -179,7 +178,7 @@ def _perceive_true(story: Story, spec: VideoSpec) -> dict[str, float]:
 
 
 def _seeds(settings: LookAway, spec: VideoSpec) -> Iterator[int]:
-    """Yield the seeds of scenes in which an object is carried that can be out of view."""
+    """Yield the seeds of scenes with a carried object that can be out of view."""
     for seed in count(settings.first_scene):
         script = next(make_scripts(seed, spec=spec))
         if script.intent.verb == "carry" and _away(script) is not None:
@@ -187,7 +186,7 @@ def _seeds(settings: LookAway, spec: VideoSpec) -> Iterator[int]:
 
 
 def _away(script: Script) -> float | None:
-    """Return the angle in radians that takes the object out of view; None if there is none."""
+    """Return the turn in radians that takes the object out of view, or None."""
     places = np.stack(
         [moment.scene.body(script.intent.name).world_from_body[:3, 3] for moment in script.moments]
     )
@@ -201,7 +200,7 @@ def _away(script: Script) -> float | None:
 
 
 def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
-    """Return the clips of a scene whose object is carried in view (`seen`) or out of view."""
+    """Return the clips of a scene, with the object carried in view (`seen`) or out of view."""
     script = next(make_scripts(seed, spec=spec))
     angle, frames = _away(script), spec.frames
     if angle is None:
@@ -244,7 +243,7 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
 
 
 def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:
-    """Draw the last clip of some scenes: ground truth, and each method."""
+    """Draw the last clip of some scenes: ground truth and each method."""
     shown = []
     for case in CASES:
         for seed in seeds:
@@ -252,7 +251,7 @@ def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:
             videos = {"ground truth, first clip": story.clips[0].frames}
             videos["ground truth"] = story.clips[-1].frames
             for method in METHODS:
-                folder = out / case / method.replace(", ", "_").replace(" ", "_") / str(seed)
+                folder = out / case / folder_name(method) / str(seed)
                 videos[method] = load_clip(folder / "clip_3" / "frames.npz", spec.fps).frames
             title = f"{case}, scene {seed}, last clip: {', '.join(videos)}"
             shown.append(SheetClip(title, list(videos.values())))

@@ -1,4 +1,4 @@
-"""`egosim experiment policies`: ranks policies in the generated world and in the true one."""
+"""`egosim experiment policies`: rank policies in the generated world and in the true world."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.evaluation.metrics import rank_correlation, region
 from egosim_jax.evaluation.metrics.report import Summary, print_table
 from egosim_jax.experiments.config import Policies
-from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generation.generator import Generator, batches
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_json
@@ -33,9 +32,9 @@ from egosim_jax.worlds.tabletop.policies import MAX_ERROR_M, POLICIES, goal_erro
 from egosim_jax.worlds.tabletop.world import arms_of
 
 SHEET_SCENES = 2
-"""Scenes on the contact sheet."""
+"""Number of scenes on the contact sheet."""
 LAST_FRAMES = 3
-"""Frames at the end of a clip in which the object is looked for."""
+"""Number of frames at the end of a clip that are searched for the object."""
 MEASURES = {
     "true": ("true success %", "{:.0f}"),
     "seen": ("in ground-truth frames %", "{:.0f}"),
@@ -48,22 +47,22 @@ Videos = Sequence[UInt8[np.ndarray, "f h w 3"]]
 Outcomes = Mapping[str, Mapping[str, float]]
 """Success and error in meters of every policy in one scene, by name."""
 Judge = Callable[["Task", Videos], Outcomes]
-"""Reader of the outcomes in one scene."""
+"""Function that measures the outcomes in one scene."""
 DEFINITIONS = {
     "true": "share of scenes in which the executed action leaves the object within 3 cm of the "
     "goal horizontally and 2 cm vertically",
     "seen, frames": "the same by the ground-truth and by the generated frames: the centroid of the "
     "object, segmented by color among the colors of all bodies, is within 3 cm, at the goal's "
-    "depth, of that of the object at the goal; median over the last 3 frames in which the hand "
-    "does not hide it; else no success",
-    "state": "the same as true by the pose of the object in the state after the generated clip",
+    "depth, of the centroid of the object at the goal; median over the last 3 frames in which the "
+    "hand does not hide it; else no success",
+    "state": "as true, by the pose of the object in the state after the generated clip",
     **rank_correlation.DEFINITIONS,
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A scene in which an object is to be carried to a goal, and what each policy does."""
+    """A scene with an object to carry to a goal, and the action of each policy."""
 
     seed: int
     """Seed of the scene."""
@@ -74,7 +73,7 @@ class Task:
 
     @classmethod
     def make(cls, seed: int, script: Script) -> Task:
-        """Return the task of a scene; a policy's errors depend on the scene's seed alone."""
+        """Return the task of a scene; a policy's errors depend only on the seed."""
         planned = [policy.plan(script, np.random.default_rng([seed, 2])) for policy in POLICIES]
         cameras, kind, prompt = script.cameras, script.kind, script.caption
         actions = [
@@ -83,7 +82,7 @@ class Task:
         return cls(seed=seed, script=script, actions=tuple(actions))
 
     def outcome(self, world_from_body: np.ndarray) -> dict[str, float]:
-        """Return success and distance to the goal in meters of the object at a pose."""
+        """Return success, and the distance in meters to the goal, of the object at a pose."""
         moved = self._with(world_from_body).body(self.script.intent.name)
         error = goal_error_m(moved, np.asarray(self.script.intent.goal_m))
         return {"success": float(succeeded(error)), "error_m": error[0]}
@@ -91,9 +90,9 @@ class Task:
     def outcome_seen(
         self, frames: UInt8[np.ndarray, "f h w 3"], action: Action
     ) -> dict[str, float]:
-        """Return success and distance to the goal in meters of the object that last frames show.
+        """Return success, and the distance in meters to the goal, of the object in last frames.
 
-        An object that is not shown, or hidden by the hand where it should be, has no distance.
+        The distance is missing if the hand hides the object's goal position in all frames.
         """
         script, name, pose = self.script, self.script.intent.name, np.eye(4)
         number, last = script.scene.instance_id(name), self.last_cameras
@@ -113,7 +112,7 @@ class Task:
         return {"success": float(error <= MAX_ERROR_M[0]), "error_m": error}
 
     def last_frames(self, action: Action) -> UInt8[np.ndarray, "f h w 3"]:
-        """Return the last frames of the ground truth of an action."""
+        """Return the last ground-truth frames of an action."""
         scenes, _ = World(scene=self.script.scene).move(action)
         rendered = render_scenes(
             scenes[-LAST_FRAMES:], self.last_cameras, arms=self.last_arms(action)
@@ -136,13 +135,14 @@ class Task:
 
 
 def run(settings: Policies) -> None:
-    """Execute and generate every policy in every scene; rank, compare, draw.
+    """Execute and generate every policy in every scene; rank, compare and draw.
 
-    Frames are judged first, and reported; then states, for which every clip is perceived.
+    A first report has success by frames; the final report adds success by states, which needs slow
+    perception of every clip.
     """
     check_counts({"--scenes": settings.scenes, "--batch-size": settings.batch_size})
     perceive = registry.parse(settings.perception).build()
-    generator = open_experiment(settings)
+    generator = settings.open()
     folder, found = settings.out / "scenes", {key: [] for key in MEASURES}
     tasks = list(islice(_tasks(settings, generator.config.video), settings.scenes))
     for task in track(tasks, "generating", total=len(tasks)):
@@ -159,14 +159,14 @@ def run(settings: Policies) -> None:
 
 
 def _cached(path: Path, judge: Judge, task: Task, videos: Videos) -> Outcomes:
-    """Return the outcome of every policy in one scene, by a judge or from its file."""
+    """Return the outcome of every policy in one scene, from its file or by a judge."""
     if not path.exists():
         write_json(path, judge(task, videos))
     return read_json(path)
 
 
 def _tasks(settings: Policies, spec: VideoSpec) -> Iterator[Task]:
-    """Yield the scenes in which an object is carried to a place on the table."""
+    """Yield the scenes with an object to carry to a place on the table."""
     for seed in count(settings.first_scene):
         script = next(make_scripts(seed, spec=spec))
         if script.intent.verb == "carry":
@@ -174,7 +174,7 @@ def _tasks(settings: Policies, spec: VideoSpec) -> Iterator[Task]:
 
 
 def _videos(task: Task, generator: Generator, size: int, folder: Path) -> Videos:
-    """Return the generated clips of every policy in one scene, or read them from their file."""
+    """Return the generated clip of every policy in one scene, from their file or newly made."""
     path = folder / f"{task.seed}.npz"
     if not path.exists():
         videos = _generate(task, generator, size)
@@ -184,7 +184,7 @@ def _videos(task: Task, generator: Generator, size: int, folder: Path) -> Videos
 
 
 def _generate(task: Task, generator: Generator, size: int) -> Videos:
-    """Generate the clip of every policy, from equal noise."""
+    """Generate the clip of every policy from the same noise."""
     first, state = World(scene=task.script.scene).observe(task.script.cameras)
     view = generator.renderer.render(state, task.script.cameras, point_px=POINT_PX)
     triplets = [
@@ -243,7 +243,7 @@ def _perceived(task: Task, videos: Videos, *, perceive: Perception, fps: int) ->
 
 
 def _pose_in(state: SceneState, script: Script) -> np.ndarray:
-    """Return the pose of the carried object in a state: its first one, moved as perceived."""
+    """Return the pose of the carried object in a state: its initial pose, moved as perceived."""
     name = script.intent.name
     moved = state.world_from_object.get(script.scene.instance_id(name), np.eye(4))
     return moved @ script.scene.body(name).world_from_body
@@ -273,7 +273,7 @@ def _report(out: Path, found: Mapping[str, Sequence[Outcomes]], *, judges: Seque
 
 
 def _plot(rows: Mapping[str, Summary], path: Path, judges: Sequence[str]) -> None:
-    """Plot success in the generated world against true success, a point for each policy."""
+    """Plot success in the generated world over true success, with a point per policy."""
     matplotlib.use("agg")
     figure = Figure(figsize=(5.5 * len(judges), 5), layout="constrained")
     panels = figure.subplots(1, len(judges), sharey=True, squeeze=False)[0]
@@ -290,7 +290,7 @@ def _plot(rows: Mapping[str, Summary], path: Path, judges: Sequence[str]) -> Non
 
 
 def _draw(out: Path, tasks: Sequence[Task], generator: Generator) -> None:
-    """Draw clips of every policy: generated, and true."""
+    """Draw the generated and the ground-truth clip of every policy."""
     clips = []
     for task in tasks:
         start = World(scene=task.script.scene, seed=task.seed)

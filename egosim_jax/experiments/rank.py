@@ -1,4 +1,4 @@
-"""`egosim experiment rank`: candidate actions by the goal that they reach in generated videos."""
+"""`egosim experiment rank`: rank candidate actions by a goal image, using generated videos."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from egosim_jax.evaluation.metrics.rank_correlation import spearman
 from egosim_jax.evaluation.metrics.report import paired_difference, print_table
 from egosim_jax.experiments.config import Rank
-from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import conditions_of
 from egosim_jax.generation.generator import Generator
 from egosim_jax.generation.rank import by_image
@@ -22,27 +21,27 @@ from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 
 MEASURES = {"top1": ("top-1 %", "{:.1f}"), "spearman": ("Spearman", "{:.3f}")}
 DEFINITIONS = {
-    "score": "-LPIPS of AlexNet between the last frame of a video and that of the goal's action; "
-    "mean over seeds",
+    "score": "-LPIPS (AlexNet) between the last frames of a video and of the goal's action; mean "
+    "over seeds",
     "top1": "share of goals whose action has the highest score, in percent; 95 % interval of "
     "Clopper and Pearson",
-    "spearman": "rank correlation of the scores of a goal's candidates with those of their true "
-    "videos; mean over goals, 95 % interval of the bootstrap over goals",
+    "spearman": "rank correlation between the scores of a goal's candidates and the scores of "
+    "their true videos; mean over goals, 95 % interval of the bootstrap over goals",
 }
 MAX_TRIES = 200
-"""Actions of a scene that are tried, of which different ones are kept."""
+"""Maximum number of actions of a scene to try for different ones."""
 METHODS = {"generated": "generated videos", "autoencoder": "ground truth through the autoencoder"}
 
 
 def run(settings: Rank) -> None:
-    """Generate the candidates of every goal, rank them, compare with the ground truth."""
+    """Generate the candidates of every goal, rank them, and compare with the true ranking."""
     check_counts({"--goals": settings.goals, "--seeds": settings.seeds})
     if settings.candidates < 2:
         raise InputError(
             f"A goal with {settings.candidates} candidate cannot be ranked: it needs at least 2. "
             "(--candidates)"
         )
-    generator = open_experiment(settings)
+    generator = settings.open()
     seeds = range(settings.first_scene, settings.first_scene + settings.goals)
     goals = [
         _goal(settings, generator, seed) for seed in track(seeds, "goals", total=settings.goals)
@@ -91,11 +90,11 @@ def _triplet(clip: TabletopClip, generator: Generator) -> Triplet:
 
 
 def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
-    """Return clips of different actions in one scene, from the same cameras.
+    """Return clips of different actions in one scene, with the same cameras.
 
-    Raises `InputError` if the scene does not have so many.
+    Raises `InputError` if the scene has too few different actions.
     """
-    small = VideoSpec(frames=spec.frames, height=16, width=16, fps=spec.fps)
+    small = VideoSpec(frames=spec.frames, height=16, width=16, fps=spec.fps)  # for captions only
 
     def different() -> Iterator[int]:
         seen: set[str] = set()
@@ -115,7 +114,7 @@ def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
 
 
 def _summary(goals: Sequence[dict], method: str) -> dict[str, dict[str, float]]:
-    """Return top-1 and Spearman of a method with their intervals."""
+    """Return top-1 accuracy and Spearman correlation of a method, with intervals."""
     from scipy.stats import binomtest
 
     hits = sum(int(np.argmax(goal[method])) == goal["best"] for goal in goals)

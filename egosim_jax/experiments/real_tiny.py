@@ -1,7 +1,7 @@
 """`egosim experiment real_tiny`: train a small model on recorded clips and compare its clips.
 
-Along with the clips as they are, each is generated with the prior, mask and hands of another clip:
-the drop of the scores measures how much the model depends on its conditions.
+Each clip is also generated with the prior, mask and hands of another clip. The drop of the scores
+measures how much the model uses its conditions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SHEET_FRAMES = (4, 10, 16)
 
 
 def run(settings: RealTiny) -> None:
-    """Train, generate, compare, draw."""
+    """Train, generate, compare and draw."""
     replace(REAL_TINY, metadata=settings.metadata, out=settings.out).run()
     compare(
         "real_tiny",
@@ -44,9 +44,9 @@ def run(settings: RealTiny) -> None:
 def compare(
     config: str, metadata: Path, out: Path, *, starts: Sequence[int], seed: int, batch_size: int
 ) -> None:
-    """Generate the clips with their conditions and with those of others; compare both, and draw.
+    """Generate the clips with their own and with swapped conditions; compare both, and draw.
 
-    The model is the one trained in `out`. Writes report.json and contact_sheet.png.
+    The model is the one in `out`. Writes report.json and contact_sheet.png.
     """
 
     def report_of(name: str, metadata: Path) -> dict[str, Any]:
@@ -84,7 +84,7 @@ def compare(
 
 
 def _swap(metadata: Path, path: Path) -> Path:
-    """Write metadata in which each clip has the conditions of the next one of its split."""
+    """Write metadata in which each clip has the conditions of the next clip in its split."""
     items = read_metadata(metadata)
     lines = []
     for split in sorted({item.extra["split"] for item in items}):
@@ -96,7 +96,7 @@ def _swap(metadata: Path, path: Path) -> Path:
 
 
 def _row(clip: ClipFiles, other: ClipFiles) -> dict[str, str]:
-    """Return a metadata row with the prior, hence the mask next to it, and hands of another."""
+    """Return a metadata row with another clip's hands and prior, and so the mask next to it."""
     return {
         "video": str(clip.target and clip.target.resolve()),
         "ego_prior_video": str(other.prior.resolve()),
@@ -109,7 +109,7 @@ def _row(clip: ClipFiles, other: ClipFiles) -> dict[str, str]:
 
 
 def _sheet_clips(folder: Path) -> Iterator[SheetClip]:
-    """Yield the comparison video of each generated clip, by split and id."""
+    """Yield one comparison video per clip, sorted by split and id."""
     results = read_results(folder) or {}
     shown = {
         line["source_id"]: line for line in reversed(results.values()) if line["status"] == "done"

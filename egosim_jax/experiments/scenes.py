@@ -1,4 +1,4 @@
-"""Held-out scenes of the tabletop world, and the evaluation of videos of them."""
+"""Held-out clips of the tabletop world, and the scores of videos of them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DEFINITIONS = {
     "object_lost": "frames without a pixel of its color, in percent of those that show it",
 }
 SHEET_SCENES = 4
-"""Scenes on a contact sheet."""
+"""Number of scenes on a contact sheet."""
 SHEET_MOMENTS = (0, 3, 6, 9, 12, 16)
 """Frames on a contact sheet."""
 
@@ -55,7 +55,7 @@ class HeldOutClip:
     triplet: Triplet
     """Conditions and target in EgoSim's format."""
     background: np.ndarray
-    """Ground-truth frames without hands and without manipulated object, uint8 `f h w 3`."""
+    """Ground-truth frames without hands and manipulated object, uint8 `f h w 3`."""
 
     @classmethod
     def make(
@@ -69,7 +69,7 @@ class HeldOutClip:
         prior: PriorName = "state",
         hands: HandsName = "skeleton",
     ) -> HeldOutClip:
-        """Make the first clip of a seed."""
+        """Make the first clip of a scene."""
         scene = partial(
             make_sequence,
             seed,
@@ -82,7 +82,7 @@ class HeldOutClip:
         return cls(clip, to_triplet(clip, prior=prior, hands=hands), bare.frames)
 
     def evaluate(self, video: np.ndarray) -> dict[str, float]:
-        """Return every measure of a video of this clip."""
+        """Return all measures of a video of this clip."""
         target, ids = self.clip.frames[1:], self.clip.ids[1:]
         number = self.clip.body_ids[self.clip.target]
         hands, body = ids >= FIRST_HAND, ids == number
@@ -99,9 +99,9 @@ class HeldOutClip:
         }
 
     def on_sheet(self, videos: Mapping[str, np.ndarray], *, note: str = "") -> SheetClip:
-        """Return conditions, videos by name, and ground truth for a contact sheet.
+        """Return the rows of a contact sheet: conditions, videos by name, and ground truth.
 
-        The title is a note on the clip, or the names of its rows.
+        The title has a note, or by default the names of the rows.
         """
         names = ", ".join(("prior", "hands", *videos, "ground truth"))
         return SheetClip(
@@ -111,14 +111,14 @@ class HeldOutClip:
 
 
 def conditions_of(config: ModelConfig) -> tuple[PriorName, HandsName]:
-    """Return the renderings of scene and hands that a model is conditioned on."""
+    """Return the renderings of scene and hands in a model's conditions."""
     if config.layout.mask_packing == "observed":
         return "static", "mesh"
     return "state", "skeleton"
 
 
 def evaluate(scenes: Sequence[HeldOutClip], videos: Sequence[np.ndarray]) -> list[dict[str, float]]:
-    """Return every measure of a video of each scene."""
+    """Return all measures of one video per scene."""
     return [scene.evaluate(video) for scene, video in zip(scenes, videos, strict=True)]
 
 
@@ -130,7 +130,7 @@ def generate(
     seed: int = 0,
     without: DroppedCondition | None = None,
 ) -> Iterator[np.ndarray]:
-    """Generate a video of every scene, from noise that differs by scene and seed."""
+    """Generate a video of every scene, with noise that depends on scene and seed."""
     for batch in batches(scenes, batch_size):
         noise = [1000 * seed + scene.clip.seed for scene in batch]
         clips = generator.generate([scene.triplet for scene in batch], noise, without=without)
@@ -140,14 +140,14 @@ def generate(
 def reconstruct(
     generator: Generator, scenes: Sequence[HeldOutClip], *, batch_size: int
 ) -> Iterator[np.ndarray]:
-    """Reconstruct every scene by the autoencoder: the upper bound of any denoiser."""
+    """Reconstruct every scene by the autoencoder: an upper bound for any denoiser."""
     for batch in batches(scenes, batch_size):
         clips = generator.reconstruct([scene.triplet for scene in batch])
         yield from (clip.frames for clip in clips)
 
 
 def baselines(scenes: Sequence[HeldOutClip]) -> dict[str, list[np.ndarray]]:
-    """Return the videos of the methods without a model."""
+    """Return the videos of the baselines without a model."""
     targets = [scene.clip.frames for scene in scenes]
     return {
         "prior copied": [scene.triplet.prior for scene in scenes],

@@ -12,8 +12,6 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.evaluation.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.experiments.config import Tabletop
-from egosim_jax.experiments.failures import worst
-from egosim_jax.experiments.model import open_experiment
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
@@ -35,14 +33,14 @@ from egosim_jax.types import Kind, check_counts
 Table = dict[str, dict[str, dict[str, float]]]
 Scores = list[dict[str, float]]
 CEILING = "ground truth through the autoencoder"
-"""Name of the row of the clips that are encoded and decoded."""
+"""Row of the encoded and decoded clips: an upper bound for the denoiser."""
 METHODS: tuple[tuple[str, DroppedCondition | None], ...] = (
     ("full", None),
     ("without prior", "prior"),
     ("without mask", "mask"),
     ("without hands", "hands"),
 )
-"""Names of the generated rows, and the condition that each drops."""
+"""Generated rows, and the condition that each drops."""
 SPREAD = {
     "spread": "standard deviation over scenes (n - 1), each a mean over seeds",
     "spread_over_seeds": "standard deviation over seeds (n - 1), each a mean over scenes",
@@ -53,19 +51,32 @@ DIFFERENCES = {
 }
 
 
+GOALS: Mapping[str, tuple[float, str]] = {
+    "object_lost": (1.0, "object lost in {:.0f} % ({:.0f} %)"),
+    "object_error": (5.0, "object {:.0f} % off ({:.0f} %)"),
+    "hand_iou": (-0.70, "hand IoU {:.2f} ({:.2f})"),
+    "region_psnr": (-21.5, "region {:.1f} dB ({:.1f})"),
+    "lpips_alex": (0.17, "LPIPS {:.2f} ({:.2f})"),
+}
+"""Maximum of each measure, or the negated minimum, and the text if a clip misses it.
+
+The text has the clip's value and, in parentheses, the value of the ground truth through the
+autoencoder: if that misses the goal, too, no denoiser can reach it."""
+
+
 class Found(NamedTuple):
-    """Findings of an experiment on the scenes of one kind of hands."""
+    """Findings on the scenes of one kind of hands."""
 
     table: Table
     """Measures of the methods."""
     differences: Table
-    """Differences of the methods from the first."""
+    """Differences of the methods from the first method."""
     worst: list[dict[str, Any]]
-    """Scenes of the sheet of the worst, with what each lacks."""
+    """Worst scenes, with the goals that they miss."""
 
 
 def run(settings: Tabletop) -> None:
-    """Make the scenes, generate, compare, draw."""
+    """Make the scenes, generate, compare and draw."""
     check_counts(
         {
             "--scenes": settings.scenes,
@@ -74,7 +85,7 @@ def run(settings: Tabletop) -> None:
             "--worst": settings.worst,
         }
     )
-    generator = open_experiment(settings)
+    generator = settings.open()
     hands = conditions_of(generator.config)[1]
     kinds: tuple[Kind, ...] = ("human", "robot") if hands == "skeleton" else ("human",)
     found = {kind: _compare(settings, kind, generator) for kind in kinds}
@@ -134,7 +145,7 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Found:
     notes: list[dict[str, Any]] = []
     if settings.worst is not None:
         videos = {"generated": generated, "through the autoencoder": coded}
-        found = worst(first, scores[CEILING], settings.worst)
+        found = worst_clips(first, scores[CEILING], settings.worst)
         notes = [{"scene": scenes[n].clip.seed, "lacks": lacking} for n, lacking in found.items()]
         rows = [
             scenes[n].on_sheet(
@@ -146,10 +157,31 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> Found:
     return Found(table, differences_from("full", by_scene), notes)
 
 
+def missed_goals(scores: Mapping[str, float], ceiling: Mapping[str, float]) -> list[str]:
+    """Return a text for each missed goal; NaN and absent measures miss no goal."""
+    return [
+        text.format(scores[name], ceiling[name])
+        for name, (goal, text) in GOALS.items()
+        if name in scores and scores[name] * np.sign(goal) > goal
+    ]
+
+
+def worst_clips(
+    scores: Sequence[Mapping[str, float]], ceilings: Sequence[Mapping[str, float]], count: int
+) -> dict[int, list[str]]:
+    """Return the missed goals of the worst clips by index, starting with the most missed goals.
+
+    Ties are ordered by the PSNR of the region of hands and object, lowest first.
+    """
+    missed = [missed_goals(*pair) for pair in zip(scores, ceilings, strict=True)]
+    order = sorted(range(len(scores)), key=lambda n: (-len(missed[n]), scores[n]["region_psnr"]))
+    return {n: missed[n] for n in order[:count]}
+
+
 def differences_from(
     reference: str, by_scene: Mapping[str, Sequence[Mapping[str, float]]]
 ) -> Table:
-    """Return how each method differs from a reference on the same scenes, by measure."""
+    """Return the paired differences of each method from a reference, by measure."""
     start = by_scene[reference]
     return {
         name: paired_differences(scenes, start, [m for m in MEASURES if m in start[0]])
@@ -159,7 +191,7 @@ def differences_from(
 
 
 def over_seeds(runs: Sequence[Sequence[Mapping[str, float]]]) -> list[dict[str, float]]:
-    """Return the means over seeds of each scene's scores."""
+    """Return the scores of each scene, averaged over seeds."""
     return [_means(scores) for scores in zip(*runs, strict=True)]
 
 
@@ -168,7 +200,7 @@ def summarize_runs(
 ) -> dict[str, dict[str, float]]:
     """Return mean and spreads of each measure; `runs` has the scores of all scenes for each seed.
 
-    NaN, the score of a scene in which there is nothing to measure, is ignored.
+    NaN, the score of a scene with nothing to measure, is ignored.
     """
     scenes = over_seeds(runs)
     seeds = summarize([_means(scores) for scores in runs], MEASURES)

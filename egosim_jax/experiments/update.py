@@ -1,4 +1,4 @@
-"""`egosim experiment update`: accuracy of the state after an object was carried."""
+"""`egosim experiment update`: accuracy of the scene state after an object was carried."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from egosim_jax.evaluation.metrics.state_update import (
     symmetric_distance,
 )
 from egosim_jax.experiments.config import Update
-from egosim_jax.experiments.model import open_experiment
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.io.run import write_json
@@ -27,7 +26,7 @@ from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action, to_ground_truth
 
 LARGE = VideoSpec(frames=17, height=480, width=832, fps=8)
-"""Clips of the official size."""
+"""Clips at EgoSim's size."""
 CARRIED = ("carry", "stack")
 """Actions that carry an object."""
 MEASURES = {
@@ -50,9 +49,9 @@ DEFINITIONS = {
 
 
 def run(settings: Update) -> None:
-    """Update states after a carried object and compare them with the true ones."""
+    """Carry an object in every scene, update the state and compare it with the true scene."""
     check_counts({"--scenes": settings.scenes})
-    generator = open_experiment(settings)
+    generator = settings.open()
     spec = generator.config.video
     table: dict[str, list[dict[str, float]]] = {}
     for seed in track(_seeds(settings, spec), "scenes", total=settings.scenes):
@@ -64,7 +63,7 @@ def run(settings: Update) -> None:
 
 
 def _seeds(settings: Update, spec: VideoSpec) -> Iterator[int]:
-    """Yield the seeds of the first scenes in which an object is carried."""
+    """Yield the seeds of the first scenes with a carried object."""
     small = replace(spec, frames=1, height=16, width=16)  # the events are the same at any size
     clips = (next(make_sequence(seed, spec=small)) for seed in count(settings.first_scene))
     yield from islice((clip.seed for clip in clips if clip.verb in CARRIED), settings.scenes)
@@ -73,7 +72,7 @@ def _seeds(settings: Update, spec: VideoSpec) -> Iterator[int]:
 def _rows(
     seed: int, spec: VideoSpec, generator: Generator
 ) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield name and scores of each row of the table for one scene."""
+    """Yield the name and the scores of each table row for one scene."""
     large = next(make_sequence(seed, spec=LARGE))
     yield f"oracle, {LARGE.width} x {LARGE.height}", evaluate(large, large.frames, "oracle")
     clip = next(make_sequence(seed, spec=spec))
@@ -87,7 +86,7 @@ def _rows(
 
 
 def evaluate(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, float]:
-    """Score the state after perceiving and fusing some frames of a clip."""
+    """Return the scores of the state after perceiving and fusing the frames of a clip."""
     perceive = registry.parse(perception).build({clip.number: to_ground_truth(clip)})
     before = clip.state
     perceived = perceive(Clip(frames=frames, fps=LARGE.fps), to_action(clip), before)
@@ -110,7 +109,7 @@ def evaluate(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[st
 
 
 def _visible_surface(clip: TabletopClip, number: int, path: np.ndarray) -> np.ndarray:
-    """Return the points of a body that any frame shows, at its final pose."""
+    """Return the surface points of a body visible in any frame, at its final pose."""
     cameras = clip.cameras
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     seen = []
@@ -124,7 +123,7 @@ def _visible_surface(clip: TabletopClip, number: int, path: np.ndarray) -> np.nd
 def _background_seen_before(clip: TabletopClip, after: SceneState) -> np.ndarray:
     """Return the background points of a state that the clip's first camera sees.
 
-    A point may be occluded by other background that is nearer by less than 1 cm.
+    A point still counts as seen if other background is nearer by less than 1 cm.
     """
     cameras, first = clip.cameras, clip.first
     points = after.points_m[after.object_ids == 0]

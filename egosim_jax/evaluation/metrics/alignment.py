@@ -1,8 +1,8 @@
-"""Shift of one video against another: the whole pixels by which the squared error is smallest.
+"""Shift by whole pixels that minimizes the squared error between two videos.
 
-Renderings of a scene from a reconstruction may be off the recorded video by some pixels, everywhere
-and in all frames. Both are compared inside a margin, so that every shift compares equally many
-pixels of the reference.
+Renderings of a reconstructed scene may be displaced from the recorded video by the same few pixels
+in all frames. The videos are compared inside a margin: every shift then compares the same pixels of
+the reference.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from egosim_jax.types import InputError, check_video
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
-    """Shift of a video against its reference, and PSNR without and with its correction."""
+    """Shift of a video relative to its reference, and PSNR before and after the correction."""
 
     shift_px: tuple[int, int]
-    """Columns to the right and rows down of the video from the reference."""
+    """Displacement of the video from the reference: columns to the right, rows down."""
     psnr_full: float
-    """Mean PSNR over frames in dB, of all pixels, without correction."""
+    """PSNR in dB over all pixels, before the correction, mean over frames."""
     psnr_inside: float
-    """Mean PSNR over frames in dB, inside the margin, without correction."""
+    """PSNR in dB inside the margin, before the correction, mean over frames."""
     psnr_aligned: float
-    """Mean PSNR over frames in dB, inside the margin, with the shift undone."""
+    """PSNR in dB inside the margin, after the correction, mean over frames."""
 
     @property
     def gain(self) -> float:
-        """PSNR that undoing the shift adds, in dB."""
+        """PSNR gain of the correction in dB."""
         return self.psnr_aligned - self.psnr_inside
 
 
@@ -47,7 +47,7 @@ def align(
 ) -> Alignment:
     """Return the best shift of at most `most_px` pixels along each axis.
 
-    Raises `InputError` for videos of different lengths or sizes, or too small for the margin.
+    Raises `InputError` if the videos differ in length or size, or are too small for the margin.
     """
     import cv2
 
@@ -61,7 +61,7 @@ def align(
         )
     rows, columns = slice(most_px, height - most_px), slice(most_px, width - most_px)
     inside = reference[:, rows, columns]
-    errors = sum(
+    errors = sum(  # one error map over all shifts per frame
         cv2.matchTemplate(frame, part, cv2.TM_SQDIFF).astype(np.float64)
         for frame, part in zip(video, inside, strict=True)
     )
@@ -76,7 +76,7 @@ def align(
 
 
 def align_clip(video: Path, reference: Path | None, *, most_px: int = 12) -> Alignment:
-    """Return the best shift of a video file; raise `InputError` without a recorded video."""
+    """Return the best shift of a video file. Raises `InputError` without a recorded video."""
     if reference is None:
         raise InputError("it has no recorded video to compare with (column video).")
     return align(read_video(video).frames, read_video(reference).frames, most_px=most_px)

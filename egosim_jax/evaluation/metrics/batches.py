@@ -1,4 +1,4 @@
-"""Frames in batches of equal size, dealt out over the local devices."""
+"""Frames in batches of equal size, sharded over the local devices."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from egosim_jax.types import InputError
 
 
 class Batches:
-    """Batches of the frames of a video, the last one filled with copies.
+    """Batches of the frames of a video; the last batch is padded with copies.
 
-    All have one size, a multiple of the number of devices, so that one program is compiled; each
-    device gets an equal part.
+    All batches have one size, a multiple of the number of devices: only one program is compiled,
+    and each device gets an equal part.
     """
 
-    def __init__(self, count: int, most: int):
-        """Divide `count` frames into batches of at most `most` frames, or one for each device."""
+    def __init__(self, count: int, max_size: int):
+        """Divide `count` frames into batches of at most `max_size` frames, or one per device."""
         devices = jax.local_device_count()
-        parts = -(-count // max(most, devices))
+        parts = -(-count // max(max_size, devices))
         size = -(-count // parts)
         self._size = -(-size // devices) * devices
         self._count = count
@@ -36,7 +36,7 @@ class Batches:
             yield jax.device_put(frames[numbers], _sharding())
 
     def join(self, values: Iterable[Any]) -> np.ndarray:
-        """Return the values of all frames, given those of each batch."""
+        """Return the values of all frames, given the values of each batch, without the padding."""
         return np.concatenate([np.asarray(part) for part in values])[: self._count]
 
 

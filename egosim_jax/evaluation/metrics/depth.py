@@ -1,4 +1,4 @@
-"""Depth error. The paper's Depth ERR has no formula; this definition is ours."""
+"""Depth error. The paper gives no formula for its Depth ERR; this definition is ours."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ def depth_error(
     target_m: Float32[np.ndarray, "f h w"],
     counted: Bool[np.ndarray, "f h w"],
 ) -> float:
-    """Return the mean of |depth - target| / target in percent over counted pixels with both known.
+    """Return mean |depth - target| / target in percent over counted pixels where both are known.
 
-    NaN if there are none.
+    NaN without such pixels.
     """
     known = counted & np.isfinite(depth_m) & np.isfinite(target_m) & (depth_m > 0) & (target_m > 0)
     if not known.any():
@@ -23,5 +23,5 @@ def depth_error(
 
 
 def coverage(depth_m: Float32[np.ndarray, "f h w"], counted: Bool[np.ndarray, "f h w"]) -> float:
-    """Return the percentage of counted pixels whose depth is known; NaN if none are counted."""
+    """Return the percentage of counted pixels with known depth; NaN without counted pixels."""
     return float(100 * np.isfinite(depth_m[counted]).mean()) if counted.any() else float("nan")

@@ -1,20 +1,20 @@
 """DreamSim (Fu et al. 2023): distance between images in the features of three adapted networks.
 
 An image is resized to 224 x 224 (bicubic, with antialiasing, from uint8 to uint8) and embedded by
-three vision transformers of base size with patches of 16 pixels: DINO's class token after the last
-block, and the projected class tokens of CLIP and OpenCLIP. The weights of queries, keys and values
-are adapted by a LoRA. The embeddings are joined and centered; the distance is one minus their
-cosine. This is the ensemble, the package's default.
+three ViT-B/16 networks: DINO's class token after the last block, and the projected class tokens of
+CLIP and OpenCLIP. A LoRA adapts the weights of queries, keys and values. The embeddings are
+concatenated and centered; the distance is one minus their cosine. This is the ensemble, the default
+of the package dreamsim.
 
-The weights are those of the release v0.2.0-checkpoints (dreamsim_ensemble_checkpoint.zip, MIT),
-unpacked as the package dreamsim unpacks them, and DINO's backbone where that package puts it:
+The weights come from the release v0.2.0-checkpoints (dreamsim_ensemble_checkpoint.zip, MIT),
+unpacked as by the package dreamsim, with DINO's backbone where that package puts it:
 
     ensemble_lora/adapter_config.json and adapter_model.safetensors or .bin
     checkpoints/dino_vitbase16_pretrain.pth
     clip_vitb16_pretrain.pth.tar
     open_clip_vitb16_pretrain.pth.tar
 
-They are read without PyTorch, and no pickle is run.
+They are read without PyTorch, and no pickle is executed.
 """
 
 from __future__ import annotations
@@ -50,31 +50,31 @@ MISSING = (
     "ssundaram21/dreamsim (dreamsim_ensemble_checkpoint.zip) and give its folder. (--dreamsim)"
 )
 HEAD_CHANNELS = 64
-"""Channels of an attention head, in every vision transformer of base size."""
+"""Channels of an attention head in every ViT-B."""
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 CLIP = ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711))
-"""Mean and standard deviation of the colors on which the networks were trained."""
+"""Mean and standard deviation of the training colors."""
 MAX_FRAMES = 8
-"""Frames that are embedded together."""
+"""Maximum number of frames that are embedded together."""
 ADAPTED = re.compile(r"extractor_list\.(\d+)\.model\.(blocks\.\d+\.[\w.]+)\.lora_([AB])\.weight$")
-"""Adapted weights in the file of the LoRA: number of the network, layer, and factor."""
+"""Name of a LoRA weight: number of the network, layer, factor."""
 Weights = dict[str, Array]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Backbone:
-    """One of the networks: where its weights are, and what distinguishes it."""
+    """One network of the ensemble: its file, and its differences from the others."""
 
     file: str
-    """Path of its weights in the folder."""
+    """Path of the weights in the folder."""
     colors: tuple[tuple[float, float, float], tuple[float, float, float]]
-    """Mean and standard deviation of the colors of its inputs."""
+    """Mean and standard deviation of the input colors."""
     epsilon: float
-    """Constant of its layer norms."""
+    """Epsilon of the layer norms."""
     projected: bool = True
-    """True if its class token is normalized and projected."""
+    """True if the class token is normalized and projected."""
     quick: bool = False
-    """True if its activation is x sigmoid(1.702 x) instead of the exact GELU."""
+    """True for the activation x sigmoid(1.702 x) (QuickGELU) instead of the exact GELU."""
 
 
 BACKBONES = (
@@ -91,7 +91,7 @@ BACKBONES = (
 
 
 class DreamSim:
-    """Distance between frames, by weights in a folder."""
+    """DreamSim distance between frames."""
 
     def __init__(self, folder: Path):
         """Read and adapt the weights. Raises `InputError` if some are missing or do not fit."""
@@ -106,11 +106,11 @@ class DreamSim:
         if unused:
             raise InputError(
                 f"The LoRA in {quote_path(folder)} adapts {quote(min(unused))} of a fourth "
-                "network: only the ensemble of three is supported. Give that of release v0.2.0."
+                "network: only the ensemble of three is supported. Use the LoRA of release v0.2.0."
             )
         adapter = next(p for p in _adapters(folder) if p.is_file())
         self.hashes = {path.name: sha256(path) for path in (*files, adapter)}
-        """SHA-256 of the files of weights, by name."""
+        """SHA-256 of the weight files, by name."""
 
     @property
     def size(self) -> int:
@@ -120,7 +120,7 @@ class DreamSim:
         return round(places**0.5) * weights["patch_embed.proj.weight"].shape[-1]
 
     def embed(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Float[np.ndarray, "f d"]:
-        """Return the centered embedding of every frame."""
+        """Return the centered embedding of each frame."""
         size = self.size
         images = np.stack(
             [
@@ -216,7 +216,7 @@ def _check_files(folder: Path, files: list[Path]) -> None:
 def _read_lora(
     folder: Path,
 ) -> tuple[dict[tuple[int, str, str], Float[np.ndarray, "i j"]], dict[str, Any]]:
-    """Return the factors of the LoRA by number of the network, layer and factor; its settings."""
+    """Return the LoRA factors by network number, layer and factor; and the LoRA's settings."""
     config = folder / "ensemble_lora" / "adapter_config.json"
     found = [path for path in _adapters(folder) if path.is_file()]
     if not found or not config.is_file():
@@ -227,8 +227,8 @@ def _read_lora(
         match = ADAPTED.search(name)
         if match is None:
             raise InputError(
-                f"{quote_path(found[0])} has {quote(name)}, which is no factor of a LoRA of the "
-                "ensemble. Give that of release v0.2.0."
+                f"{quote_path(found[0])} has {quote(name)}, which is not a LoRA factor of the "
+                "ensemble. Use the LoRA of release v0.2.0."
             )
         factors[int(match[1]), match[2], match[3]] = array
     settings = read_json(config)
@@ -237,7 +237,7 @@ def _read_lora(
         if not (isinstance(value, (int, float)) and 0 < value < float("inf")):
             raise InputError(
                 f"{quote_path(config)} has {quote(value)} as {key}: r and lora_alpha must be "
-                "positive numbers. Give that of release v0.2.0. (--dreamsim)"
+                "positive numbers. Use the file of release v0.2.0. (--dreamsim)"
             )
     return factors, settings
 
@@ -260,7 +260,7 @@ def _adapt(
     number: int,
     scale: float,
 ) -> Weights:
-    """Return weights to which a network's part of the LoRA was added."""
+    """Return a network's weights with its part of the LoRA merged in."""
     for layer in {name for index, name, _ in lora if index == number}:
         key = f"{layer}.weight"
         down, up = (lora.get((number, layer, factor)) for factor in "AB")

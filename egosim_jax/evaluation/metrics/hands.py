@@ -1,7 +1,7 @@
-"""Hands of a video against those of the ground truth: keypoint error and IoU.
+"""Agreement of detected hands with the ground truth: keypoint error, recall and IoU.
 
-Keypoints are the 21 of MediaPipe and MANO, of the left and the right hand (`f 2 21 2`), in pixels;
-NaN where a hand was not found.
+Keypoints are in pixels: 21 per hand, as in MediaPipe and MANO, left hand first (`f 2 21 2`). They
+are NaN where a hand was not found.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 def keypoint_errors(
     found_px: Float[np.ndarray, "f 2 21 2"], target_px: Float[np.ndarray, "f 2 21 2"]
 ) -> Float[np.ndarray, " n"]:
-    """Return the mean distance in pixels between keypoints of each hand that both videos show."""
+    """Return the mean keypoint distance in pixels of each hand found in both videos."""
     distances = np.linalg.norm(found_px - target_px, axis=-1).mean(axis=-1)
     return distances[np.isfinite(distances)]
 
@@ -21,7 +21,7 @@ def keypoint_errors(
 def hand_recall(
     found_px: Float[np.ndarray, "f 2 21 2"], target_px: Float[np.ndarray, "f 2 21 2"]
 ) -> float:
-    """Return the share of the target's hands that the video shows, too; NaN if it has none."""
+    """Return the fraction of the target's hands found in the video; NaN without target hands."""
     shown, there = _present(target_px), _present(found_px)
     return float((shown & there).sum() / shown.sum()) if shown.any() else float("nan")
 
@@ -35,7 +35,7 @@ def hand_iou(
 ) -> float:
     """Return the IoU of the hands' convex hulls, averaged over the frames with a target hand.
 
-    A hand that is missing has no area. NaN if no frame of the target has a hand.
+    A missing hand has no area. NaN if no frame of the target has a hand.
     """
     values = []
     for here, there in zip(found_px, target_px, strict=True):
@@ -49,7 +49,7 @@ def hand_iou(
 def hull_mask(
     joints_px: Float[np.ndarray, "2 21 2"], height: int, width: int
 ) -> Bool[np.ndarray, "height width"]:
-    """Return the pixels in the convex hull of the keypoints of either hand."""
+    """Return the pixels inside the convex hull of either hand's keypoints."""
     import cv2
 
     mask = np.zeros((height, width), np.uint8)

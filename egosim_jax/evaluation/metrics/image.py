@@ -1,15 +1,15 @@
 """PSNR and SSIM of uint8 RGB videos, color drift, and color fitting of a baseline.
 
-PSNR of a frame is 10 log10(255^2 / MSE), the MSE over all its pixels and channels; a frame equal
-to its reference would be infinite and counts as 100 dB. A video's PSNR is the mean over frames, or,
-as torchmetrics computes it and DWM reports it, that of one MSE over all frames.
+The PSNR of a frame is 10 log10(255^2 / MSE), with the MSE over all pixels and channels. A frame
+equal to its reference counts as 100 dB instead of infinity. The PSNR of a video is the mean over
+frames. DWM instead reports the PSNR of one MSE over all frames, as computed by torchmetrics.
 
 SSIM (Wang et al. 2004) compares means, variances and the covariance under an 11 x 11 Gaussian
 window of sigma 1.5, whose weights sum to one:
 
     (2 mu_a mu_b + C1) (2 cov_ab + C2) / ((mu_a^2 + mu_b^2 + C1) (var_a + var_b + C2))
 
-with C1 = (0.01 * 255)^2 and C2 = (0.03 * 255)^2. It is computed for each channel, averaged over the
+with C1 = (0.01 * 255)^2 and C2 = (0.03 * 255)^2. It is computed per channel, averaged over the
 windows inside the frame (no padding), then over channels and frames.
 """
 
@@ -27,9 +27,9 @@ from jaxtyping import Array, Float, UInt8
 from egosim_jax.evaluation.metrics.batches import Batches, check_same_shape
 
 MAX_PSNR = 100.0
-"""Largest PSNR in dB, that of equal frames."""
+"""PSNR in dB of equal frames."""
 MAX_PIXELS = 1 << 23
-"""Pixels of the frames that are compared together on an accelerator."""
+"""Maximum number of pixels in a batch on an accelerator."""
 _GRAY = 127.5
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
@@ -51,7 +51,7 @@ def psnr(
 def clip_psnr(frame_psnr: Float[np.ndarray, " f"]) -> float:
     """Return the PSNR in dB of one MSE over all frames, given the PSNR of each frame.
 
-    A frame equal to its reference counts as one of 100 dB.
+    A frame equal to its reference counts as 100 dB.
     """
     return float(-10 * np.log10(np.mean(10 ** (-np.asarray(frame_psnr) / 10))))
 
@@ -59,7 +59,7 @@ def clip_psnr(frame_psnr: Float[np.ndarray, " f"]) -> float:
 def color_drift(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, "f 3"]:
-    """Return the mean RGB of every frame minus that of the reference, in levels of 255."""
+    """Return the mean RGB of each frame minus the reference's, in levels of 255."""
     return mean_colors(video) - mean_colors(reference)
 
 
@@ -77,10 +77,10 @@ def decibels(errors: Float[Any, "*n"]) -> Any:
 def ssim(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
-    """Return the SSIM of every frame, of at least 11 pixels in height and width."""
+    """Return the SSIM of each frame; frames need at least 11 pixels in height and width."""
     check_same_shape(video, reference)
     count, height, width, _ = video.shape
-    alone = jax.default_backend() == "cpu"  # where a frame fits the caches
+    alone = jax.default_backend() == "cpu"  # single frames fit the CPU caches
     batches = Batches(count, 1 if alone else MAX_PIXELS // (height * width))
     values = []
     for frames, others in zip(batches.of(video), batches.of(reference), strict=True):
@@ -94,7 +94,7 @@ def fit_colors(
 ) -> UInt8[np.ndarray, "f h w 3"]:
     """Return a video whose colors are fitted to a reference.
 
-    One affine map, 3 x 4, for the clip, by least squares over all pixels.
+    One affine map (3 x 4) for the clip is fitted by least squares over all pixels.
     """
     gram, moment = np.zeros((4, 4)), np.zeros((4, 3))
     for frame, other in zip(video, reference, strict=True):
@@ -128,10 +128,10 @@ def _with_one(frame: UInt8[Array, "h w 3"]) -> Float[Array, "n 4"]:
 def _moments(
     a: UInt8[Array, "b h w c"], b: UInt8[Array, "b h w c"]
 ) -> tuple[Float[Array, "b 4 h w c"], Float[Array, "b 1 1 1"]]:
-    """Return a, b, a b and a^2 + b^2 of values minus a constant of the frame, and that constant.
+    """Return a, b, a b and a^2 + b^2 of values centered per frame, and the subtracted constant.
 
-    Variances are small differences of large squares; subtracting the frames' mean first keeps
-    float32 exact enough.
+    Variances are small differences of large squares: float32 is exact enough only after the mean of
+    the frames is subtracted.
     """
     a, b = a.astype(jnp.float32), b.astype(jnp.float32)
     mean = (a + b).mean(axis=(1, 2, 3), keepdims=True)
@@ -142,10 +142,10 @@ def _moments(
 
 @functools.partial(jax.jit, static_argnames="axis")
 def _blur(x: Float[Array, "b 4 _ _ c"], *, axis: int) -> Float[Array, "b 4 _ _ c"]:
-    """Apply the Gaussian window along one axis, where it is inside the frame.
+    """Apply the Gaussian window along one axis, only where it is inside the frame.
 
-    Two jitted passes: in one program XLA would compute the first pass again for each tap of the
-    second.
+    Each pass is a separate jitted call: in one program, XLA would recompute the first pass for each
+    tap of the second.
     """
     offsets = np.arange(_WINDOW) - _WINDOW // 2
     weights = np.exp(-(offsets**2) / (2 * _SIGMA**2))

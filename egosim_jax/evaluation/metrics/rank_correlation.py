@@ -1,11 +1,11 @@
 """Agreement of two evaluations of the same policies: correlation, and violations of the ranking.
 
-With s_i the success of policy i in the generated world and r_i that in the true one, a pair is
-ranked wrongly if s_i < s_j but not r_i < r_j, or the other way round, and
+Policy i has success s_i in the generated world and r_i in the true world. A pair is ranked wrongly
+if s_i < s_j but not r_i < r_j, or vice versa. The mean maximum rank violation is
 
     MMRV = mean_i max_j |r_i - r_j| [(s_i < s_j) != (r_i < r_j)]
 
-the mean maximum rank violation: 0 for equal rankings, else in units of success. Source: Li et al.,
+It is in units of success, and 0 for equal rankings. Source: Li et al.,
 Evaluating Real-World Robot Manipulation Policies in Simulation (SIMPLER), 2024, section III.
 """
 
@@ -31,14 +31,14 @@ DEFINITIONS = {
 
 
 def pearson(values: Float[np.ndarray, " n"], reference: Float[np.ndarray, " n"]) -> float:
-    """Return Pearson's correlation; NaN if either side is constant."""
+    """Return Pearson's correlation; NaN if an input is constant."""
     a, b = values - values.mean(), reference - reference.mean()
     strength = np.sqrt((a @ a) * (b @ b))
     return float(a @ b / strength) if strength > 0 else float("nan")
 
 
 def spearman(values: Float[np.ndarray, " n"], reference: Float[np.ndarray, " n"]) -> float:
-    """Return Spearman's rank correlation, ties by their mean rank; NaN if a side is constant."""
+    """Return Spearman's rank correlation (ties: mean rank); NaN if an input is constant."""
     from scipy.stats import rankdata
 
     return pearson(rankdata(values), rankdata(reference))
@@ -58,10 +58,9 @@ def agreement(
     level: float = 0.95,
     resamples: int = 2000,
 ) -> dict[str, dict[str, float]]:
-    """Return each measure of the success of p policies in s scenes, with its interval.
+    """Return each measure of the success of p policies in s scenes, with its bootstrap interval.
 
-    The scenes are drawn again with replacement, with a fixed seed; resamples in which a measure is
-    not defined are ignored.
+    The bootstrap resamples scenes with a fixed seed; undefined values of a measure are ignored.
     """
     scenes = generated.shape[1]
     draws = np.random.default_rng(0).integers(scenes, size=(resamples, scenes))

@@ -1,10 +1,10 @@
 """Silhouettes and positions of hands and objects, segmented by color.
 
-An object of color c under light s has pixels of color s * c. Where the scene without hands and
-without the object that they move is known, each pixel gets the label whose color is nearest: that
-background under some light, {s * b : 0.45 <= s <= 1.15}, or one of the colors of hands and object.
-The same rule labels the ground truth and the generated video; on the ground truth, whose ids are
-known, its accuracy can be measured.
+An object of color c under light s has pixels of color s * c. Given the background (the scene
+without hands and manipulated object), each pixel gets the label of the nearest color: the
+background under some light, {s * b : 0.45 <= s <= 1.15}, or a color of the hands or the object.
+The same rule labels the ground truth and the generated video. Its accuracy can be measured on the
+ground truth, whose ids are known.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from egosim_jax.evaluation.metrics.image import decibels
 
 SHADES = (0.45, 1.15)
-"""Range of light on a surface."""
+"""Minimum and maximum light on a surface."""
 MIN_VISIBLE_PX = 20
-"""Fewest visible pixels of an object in a frame in which it is searched."""
+"""Minimum number of pixels of an object in a frame for it to count as visible."""
 CENTROID_RADIUS = 0.12
-"""Radius around an object's median pixel within which pixels count, as a fraction of the width."""
+"""Radius around an object's median pixel for its centroid, as a fraction of the width."""
 
 
 def label(
@@ -43,10 +43,10 @@ def find(
     background: UInt8[np.ndarray, "f h w 3"],
     paints: Mapping[int, tuple[int, int, int]],
 ) -> Bool[np.ndarray, "f h w"]:
-    """Return the silhouette of one body of a video, opened.
+    """Return the opened silhouette of body `number` in a video.
 
-    A pixel belongs to it if its color is nearest to the body's, and not to that of the background,
-    a hand or any other body of `paints`, all of which may be misplaced in the video.
+    A pixel belongs to the body with the nearest color among the background and all of `paints`,
+    because hands and other bodies may also be misplaced in the video.
     """
     return open_mask(label(video, background, paints) == number)
 
@@ -54,14 +54,14 @@ def find(
 def _distance(
     pixels: Float[np.ndarray, "f h w 3"], color: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "f h w"]:
-    """Return the squared distance to a color under the light that minimizes it."""
+    """Return the squared distance to a color under the best light."""
     strength = np.maximum(np.square(color).sum(axis=-1), 1e-6)
     shade = np.clip((pixels * color).sum(axis=-1) / strength, *SHADES)
     return np.square(pixels - shade[..., None] * color).sum(axis=-1)
 
 
 def open_mask(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Return masks without lines and specks that no 3 x 3 square fits into (opening)."""
+    """Return masks without lines and specks narrower than 3 pixels (morphological opening)."""
     import cv2
 
     square = np.ones((3, 3), np.uint8)
@@ -81,7 +81,7 @@ def region_psnr(
 
 
 def silhouette_iou(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
-    """Return the IoU, averaged over the frames in which the target has pixels; else NaN."""
+    """Return the IoU, averaged over the frames with target pixels; NaN without such frames."""
     shown = target.any(axis=(1, 2))
     both = (found & target).sum(axis=(1, 2))[shown]
     either = (found | target).sum(axis=(1, 2))[shown]
@@ -93,8 +93,8 @@ def centroid_errors(
 ) -> Float[np.ndarray, " g"]:
     """Return the distances in pixels between the centroids of two silhouettes.
 
-    One for each frame in which the target has enough pixels; an empty silhouette counts as an
-    image width away.
+    There is one distance per frame with a visible target. An empty silhouette counts as one image
+    width away.
     """
     width = target.shape[2]
     shown = _visible(target)
@@ -106,18 +106,18 @@ def centroid_errors(
 
 
 def lost_share(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
-    """Return the share of the frames that show a target in which nothing was found; else NaN."""
+    """Return the fraction of frames with a visible but lost target; NaN if it is never visible."""
     shown = _visible(target)
     return float((~found[shown].any(axis=(1, 2))).mean()) if shown.any() else float("nan")
 
 
 def _visible(silhouettes: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, " f"]:
-    """Return the frames in which enough pixels are visible."""
+    """Return True for frames with enough visible pixels."""
     return silhouettes.sum(axis=(1, 2)) >= MIN_VISIBLE_PX
 
 
 def _centroid(silhouette: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
-    """Return the centroid of the pixels near the median one; stray pixels do not count."""
+    """Return the centroid of the pixels near the median pixel, without stray pixels."""
     pixels = np.argwhere(silhouette)
     gaps = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
     near = gaps <= max(CENTROID_RADIUS * silhouette.shape[1], gaps.min())

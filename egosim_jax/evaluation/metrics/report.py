@@ -1,4 +1,4 @@
-"""Scores of videos, their means and spreads, and tables of them."""
+"""Scores of videos, their means, spreads and paired differences, and printed tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Measures = Mapping[str, tuple[str, str]]
 Summary = Mapping[str, Mapping[str, float]]
 """`mean` and `spread` of each measure, by name; a measure without repetitions has no `spread`.
 
-`known` and `of` count the scores, where some are missing."""
+If scores are missing, `known` of `of` scores are valid."""
 
 
 def score(
@@ -32,9 +32,9 @@ def score(
 
 
 def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
-    """Return mean and standard deviation (n - 1) of values, ignoring those that are not finite.
+    """Return mean and standard deviation (n - 1) of the finite values.
 
-    The mean of no values is NaN, the deviation of fewer than two values 0.
+    The mean of no values is NaN; the deviation of fewer than two values is 0.
     """
     known = [value for value in values if np.isfinite(value)]
     mean = float(np.mean(known)) if known else float("nan")
@@ -44,10 +44,10 @@ def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
 def summarize(
     scores: Sequence[Mapping[str, float]], measures: Iterable[str]
 ) -> dict[str, dict[str, float]]:
-    """Return mean and spread of each measure over scores, without those that no score has.
+    """Return mean and spread over scores of each measure that any score has.
 
-    Where some scores are not finite, `known` is the number of the others and `of` that of all:
-    their mean hides what failed.
+    If some scores are not finite, `known` counts the finite ones and `of` counts all: the mean
+    alone would hide failures.
     """
     summary = {}
     for name in measures:
@@ -66,7 +66,7 @@ def paired_differences(
     reference: Sequence[Mapping[str, float]],
     measures: Iterable[str],
 ) -> dict[str, dict[str, float]]:
-    """Return `paired_difference` of each measure between two methods on the same scenes."""
+    """Return the paired difference of each measure between two methods on the same scenes."""
     return {
         measure: paired_difference(
             [found[measure] for found in scores], [found[measure] for found in reference]
@@ -84,10 +84,10 @@ def paired_difference(
 ) -> dict[str, float]:
     """Return the mean of `values - reference` over pairs and its bootstrap confidence interval.
 
-    Pairs are drawn again with replacement, with a fixed seed, and the interval is that of the
-    percentiles of their means. Pairs with NaN are ignored, and then counted as `known` and `of`;
-    fewer than two have an infinite interval. Source: Efron and Tibshirani, An Introduction to the
-    Bootstrap, 1993, section 13.3.
+    The bootstrap resamples pairs with a fixed seed; the interval is between percentiles of their
+    means. Pairs with NaN are ignored, and then counted by `known` and `of`. Fewer than two pairs
+    have an infinite interval. Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993,
+    section 13.3.
     """
     pairs = np.subtract(values, reference)
     known = pairs[~np.isnan(pairs)]
@@ -103,11 +103,11 @@ def paired_difference(
 def print_table(
     corner: str, rows: Mapping[str, Summary], measures: Measures, *, title: str | None = None
 ) -> None:
-    """Print a row for each summary, as mean ± spread; `corner` heads the column of row names.
+    """Print a row for each summary as mean ± spread; `corner` is the heading of the row names.
 
-    The cell of a missing measure is empty; a `spread_over_seeds` is appended in parentheses, an
-    interval from `low` to `high` in brackets, and the number of `known` values if it is not that of
-    all.
+    The cell of a missing measure is empty. A cell may also have `spread_over_seeds` in parentheses,
+    an interval from `low` to `high` in brackets, and the number of `known` values if some are
+    missing.
     """
     from rich.console import Console
     from rich.table import Table

@@ -1,6 +1,6 @@
-"""Accuracy of a state after an object was moved, against the object's ground-truth surface.
+"""Accuracy of a scene state after an object moved, against the object's ground-truth surface.
 
-All fractions are in percent. Source: the definitions are ours; the paper gives none for the state.
+All fractions are in percent. The definitions are ours; the paper does not evaluate the state.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 ON_SURFACE_M = 0.01
-"""Distance in meters within which a point is on a surface."""
+"""Maximum distance in meters of a point on a surface."""
 SAME_POINT_M = 0.005
-"""Distance in meters within which two points are the same."""
+"""Maximum distance in meters of two points that count as the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectAccuracy:
-    """Accuracy of the points of one object after an update, in percent."""
+    """Accuracy of the points of one object after a state update, in percent."""
 
     accurate: float
-    """Percentage of its points within 1 cm of its ground-truth surface after the move."""
+    """Percentage of the object's points within 1 cm of its ground-truth surface after the move."""
     complete: float
-    """Percentage of its observed surface within 1 cm of one of its points."""
+    """Percentage of the object's observed surface within 1 cm of one of its points."""
     ghost: float
-    """Percentage of ghost points: of those off the new surface before, the ones still there."""
+    """Percentage of earlier points off the new surface that are still present (ghost points)."""
 
 
 def object_accuracy(
@@ -35,10 +35,10 @@ def object_accuracy(
     surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]],
     seen_m: Float[np.ndarray, "k 3"],
 ) -> ObjectAccuracy:
-    """Compare an object's points before and after with its mesh and its observed surface points.
+    """Compare an object's points before and after the move with its mesh and observed surface.
 
-    `surface` and `seen_m` are at the object's pose after the move. A state without points of it is
-    neither accurate nor complete (0); an object that did not move leaves no ghost points (0).
+    `surface` and `seen_m` are at the object's pose after the move. A state without points of the
+    object has accuracy and completeness 0. An object that did not move has no ghost points (0).
     """
     off = distance_to_mesh(before_m, surface) > ON_SURFACE_M
     return ObjectAccuracy(
@@ -54,9 +54,9 @@ def symmetric_distance(
     *,
     quantile: float = 0.95,
 ) -> float:
-    """Return the larger of both quantiles of nearest-neighbor distances, in meters.
+    """Return the quantile of nearest-neighbor distances in meters, maximum of both directions.
 
-    Infinite if there are no points on either side.
+    Infinite if either set is empty.
     """
     if not len(points_m) or not len(others_m):
         return float("inf")
@@ -82,7 +82,7 @@ def distance_to_mesh(
 def nearest(
     points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance of each point to the nearest of others; infinite if there are none."""
+    """Return the distance of each point to the nearest of the others; infinite without others."""
     import open3d as o3d
 
     if not len(points_m) or not len(others_m):

@@ -1,8 +1,8 @@
-"""Camera trajectory of a generated video. The paper's Cam ERR has no formula; this is our own.
+"""Camera trajectory errors. The paper gives no formula for its Cam ERR; this definition is ours.
 
 The ground-truth scene is known at every frame. Dense optical flow from the ground-truth frame to
-the generated one maps each of its points to a pixel, and the camera that observes them there is
-found by PnP (RANSAC, then least squares). On the ground-truth frames themselves the error is 0.
+the generated frame gives a pixel for each scene point. PnP (RANSAC, then least squares) finds the
+camera that sees the points at these pixels. For the ground-truth frames themselves, the error is 0.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from egosim_jax.geometry import invert, pixel_rays, transform
 from egosim_jax.types import Cameras
 
 MAX_KEYPOINTS = 800
-"""Largest number of tracked points, those with the strongest image gradient."""
+"""Maximum number of tracked points, chosen by image gradient."""
 MIN_INLIERS = 12
-"""Fewest points of a pose."""
+"""Minimum number of points for a pose."""
 INLIER_THRESHOLD_PX = 1.0
 """Inlier threshold in pixels."""
 
@@ -32,8 +32,8 @@ def estimate_cameras(
 ) -> Float[np.ndarray, "f 4 4"]:
     """Return `world_from_camera` of each frame; NaN where too few points agree.
 
-    `depth_m` and `cameras` belong to the target frames; `still` are their static pixels, without
-    hands and the objects they act on.
+    `depth_m` and `cameras` belong to the target frames. `still` marks their static pixels, without
+    hands and manipulated objects.
     """
     import cv2
 
@@ -71,7 +71,7 @@ def _pose(
     """Return `world_from_camera` of the camera that sees the points at the pixels, or NaN."""
     import cv2
 
-    cv2.setRNGSeed(0)
+    cv2.setRNGSeed(0)  # RANSAC draws from OpenCV's global generator
     intrinsics = cameras.intrinsics_px.astype(float)
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points_m,
@@ -99,7 +99,7 @@ def camera_errors(
 ) -> tuple[float, float]:
     """Return the RMS errors of position in meters and of rotation in degrees.
 
-    Frames whose pose is not finite do not count; NaN if no pose is finite.
+    Frames without a finite pose are ignored. NaN if no pose is finite.
     """
     known = np.isfinite(world_from_camera).all(axis=(1, 2))
     if not known.any():
@@ -110,23 +110,23 @@ def camera_errors(
 
 
 class PathErrors(NamedTuple):
-    """Errors of a camera path whose unit and world are unknown, such as an estimated one."""
+    """Errors of a camera path with unknown scale and world frame, such as an estimated path."""
 
     rotation_deg: float
-    """RMS angle in degrees between the rotations since the first frame."""
+    """RMS angle in degrees between the rotations relative to the first frame."""
     translation: float
-    """RMS distance of the positions since the first frame, each path divided by its extent."""
+    """RMS distance of positions relative to the first frame, each path divided by its extent."""
     ate: float
-    """RMS distance of the positions after a least-squares scale, in units of the target."""
+    """RMS distance of the positions after a least-squares scale, in the target's unit."""
 
 
 def path_errors(
     world_from_camera: Float[np.ndarray, "f 4 4"], target: Float[np.ndarray, "f 4 4"]
 ) -> PathErrors:
-    """Return the errors of a path relative to its first camera, whatever its scale.
+    """Return the errors of a path relative to its first camera, independent of its scale.
 
-    A path's extent is the largest distance from its first camera; a path that stays there has an
-    extent of 1. Frames whose pose is not finite do not count; NaN if the first one's is not.
+    The extent of a path is the maximum distance from its first camera, or 1 if it does not move.
+    Frames without a finite pose are ignored. NaN if the first pose is not finite.
     """
     known = np.asarray(np.isfinite(world_from_camera).all(axis=(1, 2)))
     if not known[0]:
@@ -144,7 +144,7 @@ def path_errors(
 
 
 def _extent(positions: Float[np.ndarray, "f 3"]) -> float:
-    """Return the largest distance from the first camera, or 1 for a camera that stays."""
+    """Return the maximum distance from the first camera, or 1 for a camera that does not move."""
     return float(np.linalg.norm(positions, axis=1).max()) or 1.0
 
 

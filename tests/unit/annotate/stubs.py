@@ -1,4 +1,4 @@
-"""Estimators without networks for tests, and videos that they annotate in a moment."""
+"""Stub estimators for tests, and videos that they annotate quickly."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,7 +50,7 @@ class StubHands:
 
 @dataclass(frozen=True)
 class StubCameras:
-    """A camera that does not move, or none: always, or in the dark without a focal length."""
+    """A fixed camera, or no camera: always, or in dark videos without a focal length."""
 
     refuse: bool
     log: Path | None
@@ -134,7 +134,7 @@ def note(log, name):
 
 
 def textured_video(frames=17, height=48, width=80, *, seed=0, shift=1.0):
-    """Return a video of a sharp random texture that moves by `shift` pixels a frame."""
+    """Return a video of a sharp random texture that moves by `shift` pixels per frame."""
     rng = np.random.default_rng(seed)
     margin = int(np.ceil(abs(shift) * frames)) + 4
     texture = rng.integers(40, 216, (height, width + margin, 3), np.uint8)
@@ -154,5 +154,5 @@ def write(path, frames, fps=16):
 
 
 def config(**changes):
-    """Return a stub configuration that draws with the renderer in NumPy."""
+    """Return a stub configuration with the NumPy renderer."""
     return replace(StubConfig(renderer="numpy"), **changes)

@@ -22,7 +22,7 @@ ARRAYS = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m"
 
 @dataclass(frozen=True, kw_only=True)
 class RoomConfig(AnnotateConfig):
-    """The real estimators, but for the hands, of which the room has none."""
+    """The real estimators, except for hands: the room shows no hands."""
 
     def build(self) -> Estimators:
         """Return the estimators."""

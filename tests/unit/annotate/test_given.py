@@ -1,4 +1,4 @@
-"""Recordings of which cameras, hands or depth are known: these are taken, not estimated."""
+"""Recorded cameras, hands and depth are used instead of estimates."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -21,7 +21,7 @@ ARRAYS = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m"
 
 @pytest.fixture
 def recording(tmp_path):
-    """A recording of 17 frames whose camera moves to the right by a centimeter a frame."""
+    """A recording of 17 frames; the camera moves to the right by 1 cm per frame."""
     path = write(tmp_path / "source.mp4", textured_video(17))
     poses = np.tile(np.eye(4), (17, 1, 1))
     poses[:, 0, 3] = 0.01 * np.arange(17)

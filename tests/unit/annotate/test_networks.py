@@ -15,7 +15,7 @@ from tests.unit.perception.networks import tiny
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig(AnnotateConfig):
-    """The networks that are asked for, hands and cameras from stubs."""
+    """The chosen networks; hands and cameras from stubs."""
 
     def build(self) -> Estimators:
         """Return the estimators."""

@@ -100,7 +100,7 @@ def test_videos_of_one_name_take_their_folders(tmp_path):
     assert [s.name for s in found] == ["x_take", "y_take"]
     write(tmp_path / "x_take.mp4", frames)
     write(tmp_path / "deeper/x/take.mp4", frames)
-    with pytest.raises(InputError, match="one id"):
+    with pytest.raises(InputError, match="with the same id"):
         find_sources([tmp_path])
 
 

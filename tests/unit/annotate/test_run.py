@@ -229,7 +229,7 @@ def test_long_videos_are_cut_into_clips(tmp_path):
 
 
 def test_killed_runs_continue(video, tmp_path):
-    """A process is killed while it annotates; the same command gives what one run gives."""
+    """After a process is killed, the same command gives the result of one run."""
     write(tmp_path / "dish.mp4", textured_video(17, seed=3))
     program = f"""
 import os, sys

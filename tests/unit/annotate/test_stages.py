@@ -75,7 +75,7 @@ def test_all_hands_are_of_the_given_side(tmp_path):
 
 @dataclass(frozen=True)
 class MirroredHands:
-    """The stub's hand, whose joints are those of the other side in some of nine frames."""
+    """The stub's hand, with the joints of the other side in some of nine frames."""
 
     frames: int
 

@@ -222,7 +222,7 @@ def test_packing_over_other_files_is_refused(clips, out):
 
 
 def refused(command, capsys):
-    """Exit code, and the last of what is printed, which must not be a traceback."""
+    """Return the exit code and the last error line, which must not be in a traceback."""
     code = run_with_exit_codes(command.run)
     error = capsys.readouterr().err
     assert "Traceback" not in error

@@ -55,5 +55,5 @@ def test_an_action_file_that_is_wrong_is_refused(own, fields, message):
 @pytest.mark.parametrize("option", [{"clips": 2}, {"seed": 0}, {"robot": True}])
 def test_options_of_the_tabletop_world_are_refused_with_own_actions(own, tmp_path, option):
     name = next(iter(option))
-    with pytest.raises(InputError, match=f"--{name} is of the tabletop world"):
+    with pytest.raises(InputError, match=f"--{name} is for the tabletop world"):
         MakeEpisode(out=tmp_path / "out", actions=(own(),), **option).run()

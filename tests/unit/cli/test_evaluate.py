@@ -27,7 +27,7 @@ def run(clips, tmp_path):
 
 @pytest.fixture(autouse=True)
 def network(monkeypatch):
-    """Return a network of LPIPS, of few channels; the code of the tests is not optimized."""
+    """Return a small LPIPS network, because test programs are compiled without optimization."""
     stage = (lpips.Convolution(features=4),)
     alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
     found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
@@ -213,7 +213,7 @@ def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, r
     for folder in (run, small):
         Evaluate(generated=(str(folder),), page_clips=0, metadata=clips, size="target").run()
     assert json.loads((small / "report.json").read_text())["protocol"]["pixels"] == ["48x32"]
-    for method in ("prior", "still"):  # of which neither depends on what was generated
+    for method in ("prior", "still"):  # neither depends on the generated clips
         assert metrics(small)["clip0"][method] == metrics(run)["clip0"][method]
     Evaluate(generated=(str(small),), page_clips=0, metadata=clips).run()
     assert metrics(small)["clip0"]["prior"] != metrics(run)["clip0"]["prior"]

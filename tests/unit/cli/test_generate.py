@@ -1,4 +1,4 @@
-"""`egosim generate`: input that is refused before anything is compiled."""
+"""`egosim generate`: invalid input is refused before compilation."""
 
 from dataclasses import replace
 from functools import partial

@@ -1,4 +1,4 @@
-"""`egosim models`: from a release on a hub to weights that the generator loads."""
+"""`egosim models`: from a release on a hub to loadable weights."""
 
 import json
 
@@ -24,7 +24,7 @@ FILES = configs.release("egosim_14b").files
 
 @pytest.fixture
 def served(tmp_path, monkeypatch):
-    """A release of `debug` with the files of EgoSim-14B."""
+    """A release of `debug` in the file layout of EgoSim-14B."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     ours, folder = tmp_path / "ours", tmp_path / "hub"
     write_weights(ours, configs.get("debug"))

@@ -1,4 +1,4 @@
-"""`egosim simulate`: the table of scores."""
+"""`egosim simulate`: refused options and the table of scores."""
 
 import pytest
 

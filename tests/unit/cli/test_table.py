@@ -1,4 +1,4 @@
-"""`egosim table`: any folders of clips in the papers' tables, their files and their cache."""
+"""`egosim table`: folders of clips in the papers' tables, output files and cache."""
 
 import csv
 import dataclasses
@@ -23,7 +23,7 @@ from egosim_jax.types import InputError
 
 @pytest.fixture(autouse=True)
 def network(monkeypatch):
-    """Use a network of few channels for LPIPS."""
+    """Use a small network for LPIPS."""
     stage = (lpips.Convolution(features=4),)
     alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
     found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
@@ -43,7 +43,7 @@ def metadata(make_clips):
 
 @pytest.fixture
 def folders(metadata, tmp_path):
-    """Folders of two methods, the second one's clips in a subfolder of their dataset."""
+    """Folders of two methods; the second has its clips in a subfolder of their dataset."""
     for number, dataset in enumerate(("egodex", "egodex", "egovid")):
         target = target_of(metadata, f"clip{number}")
         write_video(tmp_path / "near" / f"clip{number}.mp4", target // 2 + 60 + 3 * number, 16)

@@ -188,7 +188,7 @@ def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, fixed, tmp_path):
     assert command.run() == 0
     (files,) = read_metadata(tmp_path / "out" / "metadata.csv")
     assert probe_video(files.target).fps == probe_video(files.prior).fps == rate
-    with pytest.raises(InputError, match=r"29\.97 frames per second, not 8: .*Leave it out"):
+    with pytest.raises(InputError, match=r"29\.97 frames per second, not 8: .*Omit --fps"):
         replace(command, fps=8).run()
 
 
@@ -214,7 +214,7 @@ def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
     assert rate("videos") == 24
     assert rate("rate") == 8
     assert rate("frames", fps=12) == 12
-    with pytest.raises(InputError, match="do not say their frame rate: give it"):
+    with pytest.raises(InputError, match="have no frame rate: give it"):
         rate("frames")
     for name, have in (("videos", 24), ("rate", 8)):
         with pytest.raises(InputError, match=f"have {have} frames per second, not 30"):

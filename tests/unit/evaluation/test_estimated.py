@@ -1,4 +1,4 @@
-"""Measures of estimates, with estimators of known results."""
+"""Measures from estimates, with estimators of known results."""
 
 from types import SimpleNamespace
 
@@ -68,7 +68,7 @@ def test_other_masks_and_hands_make_other_cached_scores(truth):
 
 
 def depth_of(scale, metric):
-    """Return an estimator of depth that is the green level in some unit."""
+    """Return an estimator whose depth is the green level in some unit."""
 
     def estimate(frames, moving, cameras, wanted):
         depth = scale * (1 + frames[list(wanted)][..., 1].astype(np.float32))
@@ -94,7 +94,7 @@ def test_metric_depth_is_not_rescaled(truth, metric, expected):
 
 
 def cameras_by_level(frames, moving, **_):
-    """Return cameras that move by the mean blue level, or none for a black video."""
+    """Return cameras that move by the mean blue level; None for a black video."""
     if not frames.any():
         cameras = None
     else:

@@ -1,4 +1,4 @@
-"""Shifts between videos: the known one is found, and undoing it raises the PSNR."""
+"""A known shift between videos is found, and undoing it raises the PSNR."""
 
 import numpy as np
 import pytest

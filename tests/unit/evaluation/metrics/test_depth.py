@@ -1,4 +1,4 @@
-"""Depth errors against figures worked out by hand."""
+"""Depth errors against hand-computed values."""
 
 import numpy as np
 import pytest

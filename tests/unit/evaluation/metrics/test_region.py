@@ -93,7 +93,7 @@ def test_an_object_is_lost_in_the_frames_that_show_it_where_nothing_was_found():
 
 @pytest.mark.parametrize(("kind", "least"), [("human", 0.85), ("robot", 0.75)])
 def test_the_metrics_find_hands_and_objects_in_the_ground_truth(kind, least):
-    """Less well those of a gray gripper over a table of slate."""
+    """A gray gripper over a slate table is found less well."""
     spec = VideoSpec(frames=5, height=96, width=160)
     for seed in (100, 101, 102):
         clip, bare = (

@@ -1,4 +1,4 @@
-"""Estimated cameras, for ground-truth frames taken for one another."""
+"""Camera errors of ground-truth frames, in order and exchanged."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_the_ground_truth_has_its_own_cameras(clip):
 
 
 def test_a_video_from_elsewhere_has_the_cameras_there(clip):
-    """Each frame is taken for the one after it."""
+    """Each frame replaces the previous frame."""
     late = np.concatenate([clip.frames[1:], clip.frames[-1:]])
     truth = clip.cameras.world_from_camera
     found = estimate_cameras(late, clip.frames, clip.depth_m, still(clip), clip.cameras)[:-1]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from egosim_jax.cli.table import TableCommand
-from egosim_jax.evaluation.metrics.frechet import frechet_distance
+from egosim_jax.evaluation.fvd import frechet_distance
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.perception.networks import VideoMae, close_workers
 from egosim_jax.types import InputError

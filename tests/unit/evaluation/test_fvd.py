@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
-from egosim_jax.evaluation.metrics.frechet import frechet_distance
+from egosim_jax.evaluation.fvd import frechet_distance
 
 
 def test_a_shift_costs_its_square():
