@@ -13,14 +13,14 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jax.sharding import Mesh
 
-from egosim_jax.conditioning.baselines import DROPPED, Baseline, with_hand_mask
+from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.lora import check_base
 from egosim_jax.data.clips import Policy, check_clip, load_triplet
@@ -35,9 +35,26 @@ from egosim_jax.io.digest import sha256_within
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.rendering.mesh import hand_mask
 from egosim_jax.sharding import check_batch, make_mesh, parts
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet
 
+Baseline = Literal["no_hands", "hand_mask", "sdedit"]
+"""Baseline that uses a model's weights with other conditions.
+
+    no_hands    no hands: a video model of the scene alone (Wan-InP in EgoSim)
+    hand_mask   silhouettes of the hands (DWM, Table 3)
+    sdedit      from the noised prior, without prior, mask and hands (SDEdit, Meng et al. 2022; CVX
+                SDEdit in DWM, Table 1)
+
+The papers also train the models of the first two this way; weights trained with hands lose more.
+"""
+DROPPED: dict[Baseline, ConditionName | None] = {
+    "no_hands": "hands", "hand_mask": None, "sdedit": "hands",
+}  # fmt: skip
+"""Condition that a baseline drops; a model with a `strength` drops prior and mask itself."""
+STRENGTH = 0.75
+"""Default fraction of the steps that SDEdit runs (DWM)."""
 SHEET_CLIPS = 6
 """Maximum number of clips on the contact sheet."""
 SHEET_COLUMNS = 6
@@ -319,7 +336,7 @@ class BatchJob:
         self, generator: Generator, triplets: Sequence[Triplet], seeds: Sequence[int]
     ) -> list[Clip]:
         if self.baseline == "hand_mask":
-            triplets = [with_hand_mask(triplet) for triplet in triplets]
+            triplets = [replace(triplet, hands=hand_mask(triplet.hands)) for triplet in triplets]
         return generator.generate(triplets, seeds, without=self.baseline and DROPPED[self.baseline])
 
     def _write(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Key, UInt32
 
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.conditioning.image import clip_pixels
+from egosim_jax.conditioning.pixels import clip_pixels, to_model
 from egosim_jax.conditioning.posterior import (
     EncodingNoise,
     NormalizedCodec,
@@ -25,7 +25,6 @@ from egosim_jax.conditioning.posterior import (
     draw,
     posterior,
 )
-from egosim_jax.conditioning.video import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.sharding import replicate_params
 from egosim_jax.types import InputError, Triplet

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Key, UInt8
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
-from egosim_jax.conditioning.video import to_model, to_uint8
+from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
@@ -206,7 +206,7 @@ class Generator:
     ) -> list[Clip]:
         """Generate one clip for each triplet, from the noise of its seed.
 
-        `without` hides one condition, as training does (`conditioning/dropout.py`). Raises
+        `without` hides one condition, as training does (`conditioning/condition.py`). Raises
         `InputError` if a mesh does not divide the batch, and `NonFiniteError` naming the clips
         whose latents are not finite.
         """

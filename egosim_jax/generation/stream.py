@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, UInt8
 
-from egosim_jax.conditioning.video import to_uint8
+from egosim_jax.conditioning.pixels import to_uint8
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.generator import Generator
 from egosim_jax.types import Action, Triplet, View, check_seed

@@ -6,9 +6,7 @@ import os
 import shlex
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from types import FrameType
 
 
@@ -22,19 +20,6 @@ def ignore() -> None:
     """Ignore Ctrl-C from now on; a program calls this when its work is done."""
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-@contextmanager
-def not_inherited() -> Iterator[None]:
-    """Make child processes that are started in this context ignore Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def print_how_to_continue() -> None:
