@@ -257,7 +257,7 @@ def test_a_changed_file_of_a_finished_phase_is_named(tmp_path):
     "bad", [lambda *a: np.zeros((4, 48, 80, 3), np.uint8), lambda *a: np.zeros((5, 48, 80, 3))]
 )
 def test_a_generator_that_returns_other_frames_is_refused(tmp_path, bad):
-    with pytest.raises(InputError, match="must return as many frames of the same size"):
+    with pytest.raises(InputError, match="must return the same number of frames, of the same size"):
         run(tmp_path, generator=bad)
 
 
