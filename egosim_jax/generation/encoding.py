@@ -40,7 +40,7 @@ Batch = Mapping[str, Any]
     seeds                seeds of the model's `encoding_noise`, uint32 `b`
 """
 SOLVER_NOISE, PRIOR_NOISE, HANDS_NOISE = 1, 2, 3
-"""Uses of a seed, each with a key of its own; the initial noise uses the seed's key itself."""
+"""Uses of a seed, each with another key; the initial noise uses the seed's key itself."""
 
 
 def pack(

@@ -32,7 +32,7 @@ ROWS = 64
 COMPUTING = 2
 """Warpgroups of the kernel that compute, besides the one that loads."""
 BLOCK = 128
-"""Keys at a time: with more, accumulators do not fit the registers."""
+"""Keys of a block: with more, accumulators do not fit the registers."""
 STAGES = 2
 """Blocks of keys and values in shared memory."""
 MANY_KEYS = 8 * BLOCK
@@ -113,7 +113,7 @@ def _tile(
     queries_here: Any,
     **memory: Any,
 ) -> None:
-    """All of a block of threads: each warpgroup takes its part."""
+    """Body of a block of threads: each warpgroup runs its part."""
     warpgroup, head, sample = (lax.axis_index(x) for x in ("warpgroup", "head", "sample"))
 
     @pl.when(warpgroup < COMPUTING)
@@ -160,7 +160,7 @@ def _walk(
     keys_done: Any,
     values_done: Any,
 ) -> jax.Array:
-    """One warpgroup's way over all keys; `o` accumulates. Returns the output in float32."""
+    """Loop of one warpgroup over all keys; `o` accumulates. Return the output in float32."""
     scores = partial(pl.run_scoped, s=gpu.ACC((ROWS, BLOCK), jnp.float32))
     across = lambda x: lax.broadcast_in_dim(x, (ROWS, BLOCK), (0,))  # noqa: E731
     over = lambda x: lax.broadcast_in_dim(x, o.shape, (0,))  # noqa: E731

@@ -1,4 +1,4 @@
-"""Calls of a function in worker processes that start without the parent's state."""
+"""Calls of a function in worker processes that do not inherit the parent's state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 THREADS = "OPENBLAS_NUM_THREADS"
-"""Variable that a library of linear algebra reads when it is imported."""
+"""Environment variable that OpenBLAS reads when it is imported."""
 
 
 def run_in_processes(
@@ -37,9 +37,9 @@ def run_in_processes(
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Give processes that are started in this context one thread of linear algebra, if not set.
+    """Give child processes that start in this context one OpenBLAS thread, unless it is set.
 
-    Two processes that share the cores by threads take twice as long.
+    If each process has a thread per core, two processes take twice as long.
     """
     if THREADS in os.environ:
         yield

@@ -121,7 +121,7 @@ def _last_visible_frame(seen: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f 
 
 
 def apply_motion(state: SceneState, perceived: Perceived, disappeared: set[int]) -> _Points:
-    """Return the state's points at the clip's end, without those of disappeared objects."""
+    """Return the state's points at the clip's end, without disappeared objects."""
     points = state.points_m.copy()
     for number, path in perceived.world_from_object.items():
         before = state.world_from_object.get(number, np.eye(4))

@@ -51,7 +51,7 @@ class MotionDiTConfig(CogVideoXDiTConfig):
         return MotionDiT(self, rngs=rngs)
 
     def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
-        """Count a forward pass of one sample, with the poses of `image` pixel frames.
+        """Return the FLOPs of a forward pass of one sample, with poses of `image` pixel frames.
 
         To CogVideoX's, with P poses of width p, F latent frames, a time embedding of width e and L
         blocks of width d, they add

@@ -84,7 +84,7 @@ class CogVideoXVAEConfig:
             )
 
     def check_frames(self, frames: int) -> None:
-        """Raise `InputError` unless a video of so many frames divides into chunks."""
+        """Raise `InputError` unless the number of frames divides into chunks."""
         unit = CHUNK * self.temporal_stride
         if frames % unit != 1:
             below = max(1, (frames - 1) // unit * unit + 1)

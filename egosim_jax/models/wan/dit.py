@@ -64,7 +64,7 @@ class WanDiTConfig(WanDiTSizes):
         return WanDiT(self, rngs=rngs)
 
     def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
-        """Count a forward pass of one sample, of so many latent cells, text and image tokens.
+        """Return the FLOPs of a forward pass of one sample, by its latent cells and tokens.
 
         With N tokens of width d, an MLP of width f, T text and I image tokens and L blocks, it has
 
