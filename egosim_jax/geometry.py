@@ -34,7 +34,7 @@ def invert(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]
 def project(intrinsics_px: Float[Any, "3 3"], points: Float[Any, "*b n 3"]) -> tuple[Any, Any]:
     """Project points in camera coordinates; return columns and rows in pixels, each `*b n`.
 
-    Check z first: points at depth 0 give infinity or NaN, and points behind the camera are mirrored.
+    Check z first: points at depth 0 give infinity or NaN, points behind the camera are mirrored.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     focal_x, focal_y = intrinsics_px[0, 0], intrinsics_px[1, 1]

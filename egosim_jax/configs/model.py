@@ -177,7 +177,7 @@ class ModelConfig:
         return self.zero_image_tokens or (0 if self.image is None else self.image.tokens)
 
     def given_image(self, triplets: Sequence[Triplet]) -> Float[np.ndarray, "b m e"] | None:
-        """Return the image tokens of clips: their own or zeros; None without `zero_image_tokens`."""
+        """Return the image tokens of clips, or zeros; None without `zero_image_tokens`."""
         zeros = self.zero_image(len(triplets))
         if zeros is None:
             return None

@@ -4,8 +4,8 @@ With a process of `process.py`, x_t = alpha(t) x0 + sigma(t) e, one sample's err
 
     L(t) = mean | f(x_t, timestep(t)) - target |^2
 
-The target is the quantity that the network predicts, such as e - x0 for a velocity. The loss is E[w(t) L(t)] over
-e ~ N(0, 1) and one of these draws of the time t:
+The target is the quantity that the network predicts, such as e - x0 for a velocity. The loss is
+E[w(t) L(t)] over e ~ N(0, 1) and one of these draws of the time t:
 
     uniform       u ~ U(0, 1),                         t = t(u),   w = 1
     logit-normal  u = 1 / (1 + exp(-z)), z ~ N(m, s),  t = t(u),   w = 1
@@ -16,7 +16,7 @@ e ~ N(0, 1) and one of these draws of the time t:
                   minimum and mean over the 1000 times (the training schedule of DiffSynth, on
                   which the EgoSim release is built)
 
-where t(u) is the process's `warp`, the shift of a rectified flow. The mean of L may weight the
+Here t(u) is the process's `warp`, the shift of a rectified flow. The mean of L may weight the
 locations of a sample. Elements whose |f - target| exceeds a bound may count as 0 (DWM-Wan's
 trainer, at 50), so one corrupt value does not spoil an update.
 """

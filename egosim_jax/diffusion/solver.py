@@ -86,7 +86,7 @@ def integrate(
     """Turn noise into latents, one network evaluation a step: one scan, no host round trips.
 
     `steps` is the number of steps, or the timesteps to visit. `keys`, one for each sample, draw the
-    noise of a stochastic solver: that of step i comes from `fold_in(key, i)`.
+    noise of a stochastic solver; step i uses `fold_in(key, i)`.
     """
     times = process.times(steps)
     timesteps = process.timesteps(times[:-1]).astype(np.float32)

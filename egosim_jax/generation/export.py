@@ -17,6 +17,9 @@ from egosim_jax.state.ply import has_triangles, read_triangles
 from egosim_jax.state.snapshot import load, read_ply
 from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, check_video
 
+POINT_PX = 2
+"""Size of the points of a rendered prior, in pixels."""
+
 
 def write_conditions(
     folder: Path | str,
@@ -34,7 +37,7 @@ def write_conditions(
     The first frame defaults to the view's. Raises `InputError` if the first camera sees none
     of the state, and for a `video_id` that is not a valid file name.
     """
-    view = renderer.render(state, action.cameras, point_px=2)
+    view = renderer.render(state, action.cameras, point_px=POINT_PX)
     triplet = Triplet(
         video_id=video_id,
         prompt=action.prompt,
@@ -56,7 +59,7 @@ def static_of(scene: Path, cameras: Cameras) -> Static:
         state = read_ply(scene)
         return draw_scene(state.points_m, read_triangles(scene), state.colors, cameras)
     state = read_ply(scene) if scene.suffix == ".ply" else load(scene)
-    view = jitted.render(state, cameras, point_px=2)
+    view = jitted.render(state, cameras, point_px=POINT_PX)
     return view.frames, view.mask
 
 

@@ -283,7 +283,7 @@ class WanVAE(nnx.Module):
 
         `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
         returns. Afterwards the means have mean 0 and deviation 1, the log variances shrink by 2 log
-        std, and decoding what is encoded gives the same video as before.
+        std, and a decoded encoding is the same video as before.
         """
         encode, decode = self.to_moments, self.from_latents
         encode_bias, decode_bias = cast(nnx.Param, encode.bias), cast(nnx.Param, decode.bias)
