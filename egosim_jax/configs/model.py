@@ -220,7 +220,7 @@ class ModelConfig:
 
     @property
     def cached_networks(self) -> tuple[Name, ...]:
-        """Names of the networks whose outputs training the denoiser caches."""
+        """Names of the networks whose outputs are cached before the denoiser is trained."""
         return tuple(name for name in self.networks if name not in self.trained_networks)
 
     def at(self, folder: Path) -> ModelConfig:

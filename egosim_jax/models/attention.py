@@ -34,15 +34,16 @@ from egosim_jax.types import InputError
 Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
 """Attention kernel.
 
-`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`); `cudnn`
-is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only); `hopper` is the inference kernel of
-H100 and H200, replaced by cuDNN's where it does not apply, as under differentiation; `splash` runs
-on TPUs (elsewhere it is interpreted, for tests); `auto` picks the device's kernel if it applies."""
+    xla      runs anywhere; computes a few heads at a time to save memory (`SCORES`)
+    cudnn    flash kernel of NVIDIA GPUs, for bfloat16 and float16
+    hopper   inference kernel of H100 and H200; cuDNN's where it does not apply, as in training
+    splash   flash kernel of TPUs; interpreted elsewhere, for tests
+    auto     the device's kernel if it applies
+"""
 SCORES = 2**26
 """Bytes of scores that the `xla` kernel computes at a time, or one head's if these are more.
 
-The heads of a small model are computed all at once, which is faster. The heads of a long video
-are computed one by one.
+A small model's heads are computed all at once, which is faster; a long video's, one by one.
 """
 SELF_ATTENTION = "self_attention"
 """Checkpoint name of the residuals that a kernel's backward pass needs."""

@@ -7,8 +7,8 @@ sum l of a row, in base 2,
     s  = scale · log2(e) · q kᵀ,   t' = max(t, max s),   p = 2^(s - t')
     l <- 2^(t - t') l + sum p,     o <- 2^(t - t') o + p v,          out = o / l
 
-so that the scores are never in memory. The tensor cores are given the next block's scores and this
-block's p v together, and the exponentials of the next block are taken while p v is under way
+so the scores are never in memory. The tensor cores get the next block's scores and this block's
+p v together; the exponentials of the next block are computed while p v runs
 (Shah et al. 2024, "FlashAttention-3", section 3.2).
 """
 
@@ -30,13 +30,13 @@ from egosim_jax.models import flash
 ROWS = 64
 """Queries of a warpgroup: the height of Hopper's matrix instructions."""
 COMPUTING = 2
-"""Warpgroups of the kernel that compute, besides the one that loads."""
+"""Number of computing warpgroups; one more loads."""
 BLOCK = 128
 """Keys of a block: with more, accumulators do not fit the registers."""
 STAGES = 2
 """Blocks of keys and values in shared memory."""
 MANY_KEYS = 8 * BLOCK
-"""From here on, filling the pipeline costs less than it gains over cuDNN."""
+"""Number of keys from which the kernel is faster than cuDNN, despite filling its pipeline."""
 REGISTERS = {"computing": 240, "fetching": 24}
 """Registers of a thread, by the kind of its warpgroup."""
 
@@ -45,7 +45,7 @@ Keys = Float[Array, "b m h k"]
 
 
 def attend(q: Queries, k: Keys, v: Keys, *, scale: float) -> Queries:
-    """Attend, in bfloat16 or float16 with float32 sums; by cuDNN where the kernel does not fit."""
+    """Attend in bfloat16 or float16 with float32 sums; by cuDNN if the kernel does not fit."""
     return _attend(q, k, v, scale) if fits(q, k) else flash.cudnn(q, k, v, scale=scale)
 
 

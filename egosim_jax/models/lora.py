@@ -166,8 +166,8 @@ def start(
     """Add trainable low-rank changes to the linear layers that match `targets`, in place.
 
     A is drawn as PEFT does, uniformly from ±1 / sqrt(in) (Kaiming's with a = sqrt(5)), and B is 0,
-    so that nothing changes before the first update. Raises `InputError` if no linear layer matches
-    `targets`, or no weight a pattern of `also_train`.
+    so the network does not change before the first update. Raises `InputError` if no linear layer
+    matches `targets`, or no weight matches a pattern of `also_train`.
     """
     if rank < 1:
         raise InputError(f"The rank of a LoRA must be at least 1, not {rank}.")

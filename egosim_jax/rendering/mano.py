@@ -116,8 +116,8 @@ class ManoPoses:
         if broken.any() or not np.isfinite(self.betas).all():
             frame, hand = np.argwhere(broken)[0].tolist() if broken.any() else (0, 0)
             raise InputError(
-                f"Hand {hand} of frame {frame} has parameters that are not finite and others that "
-                "are: give all of a hand, or NaN for all where it is missing. (--mano-poses)"
+                f"Hand {hand} of frame {frame} is only partly finite: give all parameters of a "
+                "hand, or NaN for all where it is missing. (--mano-poses)"
             )
 
     @property

@@ -143,8 +143,8 @@ class Action:
         if broken.any():
             frame, hand = np.argwhere(broken)[0].tolist()
             raise InputError(
-                f"Hand {hand} of frame {frame} has joints that are not finite and others that are: "
-                "give all joints of a hand, or NaN for all where it is missing."
+                f"Hand {hand} of frame {frame} is only partly finite: give all joints of a hand, or "
+                "NaN for all where it is missing."
             )
         if given.any():
             self._check_size(joints, given)
@@ -285,6 +285,6 @@ class GroundTruth:
         for number, motion in (self.motions or {}).items():
             if np.shape(motion) != (shape[0], 4, 4) or not is_rigid(np.asarray(motion)).all():
                 raise InputError(
-                    f"The ground-truth motion of object {number} is of shape {np.shape(motion)}: "
+                    f"The ground-truth motion of object {number} has shape {np.shape(motion)}: "
                     f"it must be one finite rigid transform per frame, ({shape[0]}, 4, 4)."
                 )

@@ -229,8 +229,8 @@ class WanVAE(nnx.Module):
     def encode(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
         """Return normalized mean latents, float32; frames are coded in groups of 1, 4, 4, ...
 
-        Raises `InputError` unless the video is of floats (in [-1, 1]) and has 4k+1
-        frames of a size in multiples of 8.
+        Raises `InputError` unless the video has floats (in [-1, 1]) and 4k+1 frames with a height
+        and width in multiples of 8.
         """
         self._check(video)
         first, cache = self.encoder(video[:, :1], None)
