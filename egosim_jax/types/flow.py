@@ -143,8 +143,8 @@ class Action:
         if broken.any():
             frame, hand = np.argwhere(broken)[0].tolist()
             raise InputError(
-                f"Hand {hand} of frame {frame} is only partly finite: give all joints of a hand, or "
-                "NaN for all where it is missing."
+                f"Hand {hand} of frame {frame} is only partly finite: give all joints of a hand, "
+                "or NaN for all where it is missing."
             )
         if given.any():
             self._check_size(joints, given)
