@@ -75,7 +75,7 @@ def test_each_clip_starts_from_the_state_that_the_last_one_left(tmp_path):
 def test_a_state_that_no_camera_looks_at_is_refused(tmp_path):
     state = clips()[0].state
     behind = replace(state, points_m=state.points_m + np.float32([0, -50, 0]))
-    with pytest.raises(InputError, match=r"None of the .* points of the scene is seen"):
+    with pytest.raises(InputError, match=r"None of the .* points of the scene is visible"):
         list(Rollout(simulator(), tmp_path).run(behind, [to_action(clips()[0])], seed=0))
     assert not any(tmp_path.rglob("*.npz"))
 
