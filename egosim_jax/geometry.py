@@ -34,7 +34,7 @@ def invert(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]
 def project(intrinsics_px: Float[Any, "3 3"], points: Float[Any, "*b n 3"]) -> tuple[Any, Any]:
     """Project points in camera coordinates; return columns and rows in pixels, each `*b n`.
 
-    Points at depth 0 give infinity or NaN, those behind the camera are mirrored: check z first.
+    Check z first: points at depth 0 give infinity or NaN, points behind the camera are mirrored.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     focal_x, focal_y = intrinsics_px[0, 0], intrinsics_px[1, 1]
@@ -59,7 +59,7 @@ def pixels_of(
 def pixel_rays(
     intrinsics_px: Float[np.ndarray, "3 3"], *, height: int, width: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return the ray of each pixel in camera coordinates, with z = 1: times depth, a point."""
+    """Return the ray of each pixel in camera coordinates, with z = 1; ray x depth is a point."""
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     x = (columns - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
     y = (rows - intrinsics_px[1, 2]) / intrinsics_px[1, 1]

@@ -39,7 +39,7 @@ ACTIVATIONS: Mapping[str, tuple[str, ...]] = {
 
 
 def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
-    """Return a data x fsdp x context mesh of devices, by default of all.
+    """Return a data x fsdp x context mesh of devices, by default all devices.
 
     Raises `InputError` if the sizes do not fit the number of devices.
     """
@@ -51,11 +51,11 @@ def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
         raise InputError(
             f"A mesh of data {config.data} x fsdp {config.fsdp} x context {config.context} does "
             f"not fit {len(devices)} devices: the product of the axes must be the number of "
-            "devices, and only one of them may be -1, which takes the remaining ones. "
+            "devices, and only one of them may be -1, which takes the remaining devices. "
             "(--mesh.data, --mesh.fsdp, --mesh.context; in training, after the stage's name)"
         )
     axes = ("data", "fsdp", "context")
-    # `jax.make_mesh` would refuse axes that split one of a TPU's torus.
+    # `jax.make_mesh` refuses mesh axes that split a physical axis of a TPU's torus.
     arranged = mesh_utils.create_device_mesh(shape, devices, allow_split_physical_axes=True)
     return Mesh(arranged, axes, axis_types=(AxisType.Auto,) * 3)
 
@@ -139,7 +139,7 @@ def state_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:
 def _fitting(
     mesh: Mesh | AbstractMesh, shape: tuple[int, ...], axes: tuple[str | None, ...]
 ) -> PartitionSpec:
-    """Return the mesh axes of the rules, each used once, where they divide the array."""
+    """Return the mesh axes of the rules; each is used once, and only where it divides the array."""
     used: set[str] = set()
     found: list[tuple[str, ...] | None] = []
     for size, axis in zip(shape, axes, strict=True):
@@ -153,9 +153,9 @@ def _fitting(
 
 
 def shard_params(networks: Module, mesh: Mesh | None) -> Module:
-    """Return networks with their weights sharded over a mesh; unchanged without one.
+    """Return networks with their weights sharded over a mesh; unchanged without a mesh.
 
-    The weights may be shapes, which then get the shardings.
+    Weights that are only shapes get the shardings.
     """
     if mesh is None:
         return networks
@@ -164,7 +164,7 @@ def shard_params(networks: Module, mesh: Mesh | None) -> Module:
 
 
 def _put(leaf: Any, sharding: Any) -> Any:
-    """Return an array placed by a sharding; of a shape, the shape with that sharding."""
+    """Place an array by a sharding; give a shape the sharding."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
     return jax.device_put(leaf, sharding)

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 
+from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.conditioning.posterior import STD
-from egosim_jax.conditioning.video import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.clips import load_triplet

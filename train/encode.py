@@ -31,9 +31,9 @@ from flax import nnx
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
+from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.conditioning.posterior import STD
 from egosim_jax.conditioning.posterior import posterior as moments_of
-from egosim_jax.conditioning.video import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.loader import Loader
 from egosim_jax.data.manifest import MANIFEST, read_manifest

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig

@@ -23,7 +23,7 @@ import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
 
-from egosim_jax.conditioning.video import to_uint8
+from egosim_jax.conditioning.pixels import to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.records import Record

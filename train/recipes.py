@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from dataclasses import replace
 
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.fine_tuning import FineTuning
 from egosim_jax.train.from_scratch import FromClips, FromTabletop

@@ -193,8 +193,8 @@ class Generate:
     def _model(self) -> ModelConfig:
         """Return the model config with the options applied."""
         from egosim_jax import configs
-        from egosim_jax.conditioning.baselines import STRENGTH
         from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
+        from egosim_jax.generation.batch import STRENGTH
 
         config = configs.get(self.config)
         config = config if self.sampling is None else configs.sampled(config, self.sampling)

@@ -11,12 +11,10 @@ Every rule that training and generation must share is here, once. Encoding by ne
     to_model, to_uint8   pixels between uint8 and [-1, 1]
 """
 
-from egosim_jax.conditioning.condition import Condition
-from egosim_jax.conditioning.dropout import ConditionDropout
-from egosim_jax.conditioning.image import clip_pixels
+from egosim_jax.conditioning.condition import Condition, ConditionDropout
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.conditioning.mask import pack_mask
-from egosim_jax.conditioning.video import to_model, to_uint8
+from egosim_jax.conditioning.pixels import clip_pixels, to_model, to_uint8
 
 __all__ = [
     "ChannelLayout",

@@ -1,4 +1,6 @@
-"""Conditioning inputs of the denoiser, and the value of a dropped one.
+"""Conditioning inputs of the denoiser, and classifier-free dropout of them.
+
+A dropped input has this value:
 
     prior   latents 0 and mask 1: nothing was observed, everything is to be generated
     mask    0: everything counts as observed, as in the EgoSim release without a mask file;
@@ -7,17 +9,21 @@
     text    embeddings 0, as the continuous runner of the EgoSim release has for an empty prompt;
             CogVideoX: the embeddings of `unconditional_prompt`
 
-The CLIP tokens of the first frame are never dropped.
+The CLIP tokens of the first frame are never dropped. If prior and mask are both dropped, the mask
+is 1: nothing was observed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal, no_type_check
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Key
+
+from egosim_jax.diffusion.objective import sample_keys
+from egosim_jax.types import InputError
 
 Name = Literal["prior", "mask", "hands", "text"]
 """Condition that can be dropped."""
@@ -62,3 +68,37 @@ def _fill(x: Array | None, where: Bool[Array, " b"] | bool, value: int) -> Array
         return None
     where = jnp.asarray(where).reshape(-1, *[1] * (x.ndim - 1))
     return jnp.where(where, jnp.asarray(value, x.dtype), x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConditionDropout:
+    """Rates at which training samples lose their conditions, each independently of the others.
+
+    The denoiser so learns to work without any of them.
+    """
+
+    prior: float = 0.0
+    """Dropout rate of the prior; its mask then says that nothing was observed."""
+    mask: float = 0.0
+    """Dropout rate of the mask; everything then counts as observed."""
+    hands: float = 0.0
+    """Dropout rate of the hands."""
+    text: float = 0.0
+    """Dropout rate of the prompt."""
+
+    def __post_init__(self) -> None:
+        """Check that the rates are probabilities."""
+        for field in fields(self):
+            rate = getattr(self, field.name)
+            if not 0 <= rate <= 1:
+                raise InputError(f"the dropout rate of {field.name} must be in [0, 1], not {rate}.")
+
+    def apply(self, condition: Condition, key: Key[Array, " *keys"]) -> Condition:
+        """Drop conditions; `key` is one key, or one for each sample."""
+        keys = sample_keys(key, condition.text.shape[0])
+        draws = jax.vmap(lambda k: jax.random.uniform(k, (4,)))(keys)
+        rates = jnp.array([self.prior, self.mask, self.hands, self.text])
+        prior, mask, hands, text = (draws < rates).T
+        # The prior last: its mask of 1 must win over the dropped mask's 0.
+        condition = condition.drop("mask", mask).drop("prior", prior)
+        return condition.drop("hands", hands).drop("text", text)

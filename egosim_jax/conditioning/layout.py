@@ -37,13 +37,13 @@ class ChannelLayout:
     parts: tuple[tuple[Part, int], ...] = (
         ("noisy", 16), ("mask", 4), ("prior", 16), ("hands", 16),
     )  # fmt: skip
-    """Name and number of channels of each part, in their order; the noisy latents come first."""
+    """Name and number of channels of each part, in order; the noisy latents come first."""
     mask_packing: Packing = "space"
     """Pixels of the mask in a latent cell.
 
-    `space`: 2 x 2 of one frame in 4 channels (EgoSim); `time`: one of each pixel frame (Wan's
-    inpainting models); `single`: one in all; `observed`: none, the mask is constant and says that
-    everything was observed (DWM); one that says otherwise is refused.
+    `space`: 2 x 2 pixels of one frame in 4 channels (EgoSim). `time`: one pixel of each pixel frame
+    (Wan's inpainting models). `single`: one pixel. `observed`: no pixels, as everything must be
+    observed and the mask is constant (DWM); a mask with holes raises `InputError`.
     """
     mask_one: Literal["generate", "keep"] = "generate"
     """Meaning of a mask of 1 to the denoiser: `generate` (EgoSim) or `keep` (Wan, CogVideoX)."""
@@ -109,10 +109,10 @@ class ChannelLayout:
     def condition_channels(
         self, condition: Condition, noisy: Float[Array, "b f h w z"]
     ) -> Float[Array, "b f h w c"]:
-        """Return the channels after the noisy ones, which are the same at every denoising step.
+        """Return the channels after the noisy ones; they do not change between denoising steps.
 
-        Their dtype is the prior's, or else the hands', or else the noisy latents'. The noisy
-        latents give their shape, not their values.
+        Their dtype is the prior's, or else the hands', or else the noisy latents'. Of the noisy
+        latents only shape and dtype matter.
         """
         found = (condition.prior, condition.hands, noisy)
         dtype = next(array.dtype for array in found if array is not None)

@@ -15,10 +15,10 @@ Wan 2.1 inpainting models use the opposite. For a mask video of the model's size
 The release's continuous runner omits the padding of rule 3, so that its 61 frames are selected as
 floor(61 i / 16) = 0, 3, 7, 11, 15, 19, ...; `padding="none"` reproduces it.
 
-These are the rules of the packing `space` with a codec of strides 4 and 8. The others keep rules 1
-and 2 and take one pixel of each latent cell. `single` takes it from the same frame, in one channel.
-`time` takes it from every pixel frame that the latent frame encodes, a channel each (Wan 2.1).
-`observed` is 0 everywhere, and refuses a mask that says otherwise.
+These are the rules of the packing `space` with a codec of strides 4 and 8. `single` and `time` keep
+rules 1 and 2 and take one pixel of each latent cell. `single` takes it from the same frame, in one
+channel. `time` takes it from every pixel frame that the latent frame encodes, in one channel each
+(Wan 2.1). `observed` is 0 everywhere, and raises `InputError` for a mask with holes.
 """
 
 from __future__ import annotations

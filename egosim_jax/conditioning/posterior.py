@@ -1,9 +1,9 @@
 """Random encoding of videos: latents drawn from the VAE's posterior, and noise on the prior.
 
-A VAE gives mean and deviation of the latents of a video. EgoSim takes the means, in training and at
-generation. DWM draws at each training update, for the target as for the conditions, and at
-generation the latents of the hands but not of the prior (its release). The paper was evaluated with
-CogVideoX-Fun's own pipeline, which also adds noise to the pixels of the prior that are not black.
+A VAE gives mean and deviation of a video's latents. EgoSim takes the means, in training and at
+generation. DWM draws target and conditions at each training update; at generation its release draws
+the latents of the hands but not of the prior. The paper was evaluated with CogVideoX-Fun's own
+pipeline, which also adds noise to the pixels of the prior that are not black.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def draw(
     std: Float[Array, "b f h w z"],
     keys: Key[Array, " b"],
 ) -> Float[Array, "b f h w z"]:
-    """Draw latents of each sample from its own key."""
+    """Draw the latents of each sample from its own key."""
     return mean + std * normal(keys, mean)
 
 
@@ -79,5 +79,5 @@ def add_pixel_noise(
 
 
 def normal(keys: Key[Array, " b"], like: Float[Array, "b f h w c"]) -> Float[Array, "b f h w c"]:
-    """Draw standard normal numbers of each sample from its own key."""
+    """Draw standard normal numbers for each sample from its own key."""
     return jax.vmap(lambda key: jax.random.normal(key, like.shape[1:]))(keys)

@@ -1,9 +1,9 @@
 """Tokenizers of SentencePiece's unigram models (`spiece.model`), as T5's releases have them.
 
 The file is a protocol buffer: pieces with their log probability and kind, the kind of the model,
-and a table that maps characters to normal ones. Only these fields are read, with bounds, and
-nothing else is needed. Ids are the places of the pieces; spaces are written ▁, also before the
-text, and several count as one. (Kudo & Richardson 2018, SentencePiece.)
+and a table that normalizes characters. Only these fields are needed and read, with bounds. The id
+of a piece is its index. A space is written ▁, also before the text, and several spaces count as
+one. (Kudo & Richardson 2018, SentencePiece.)
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def read_spiece(path: Path) -> Tokenizer:
 def fields(data: bytes) -> Iterator[tuple[int, Any]]:
     """Yield number and value of each field of a protocol buffer: an integer, or bytes.
 
-    Raises `ValueError` if it ends in a field, or has a wire type that is not known.
+    Raises `ValueError` if it ends inside a field, or has an unknown wire type.
     """
     at = 0
     while at < len(data):
@@ -99,7 +99,7 @@ def fields(data: bytes) -> Iterator[tuple[int, Any]]:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return an integer of 7 bits a byte, and the place after it."""
+    """Return an integer of 7 bits a byte, and the offset after it."""
     value = 0
     for shift in range(0, 70, 7):
         byte = data[at]

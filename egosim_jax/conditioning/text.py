@@ -3,8 +3,8 @@
 In both, id 0 pads and id 1 ends a prompt. `byt5` needs no files: the tokens are the UTF-8 bytes
 of the prompt, byte x as id x + 3, after the ids for padding, end and unknown (Xue et al. 2022).
 A folder in the layout of google/umt5-xxl gives the tokenizer of the released text encoder. Its
-`tokenizer.json` is read as it is: the T5 class of transformers 5 would rebuild it, and lose its
-byte fallback and its id for unknown on the way. Without that file, `spiece.model` is read.
+`tokenizer.json` is read directly: the T5 class of transformers 5 would rebuild it and lose its byte
+fallback and its id for unknown. Without that file, `spiece.model` is read.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import tokenizers
 
 PAD, END = 0, 1
-"""Ids that fill up a prompt and that end it."""
+"""Ids of padding and of the end of a prompt."""
 BYTE_OFFSET = 3
 """ByT5's id of byte 0."""
 BYT5_VOCAB = 384
@@ -57,7 +57,7 @@ class PromptTokenizer:
     """Tokenizer of prompts."""
 
     kind: Literal["byt5"] | Path = "byt5"
-    """`byt5`, or a folder with tokenizer.json or spiece.model, of umT5 or another model of T5."""
+    """`byt5`, or a folder with the tokenizer.json or spiece.model of umT5 or another T5 model."""
     clean: bool = True
     """Repair encodings, HTML entities and white space first, as Wan does and CogVideoX does not."""
     max_tokens: int = 512
@@ -134,5 +134,5 @@ def _check_ids(tokenizer: tokenizers.Tokenizer, file: Path) -> None:
     for token, want in (("<pad>", PAD), ("</s>", END)):
         if (have := tokenizer.token_to_id(token)) != want:
             raise InputError(
-                f"{file} is no tokenizer of the T5 family: {token} must be id {want}, not {have}."
+                f"{file} is not a T5-family tokenizer: {token} must be id {want}, not {have}."
             )

@@ -1,7 +1,7 @@
 """Configs of models: `ModelConfig` in `model.py`, and one file for each released model.
 
-Sizes, samplings and weights of a model are chosen here. Code that runs a model is in `models` and
-`generation`.
+A config chooses the sizes, samplings and weights of a model. Code that runs models is in `models`
+and `generation`.
 
     get, names           config by name
     sampled              config with one of its named samplings
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 SHIPPED = Path(__file__).parents[1] / "weights"
-"""Folders of weights that come with the package, by config."""
+"""Folder of the weights that are shipped with the package, by config."""
 RELEASED = Path(__file__).with_name("released.json")
 """Weights on a model hub, by name."""
 
@@ -40,20 +40,20 @@ def names() -> list[str]:
 
 
 def get(name: str) -> ModelConfig:
-    """Return the config of a name; an unknown one raises `InputError` with the nearest."""
+    """Return a config by name. Raises `InputError` with the nearest name for an unknown one."""
     return _module(name).CONFIG
 
 
 def sampled(config: ModelConfig, sampling: str) -> ModelConfig:
-    """Return a model with one of its named samplings; most models have no named sampling.
+    """Return a model with one of its named samplings; most models have none.
 
-    An unknown name raises `InputError` with the nearest.
+    Raises `InputError` with the nearest name for an unknown one.
     """
     known = getattr(_module(config.name), "SAMPLINGS", {})
     if not known:
         raise InputError(
-            f"{config.name} has no named samplings, so that there is no {sampling}: omit the "
-            "option. (--sampling)"
+            f"{config.name} has no named samplings, so no {sampling!r}: omit the option. "
+            "(--sampling)"
         )
     if sampling not in known:
         near = difflib.get_close_matches(sampling, known, n=1, cutoff=0.0)
@@ -65,7 +65,7 @@ def sampled(config: ModelConfig, sampling: str) -> ModelConfig:
 
 
 def allows_random_weights(name: str) -> bool:
-    """Return True if a model may generate with random weights, to see that everything runs."""
+    """Return True if a model may generate with random weights, to check that everything runs."""
     return getattr(_module(name), "RANDOM_WEIGHTS", False)
 
 
@@ -80,7 +80,7 @@ def _module(name: str) -> ModuleType:
 
 
 def shipped_weights(name: str) -> Path | None:
-    """Return the folder of the weights that come with the package, or None."""
+    """Return the folder of the shipped weights, or None."""
     folder = SHIPPED / name
     return folder if folder.is_dir() else None
 
@@ -92,9 +92,9 @@ def releases() -> dict[str, hub.Release]:
 
 
 def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
-    """Return the release of a name; an unknown one raises `InputError` with the nearest.
+    """Return a release by name. Raises `InputError` with the nearest name for an unknown one.
 
-    `others` are names of weights that are no releases, for the message.
+    `others` are names of weights without a release, for the message.
     """
     known = releases()
     if name not in known:
@@ -107,7 +107,7 @@ def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
 
 
 def weights_of(name: str, given: Path | None) -> Path:
-    """Return the folder of a config's weights: the given one, else shipped ones, else fetched ones.
+    """Return the folder of a config's weights: the given, else the shipped, else the fetched one.
 
     Raises `InputError`, with the command that fetches them, if no weights are found.
     """

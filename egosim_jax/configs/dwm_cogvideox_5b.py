@@ -55,6 +55,6 @@ SAMPLINGS = {
         "encoding_noise": EncodingNoise(hands=True, prior_pixels=0.0563),
     },
 }
-"""Named samplings: the release's, and the one in the scripts behind the paper's tables.
+"""Named samplings: the release's, and the one of the scripts behind the paper's tables.
 
-The paper's is CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior."""
+The paper uses CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior."""

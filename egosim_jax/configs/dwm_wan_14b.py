@@ -1,9 +1,9 @@
 """DWM on Wan 2.1 Fun V1.1 14B InP: 49 frames of 720 x 480 at 8 per second, as it was released.
 
-The prior is observed everywhere: the mask is 1, which says keep. The released model generates with
-CLIP's tokens all 0, though it was trained without them, where the first 257 tokens of the prompt
-took their place; here training and generation have zeros. 50 Euler steps with guidance away from a
-short negative prompt.
+The prior is observed everywhere: the mask is 1, which means keep. The released model generates with
+CLIP tokens of zeros. It was trained without them: the first 257 tokens of the prompt took their
+place. Here training and generation both use zeros. 50 Euler steps with guidance away from a short
+negative prompt.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
-"""EgoSim-14B as released: 61 frames of 832 x 480, all of it in bfloat16, 50 Euler steps.
+"""EgoSim-14B as released: 61 frames of 832 x 480, all networks in bfloat16, 50 Euler steps.
 
-Its three quirks are part of the weights: CLIP's image is fed in [0, 1], timesteps are rounded to
+The weights were trained with three quirks: CLIP's input is in [0, 1], timesteps are rounded to
 bfloat16 before they are embedded, and there is no guidance.
 """
 

@@ -64,21 +64,21 @@ class ModelConfig:
     image: ImageEncoderConfig | None = field(default_factory=CLIPVisionConfig)
     """Config of the image encoder; None for models without the image branch."""
     zero_image_tokens: int | None = None
-    """Number of image tokens that the denoiser gets without an encoder: zeros (DWM on Wan).
+    """Number of image tokens of zeros, for a denoiser without an image encoder (DWM on Wan).
 
-    So in training as at generation; a triplet may have others (`tokens`)."""
+    Training and generation both use them, unless a triplet has `tokens`."""
     layout: ChannelLayout = field(default_factory=ChannelLayout)
     """Input channels of the denoiser."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
     """Tokenizer of the prompts."""
     encoders: Literal["frozen", "joint"] = "frozen"
-    """`frozen`: text and image encoder are given; `joint`: trained together with the denoiser."""
+    """Text and image encoders: pretrained (`frozen`), or trained with the denoiser (`joint`)."""
     image_range: Literal["signed", "unit"] = "signed"
-    """Range of the image given to CLIP's preprocessing; `unit` is the EgoSim release's."""
+    """Range of the input of CLIP's preprocessing; the EgoSim release uses `unit`."""
     posterior: Literal["sampled"] | None = None
-    """Latents of a training: drawn at each update (`sampled`, DWM), or the means (None)."""
+    """Latents in training: drawn at each update (`sampled`, DWM), or the means (None)."""
     encoding_noise: EncodingNoise | None = None
-    """Randomness in the encoding of conditions at generation; None: none."""
+    """Noise in the encoding of conditions at generation; None: no noise."""
     process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
     """Path from data to noise, and the quantity that the denoiser predicts."""
     solver: Euler | DDIM | UniPC | DPMSolver = field(default_factory=Euler)
@@ -88,7 +88,7 @@ class ModelConfig:
     unconditional_prompt: str | None = None
     """Negative prompt of the unconditional branch; None: embeddings of zeros (EgoSim).
 
-    Training replaces a dropped prompt by it.
+    Training replaces dropped prompts by it.
     """
     strength: float | None = None
     """Fraction of the steps to run, starting from the noised prior (SDEdit).
@@ -118,7 +118,7 @@ class ModelConfig:
                 raise InputError(f"{self.name}: {left} is {a} but {right} is {b}; they must agree.")
         if "mask" in layout and layout.mask_packing == "space" and self.vae.spatial_stride % 2:
             raise InputError(
-                f"{self.name}: the mask packing space takes 2 x 2 pixels of a latent cell, so that "
+                f"{self.name}: the mask packing `space` takes 2 x 2 pixels of a latent cell, so "
                 f"the codec's stride must be even, not {self.vae.spatial_stride}. Choose another "
                 "packing. (layout.mask_packing)"
             )
@@ -127,7 +127,7 @@ class ModelConfig:
                 f"{self.name}: the tokens have {dit.patch[1]} rows and {dit.patch[2]} columns; "
                 "they must be square. (dit.patch)"
             )
-        # Raises if the solver does not fit the process, or the steps.
+        # Raises if the solver does not fit the process or the steps.
         self.solver.coefficients(self.process, self.process.times(self.visited))
         if isinstance(self.vae, ChunkedCodecConfig):
             self.vae.check_frames(self.video.frames)
@@ -140,15 +140,15 @@ class ModelConfig:
             )
 
     def _image_sizes(self) -> list[tuple[str, int | None, str, int | None]]:
-        """Return the widths of the image tokens, which must agree."""
+        """Return the pair of widths of the image tokens, which must agree."""
         given = None if self.image is None else self.image.dim
         if self.zero_image_tokens is None:
             return [("dit.image_dim", self.dit.image_dim, "image.dim", given)]
         check_counts({"zero_image_tokens": self.zero_image_tokens})
         if self.image is not None or self.dit.image_dim is None:
             raise InputError(
-                f"{self.name}: image tokens of zeros are for a denoiser with an image branch in a "
-                f"model without an image encoder, not {self.zero_image_tokens} of them with "
+                f"{self.name}: image tokens of zeros need a denoiser with an image branch and a "
+                f"model without an image encoder; there are {self.zero_image_tokens} of them with "
                 f"image.dim {given} and dit.image_dim {self.dit.image_dim}. (zero_image_tokens)"
             )
         return []
@@ -157,14 +157,14 @@ class ModelConfig:
     def visited(self) -> int | tuple[int | float, ...]:
         """Number of denoising steps or, with a strength, the timesteps to visit.
 
-        Raises `InputError` for a strength outside (0, 1] or of a model without a prior.
+        Raises `InputError` for a strength outside (0, 1], or for a model without a prior.
         """
         if self.strength is None:
             return self.steps
         if not 0 < self.strength <= 1 or "prior" not in self.layout:
             raise InputError(
-                f"{self.name} cannot start from its prior with strength {self.strength}: that must "
-                "be above 0 and at most 1, and the model must have a prior. (--strength)"
+                f"{self.name} cannot start from its prior with strength {self.strength}: it "
+                "must be above 0 and at most 1, and the model must have a prior. (--strength)"
             )
         levels = self.process.timesteps(self.process.times(self.steps)[:-1])
         skipped = len(levels) - max(1, int(self.strength * len(levels)))
@@ -177,7 +177,7 @@ class ModelConfig:
         return self.zero_image_tokens or (0 if self.image is None else self.image.tokens)
 
     def given_image(self, triplets: Sequence[Triplet]) -> Float[np.ndarray, "b m e"] | None:
-        """Return the image tokens of clips in a model without an encoder; None for others."""
+        """Return the image tokens of clips, or zeros; None without `zero_image_tokens`."""
         zeros = self.zero_image(len(triplets))
         if zeros is None:
             return None
@@ -187,7 +187,7 @@ class ModelConfig:
         return zeros
 
     def zero_image(self, batch: int) -> Float[np.ndarray, "b m e"] | None:
-        """Return the image tokens of a model whose tokens are zeros; None for others."""
+        """Return image tokens of zeros for a batch; None without `zero_image_tokens`."""
         if self.zero_image_tokens is None:
             return None
         return np.zeros((batch, self.zero_image_tokens, self.dit.image_dim or 0), np.float32)
@@ -220,7 +220,7 @@ class ModelConfig:
 
     @property
     def cached_networks(self) -> tuple[Name, ...]:
-        """Names of the networks whose outputs are cached for training the denoiser."""
+        """Names of the networks whose outputs are cached before the denoiser is trained."""
         return tuple(name for name in self.networks if name not in self.trained_networks)
 
     def at(self, folder: Path) -> ModelConfig:
@@ -282,8 +282,8 @@ class Networks(nnx.Module):
     ) -> Networks:
         """Load networks from a weights folder, which holds `<network>.safetensors` for each.
 
-        With a mesh each device reads its own part of the weights. Raises `InputError` with every
-        path that is missing, unknown or of another shape.
+        On a mesh, each device reads only its own part of the weights. Raises `InputError` with
+        every path that is missing, unknown or of another shape.
         """
         networks, folder = cls.abstract(config, only=only), Path(folder)
         if not folder.is_dir():
@@ -293,7 +293,7 @@ class Networks(nnx.Module):
         return networks
 
     def save(self, folder: Path, *, dtype: str | None = None) -> None:
-        """Write a weights folder; `dtype` casts, by default weights keep their own."""
+        """Write a weights folder, cast to `dtype` if given."""
         for name, network in self.parts().items():
             weights.save(folder / f"{name}.safetensors", network, dtype=dtype)
 

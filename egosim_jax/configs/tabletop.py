@@ -1,4 +1,4 @@
-"""Model that comes with the package: small, and trained on the tabletop world alone.
+"""Model shipped with the package: small, and trained only on the tabletop world.
 
 Trained from scratch by `egosim train tabletop`; its weights are in the package and its card
 in `weights/tabletop/README.md`.

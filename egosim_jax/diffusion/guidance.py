@@ -2,10 +2,10 @@
 
     y = y_uncond + scale (y_cond - y_uncond)
 
-Data, noise and velocity are linear in each other, so that every prediction type is guided alike.
-At scale 1 this is y_cond, and the unconditional branch is not run: the EgoSim release samples so,
-one forward pass a step. Other scales cost two, one after the other: at the sizes of video a single
-sample fills the device, so that a batch of both would only take more memory.
+Data, noise and velocity are linear in each other, so every prediction type is guided alike. At
+scale 1 this is y_cond, and the unconditional branch is not run: the EgoSim release samples like
+this, with one forward pass a step. Other scales need two passes, one after the other. A single
+video fills the device, so a batch of both would only take more memory.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ With a process of `process.py`, x_t = alpha(t) x0 + sigma(t) e, one sample's err
 
     L(t) = mean | f(x_t, timestep(t)) - target |^2
 
-where the target is what the network predicts: e - x0 for a velocity. The loss is E[w(t) L(t)] over
-e ~ N(0, 1) and one of these draws of the time t:
+The target is the quantity that the network predicts, such as e - x0 for a velocity. The loss is
+E[w(t) L(t)] over e ~ N(0, 1) and one of these draws of the time t:
 
     uniform       u ~ U(0, 1),                         t = t(u),   w = 1
     logit-normal  u = 1 / (1 + exp(-z)), z ~ N(m, s),  t = t(u),   w = 1
@@ -16,9 +16,9 @@ e ~ N(0, 1) and one of these draws of the time t:
                   minimum and mean over the 1000 times (the training schedule of DiffSynth, on
                   which the EgoSim release is built)
 
-where t(u) is the process's `warp`, the shift of a rectified flow. The mean of L may weight the
-locations of a sample, and elements whose |f - target| exceeds a bound may count as 0 (DWM-Wan's
-trainer, at 50), so that one corrupt value does not spoil an update.
+Here t(u) is the process's `warp`, the shift of a rectified flow. The mean of L may weight the
+locations of a sample. Elements whose |f - target| exceeds a bound may count as 0 (DWM-Wan's
+trainer, at 50), so one corrupt value does not spoil an update.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Objective:
     logit_std: float = 1.0
     """Standard deviation of that normal."""
     max_difference: float | None = None
-    """Difference from the target above which an element's error counts as 0; None: none."""
+    """Difference from the target above which an element's error counts as 0; None: no limit."""
 
     def __post_init__(self) -> None:
         """Check the width of the logit-normal and the bound of differences."""
@@ -101,9 +101,8 @@ class Objective:
     ) -> tuple[Float[Array, ""], Sampled]:
         """Return the weighted error at random times, averaged over the batch.
 
-        `key` is one key, or one for each sample: a sample's draws depend on its own key only, so
-        a batch with given keys draws what its samples would draw alone. `loss_weights` weights the
-        locations of each sample, 1 on average.
+        `key` is one key, or one for each sample. A sample's draws depend only on its own key, not
+        on the batch. `loss_weights` weights the locations of each sample, 1 on average.
         """
         keys = jax.vmap(jax.random.split)(sample_keys(key, x0.shape[0]))
         time = self.sample_times(process, keys[:, 0], x0.shape[0])
@@ -123,7 +122,7 @@ class Objective:
     ) -> Float[Array, " b"]:
         """Return each sample's error at a given noise and time, in float32.
 
-        It is weighted by the locations of a sample, not by its time.
+        The error is weighted over locations, not by time.
         """
         x0, noise = x0.astype(jnp.float32), noise.astype(jnp.float32)
         level = time[:, None, None, None, None]
@@ -135,5 +134,5 @@ class Objective:
 
 
 def sample_keys(key: Key[Array, " *keys"], batch: int) -> Key[Array, " b"]:
-    """Return one key for each sample: `key` split, unless it already is one for each sample."""
+    """Return one key for each sample; a single `key` is split."""
     return key if key.ndim else jax.random.split(key, batch)

@@ -60,7 +60,7 @@ from jaxtyping import Array, Float
 from egosim_jax.types import InputError
 
 TIMESTEPS = 1000
-"""Timestep that the network is given at time 1 of a rectified flow."""
+"""Timestep of a rectified flow at time 1."""
 
 DenoiseFn = Callable[
     [Float[Array, "b f h w c"], Float[Array, " b"]],
@@ -75,7 +75,7 @@ Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
 
 def at_least_float32(x: Float[Array, "*x"]) -> Float[Array, "*x"]:
-    """Return an array in float32, or in float64 if it is that."""
+    """Return an array in float32; float64 stays float64."""
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
@@ -98,7 +98,7 @@ class Process(ABC):
 
     @abstractmethod
     def timesteps(self, time: Numbers) -> Numbers:
-        """Return the timesteps that the network is given at these times."""
+        """Return the network's timesteps at these times."""
 
     @abstractmethod
     def warp(self, u: Numbers) -> Numbers:
@@ -108,7 +108,7 @@ class Process(ABC):
     def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the times that a sampler visits, in float64, falling to 0.
 
-        `steps` is the number of steps, or the timesteps to visit, as the network is given them.
+        `steps` is the number of steps, or the network's timesteps to visit.
         """
 
     def add_noise(self, x0: Numbers, noise: Numbers, time: Numbers) -> Numbers:
@@ -219,7 +219,7 @@ class RectifiedFlow(Process):
             return np.floor(t) if isinstance(t, np.ndarray) else jnp.floor(t)
         if isinstance(t, np.ndarray):
             return t.astype(ml_dtypes.bfloat16).astype(t.dtype)
-        # Not a pair of casts, which the compiler may cancel out.
+        # Not a pair of casts: the compiler may cancel them.
         return jax.lax.reduce_precision(t, exponent_bits=8, mantissa_bits=7)
 
     def warp(self, u: Numbers) -> Numbers:
@@ -228,7 +228,7 @@ class RectifiedFlow(Process):
         return self.shift * w / (1 + (self.shift - 1) * w)
 
     def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
-        """Return the shifted times of a sampler; given timesteps are visited as they are."""
+        """Return the shifted times of a sampler; given timesteps are not shifted."""
         if isinstance(steps, int):
             visited = self.warp(np.linspace(1.0, 0.0, _count(steps) + 1)[:-1])
         else:
@@ -353,7 +353,7 @@ def _check_prediction(process: Process, known: tuple[Prediction, ...]) -> None:
 
 def _count(steps: int) -> int:
     if steps < 1:
-        raise InputError(f"{steps} steps cannot be sampled: it takes at least 1. (--steps)")
+        raise InputError(f"{steps} steps cannot be sampled: at least 1 is needed. (--steps)")
     return steps
 
 

@@ -2,8 +2,8 @@
 
 A solver's coefficients depend on the process and on the visited times alone. They are computed for
 all steps on the host in float64, and the integration is one `lax.scan` over their rows
-(`integrate`). Latents stay float32 between steps whatever the network computes in; DDIM
-and DPM-Solver++ keep float64 latents, where jax has them enabled.
+(`integrate`). Latents stay float32 between steps, whatever dtype the network computes in. DDIM and
+DPM-Solver++ keep float64 latents if jax has float64 enabled.
 
 Euler (rectified flow) follows the straight line of the present velocity v:
 
@@ -85,8 +85,8 @@ def integrate(
 ) -> Float[Array, "b f h w c"]:
     """Turn noise into latents, one network evaluation a step: one scan, no host round trips.
 
-    `steps` is the number of steps, or the timesteps to visit. `keys`, one for each sample, draw
-    what a stochastic solver adds: the noise of step i comes from `fold_in(key, i)`.
+    `steps` is the number of steps, or the timesteps to visit. `keys`, one for each sample, draw the
+    noise of a stochastic solver; step i uses `fold_in(key, i)`.
     """
     times = process.times(steps)
     timesteps = process.timesteps(times[:-1]).astype(np.float32)

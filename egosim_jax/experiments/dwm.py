@@ -13,7 +13,7 @@ from typing import get_args
 
 import numpy as np
 
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.evaluation.metrics.report import paired_differences, print_table
 from egosim_jax.experiments.config import DWM

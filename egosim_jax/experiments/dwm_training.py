@@ -18,7 +18,7 @@ import numpy as np
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.widen import Widening
 from egosim_jax.data.manifest import MANIFEST

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from egosim_jax import configs
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.sheet import draw_sheet

@@ -5,8 +5,8 @@ Networks, solvers and input rules are in lower layers; loops over a state are in
     generator    Generator: triplets to clips; `denoise`, the sampler
     encoding     triplets to batches to conditions
     compiled     CompiledFn: a function of networks, compiled once for each shape
-    stream       Streamer: frames as they are decoded
-    batch        BatchJob: a folder of clips, resumable
-    rank         candidate actions by the goal that their clips reach
+    stream       Streamer: each group of frames once it is decoded
+    batch        BatchJob: a resumable folder of clips; baselines
+    rank         candidate actions by how well their clips reach a goal
     export       conditions as files
 """

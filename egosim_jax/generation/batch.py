@@ -1,9 +1,12 @@
-"""Batch generation: a clip for each window of the clips of a metadata file, in one folder.
+"""Batch generation: one clip for each window of a metadata file, in one folder.
 
-For each window the folder gets {id}.mp4, {id}_cmp.mp4 (prior | hands | generated | ground truth)
-and, on request, {id}_vae.mp4, the ground truth through the autoencoder; and results.jsonl, of whose
-lines the last one of an id counts, and contact_sheet.png of the first clips. The noise of a clip
-depends on the seed and its id alone, so that a clip depends on neither order nor batch.
+    {id}.mp4            generated clip of a window
+    {id}_cmp.mp4        prior | hands | generated | ground truth
+    {id}_vae.mp4        ground truth through the autoencoder, on request
+    results.jsonl       results; the last line of an id counts
+    contact_sheet.png   the first clips
+
+The noise of a clip depends only on the job's seed and the clip's id, not on order or batch.
 """
 
 from __future__ import annotations
@@ -13,14 +16,14 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jax.sharding import Mesh
 
-from egosim_jax.conditioning.baselines import DROPPED, Baseline, with_hand_mask
+from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.lora import check_base
 from egosim_jax.data.clips import Policy, check_clip, load_triplet
@@ -35,25 +38,41 @@ from egosim_jax.io.digest import sha256_within
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.rendering.mesh import hand_mask
 from egosim_jax.sharding import check_batch, make_mesh, parts
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet
 
+Baseline = Literal["no_hands", "hand_mask", "sdedit"]
+"""Baseline that uses a model's weights with other conditions.
+
+    no_hands    no hands: a video model of the scene alone (Wan-InP in EgoSim)
+    hand_mask   silhouettes of the hands (DWM, Table 3)
+    sdedit      from the noised prior, without prior, mask and hands (SDEdit, Meng et al. 2022; CVX
+                SDEdit in DWM, Table 1)
+
+The papers also train the models of the first two this way; weights trained with hands lose more.
+"""
+DROPPED: dict[Baseline, ConditionName | None] = {
+    "no_hands": "hands", "hand_mask": None, "sdedit": "hands",
+}  # fmt: skip
+"""Condition that a baseline drops; a model with a `strength` drops prior and mask itself."""
+STRENGTH = 0.75
+"""Default fraction of the steps that SDEdit runs (DWM)."""
 SHEET_CLIPS = 6
 """Maximum number of clips on the contact sheet."""
 SHEET_COLUMNS = 6
 """Frames of each clip on the contact sheet."""
 SHEET_ROWS = ("prior", "hands", "generated", "ground truth")
-"""Rows of each clip on the contact sheet; the last one where it is known."""
+"""Rows of each clip on the contact sheet; the last one only if it is known."""
 SHEET_WIDTH = 240
 """Width of a frame on the contact sheet in pixels."""
-
 
 Failure = tuple[Window, str]
 """A window and why it failed."""
 
 
 class Outcome(NamedTuple):
-    """Numbers of windows of a batch job by their outcome."""
+    """Number of windows of a batch job by outcome."""
 
     existing: int
     """Windows that were generated before."""
@@ -72,7 +91,7 @@ def seed_of(seed: int, output_id: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchJob:
-    """Settings of a batch generation into a folder; equal settings continue in the same folder."""
+    """Settings of a batch job; a job with equal settings resumes in the same folder."""
 
     model: ModelConfig
     """Config of the model."""
@@ -81,13 +100,13 @@ class BatchJob:
     weights: Path | None
     """Folder of weights; None for random weights of `seed`."""
     lora: Path | None = None
-    """LoRA of the denoiser: a file, or a folder with weights in full (DWM's)."""
+    """LoRA of the denoiser: a file, or a folder that also has full weights (DWM)."""
     lora_scale: float = 1.0
     """Strength of the LoRA."""
     seed: int = 0
     """Seed from which each clip's noise is derived."""
     batch_size: int | None = None
-    """Clips generated together, over all devices; None for one on each part of the mesh."""
+    """Batch size over all devices; None: one clip for each shard of the batch."""
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
     """Layout of the devices."""
     policy: Policy = "strict"
@@ -95,14 +114,14 @@ class BatchJob:
     decoding: Decoding = "accurate"
     """Color decoding of videos."""
     skip_existing: bool = False
-    """Skip windows whose video is done; one of other inputs is refused."""
+    """Skip windows whose video is done; `InputError` if the video has other inputs."""
     reconstruct: bool = False
     """Also write the ground truth through the autoencoder."""
     baseline: Baseline | None = None
-    """Baseline to generate instead of the model with all of its conditions."""
+    """Baseline to generate instead of the model with all its conditions."""
 
     def open(self) -> None:
-        """Record the settings in the folder. Raises `InputError` if it is of another job."""
+        """Record the settings in the folder. Raises `InputError` if it has another job's."""
         self._place()
         digests = None if self.weights is None else hashes(self.weights)
         if self.lora is not None and digests is not None:
@@ -146,7 +165,7 @@ class BatchJob:
         return outcome
 
     def _place(self) -> tuple[Mesh, int]:
-        """Return the mesh and the number of clips generated together on it."""
+        """Return the mesh and the batch size."""
         mesh = make_mesh(self.mesh)
         size = parts("batch", mesh) if self.batch_size is None else self.batch_size
         check_batch(size, mesh)
@@ -166,10 +185,10 @@ class BatchJob:
                     )
 
     def _finished(self, windows: Sequence[Window]) -> set[str]:
-        """Return the ids of the windows whose clips are there, and listed as done.
+        """Return the ids of the windows whose files exist and whose last result is `done`.
 
-        Raises `InputError` if one is of another window, prompt or other conditions, and would be
-        taken for this one.
+        Raises `InputError` if an existing clip has another source, prompt or other conditions:
+        skipping its window would pass it off as the requested clip.
         """
         results, finished = read_results(self.out) or {}, set()
         for window in windows:
@@ -193,7 +212,7 @@ class BatchJob:
         return finished
 
     def check(self, windows: Sequence[Window]) -> tuple[list[Window], list[Failure]]:
-        """Return the windows whose inputs are valid, and the others with their problems."""
+        """Return the valid windows, and the invalid ones with their problems."""
         if windows:
             check_presence([window.files for window in windows])
         valid, rejected = [], []
@@ -228,7 +247,7 @@ class BatchJob:
         """Generate batch after batch; return the failures."""
         mesh, size = self._place()
         unit = parts("batch", mesh)
-        size = min(size, -(-len(windows) // unit) * unit)  # a multiple of the mesh that suffices
+        size = min(size, -(-len(windows) // unit) * unit)  # do not pad a short job further
         then = time.monotonic()
         generator = load(mesh)
         loaded = time.monotonic()
@@ -288,7 +307,7 @@ class BatchJob:
     def _generate_batch(
         self, generator: Generator, loaded: Sequence[tuple[Window, Triplet, str]], size: int
     ) -> list[Failure]:
-        """Generate and write one batch, padded to `size` so that nothing is compiled again."""
+        """Generate and write one batch, padded to `size` so that nothing is recompiled."""
         windows, triplets, digests = zip(*loaded, strict=True)
         fill = size - len(windows)
         triplets = [*triplets, *[triplets[-1]] * fill]
@@ -297,7 +316,7 @@ class BatchJob:
         try:
             clips = self._clips(generator, triplets, seeds)
         except NonFiniteError as error:
-            bad = {min(n, len(loaded) - 1) for n in error.places}  # the last one fills up
+            bad = {min(n, len(loaded) - 1) for n in error.bad}  # the padding repeats the last one
             problem = "The latents of the clip are not finite (NaN or infinity)."
             failed = [(windows[n], problem) for n in sorted(bad)]
             for window, _ in failed:
@@ -306,6 +325,7 @@ class BatchJob:
             return failed + (self._generate_batch(generator, good, size) if good else [])
         seconds = (time.monotonic() - then) / len(windows)
         reconstructions = generator.reconstruct(triplets) if self.reconstruct else [None] * size
+        # Not strict: `windows` and `digests` have no padding.
         for window, digest, triplet, clip, reconstruction, seed in zip(
             windows, digests, triplets, clips, reconstructions, seeds, strict=False
         ):
@@ -319,7 +339,7 @@ class BatchJob:
         self, generator: Generator, triplets: Sequence[Triplet], seeds: Sequence[int]
     ) -> list[Clip]:
         if self.baseline == "hand_mask":
-            triplets = [with_hand_mask(triplet) for triplet in triplets]
+            triplets = [replace(triplet, hands=hand_mask(triplet.hands)) for triplet in triplets]
         return generator.generate(triplets, seeds, without=self.baseline and DROPPED[self.baseline])
 
     def _write(

@@ -18,9 +18,9 @@ from egosim_jax.sharding import batch_sharding, check_batch
 class CompiledFn:
     """A function of networks and arrays, compiled once for each shape of its arguments.
 
-    On a mesh, on which `shard_params` has placed the networks, all arrays have a leading batch
-    axis. Raises `InputError` before compiling for a batch that the mesh does not divide. With a
-    `cache_key`, which identifies function and config, compiled programs are cached between starts
+    On a mesh, `shard_params` must have placed the networks, and all arrays have a leading batch
+    axis. Raises `InputError` before compiling if the mesh does not divide the batch. With a
+    `cache_key`, which identifies function and config, compiled programs are cached on disk
     (`io/executables.py`).
     """
 
@@ -37,6 +37,7 @@ class CompiledFn:
         self._mesh, self._cache_key = mesh, cache_key
         if mesh is not None:
             options["out_shardings"] = batch_sharding(mesh)
+        # `nnx.jit` would traverse the networks at every call.
         self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
         self._compiled: dict[Any, Any] = {}
 
@@ -67,7 +68,7 @@ class CompiledFn:
         return (compiled or self.trace(*args)).out_info
 
     def _placed(self, args: tuple) -> tuple:
-        """Return the shapes of arguments with their shardings."""
+        """Return the shapes and shardings of arguments."""
         placed = None
         if self._mesh is not None:
             check_batch(jax.tree.leaves(args)[0].shape[0], self._mesh)

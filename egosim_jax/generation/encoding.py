@@ -2,8 +2,8 @@
 
     triplets --pack--> Batch --encode_condition--> Condition
 
-Training reads batches of latents shards, in which some arrays are encoded already. The same
-function encodes the rest.
+Training reads batches of latents shards, in which some arrays are encoded already;
+`encode_condition` encodes the rest.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Key, UInt32
 
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.conditioning.image import clip_pixels
+from egosim_jax.conditioning.pixels import clip_pixels, to_model
 from egosim_jax.conditioning.posterior import (
     EncodingNoise,
     NormalizedCodec,
@@ -25,13 +25,12 @@ from egosim_jax.conditioning.posterior import (
     draw,
     posterior,
 )
-from egosim_jax.conditioning.video import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.sharding import replicate_params
 from egosim_jax.types import InputError, Triplet
 
 Batch = Mapping[str, Any]
-"""Arrays of a batch of clips, by name. What a model does not have is absent.
+"""Arrays of a batch of clips, by name; arrays that a model does not use are absent.
 
     prior hands target   uint8 videos `b f h w 3`; encoded: latents `b f h w z`
     mask                 packed mask, uint8 `b f h w m`
@@ -40,6 +39,8 @@ Batch = Mapping[str, Any]
     pixels               first frames for CLIP, float32 `b s s 3`; encoded: `image`, `b m e`
     seeds                seeds of the model's `encoding_noise`, uint32 `b`
 """
+SOLVER_NOISE, PRIOR_NOISE, HANDS_NOISE = 1, 2, 3
+"""Uses of a seed, each with another key; the initial noise uses the seed's key itself."""
 
 
 def pack(
@@ -47,7 +48,7 @@ def pack(
 ) -> dict[str, np.ndarray]:
     """Return triplets as a batch: tokenize prompts, pack masks, resize the images for CLIP.
 
-    `seeds` are only needed, and kept, where the encoding is random.
+    `seeds` are needed, and kept, only if the encoding draws noise.
     """
     layout = config.layout
     tokens = config.tokenizer.tokenize([t.prompt for t in triplets])
@@ -74,7 +75,7 @@ def pack(
 
 
 def batch_shapes(size: int, config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return the shapes and dtypes of what `pack` returns, to compile for before there is one."""
+    """Return the shapes and dtypes of `pack`'s result, to compile before there is a batch."""
     video, layout = config.video, config.layout
     frames = (video.frames, video.height, video.width, 3)
     tokens = (config.tokenizer.max_tokens,)
@@ -101,11 +102,11 @@ def encode_condition(
 ) -> Condition:
     """Encode the raw arrays of a batch: videos to latents, prompts and images to embeddings.
 
-    An array whose network is absent is taken as it is. `noise` draws from the batch's seeds.
+    Arrays without a network pass through: they are encoded already. `noise` uses the batch's seeds.
     """
     noise = noise or EncodingNoise()
     if "seeds" not in batch and noise != EncodingNoise():
-        raise InputError("A random encoding needs seeds: give each triplet one. (seeds)")
+        raise InputError("The encoding draws noise and needs seeds: give each triplet one. (seeds)")
     mask = batch.get("mask")
     return Condition(
         mask=None if mask is None else mask.astype(jnp.float32),
@@ -122,30 +123,30 @@ def encode_condition(
 def _latents(
     networks: Networks, batch: Batch, name: str, *, pixel_std: float = 0.0, drawn: bool = False
 ) -> Any:
-    """Return the latents of a video, the mean of the VAE's posterior or drawn from it."""
+    """Return the latents of a video: the mean of the VAE's posterior, or a draw from it."""
     if name not in batch or networks.vae is None:
         return batch.get(name)
     pixels = to_model(batch[name])
     if pixel_std:
-        pixels = add_pixel_noise(pixels, pixel_std, keys_for(batch["seeds"], 2))
+        pixels = add_pixel_noise(pixels, pixel_std, keys_for(batch["seeds"], PRIOR_NOISE))
     if drawn:
         codec = cast(NormalizedCodec, networks.vae)
-        return draw(*posterior(codec, pixels), keys_for(batch["seeds"], 3))
+        return draw(*posterior(codec, pixels), keys_for(batch["seeds"], HANDS_NOISE))
     return networks.vae.encode(pixels)
 
 
 def _embeddings(networks: Networks, batch: Batch, name: str, ids: str, mask: str) -> Any:
-    """Return the embeddings of prompts, which a batch has itself where no encoder is given."""
+    """Return the embeddings of prompts: encoded, or the batch's own if there is no encoder."""
     if networks.text is None or ids not in batch:
         return batch.get(name)
     return replicate_params(networks.text)(batch[ids], batch[mask])
 
 
 def last_32_bits(seeds: Sequence[int]) -> UInt32[np.ndarray, " b"]:
-    """Return the last 32 bits of each seed, the part that matters."""
+    """Return the last 32 bits of each seed, the part that the noise depends on."""
     return np.array([seed & 0xFFFFFFFF for seed in seeds], np.uint32)
 
 
 def keys_for(seeds: Array, use: int) -> Key[Array, " b"]:
-    """Return a key of each seed for one of its uses."""
+    """Return a key of each seed for one of its uses, such as `SOLVER_NOISE`."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), use))(seeds)

@@ -1,4 +1,4 @@
-"""Conditions of an action as files, for EgoSim's own loader and for `egosim generate`."""
+"""Export of an action's conditions as files, for EgoSim's loader and `egosim generate`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from egosim_jax.state.ply import has_triangles, read_triangles
 from egosim_jax.state.snapshot import load, read_ply
 from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, check_video
 
+POINT_PX = 2
+"""Size of the points of a rendered prior, in pixels."""
+
 
 def write_conditions(
     folder: Path | str,
@@ -30,11 +33,11 @@ def write_conditions(
 ) -> Path:
     """Write prior, mask and hand videos of an action in EgoSim's layout; return its metadata.csv.
 
-    Other clips in the folder keep their rows there; one of the same `video_id` is replaced.
+    Rows of other clips in the folder stay; a clip of the same `video_id` is replaced.
     The first frame defaults to the view's. Raises `InputError` if the first camera sees none
     of the state, and for a `video_id` that is not a valid file name.
     """
-    view = renderer.render(state, action.cameras, point_px=2)
+    view = renderer.render(state, action.cameras, point_px=POINT_PX)
     triplet = Triplet(
         video_id=video_id,
         prompt=action.prompt,
@@ -51,24 +54,24 @@ Static = tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"]]
 
 
 def static_of(scene: Path, cameras: Cameras) -> Static:
-    """Return the video of a static scene: a state's folder, or a PLY of points or triangles."""
+    """Render a static scene from a state's folder, or from a PLY of points or triangles."""
     if scene.suffix == ".ply" and has_triangles(scene):
         state = read_ply(scene)
         return draw_scene(state.points_m, read_triangles(scene), state.colors, cameras)
     state = read_ply(scene) if scene.suffix == ".ply" else load(scene)
-    view = jitted.render(state, cameras, point_px=2)
+    view = jitted.render(state, cameras, point_px=POINT_PX)
     return view.frames, view.mask
 
 
 MAX_MOVED_M, MAX_TURNED_DEG = 0.005, 0.2
-"""Largest motion of a camera that counts as fixed: about a pixel."""
+"""Maximum motion of a camera that counts as fixed: about a pixel."""
 
 
 def repeated(target: UInt8[np.ndarray, "f h w 3"], cameras: Cameras) -> Static:
     """Return the static video of a fixed camera: the first frame, repeated.
 
-    Hands that the first frame shows stay in it, as in DWM's data of TASTE-Rob. Raises `InputError`
-    if the camera moves.
+    Hands in the first frame stay visible, as in DWM's TASTE-Rob data. Raises `InputError` if the
+    camera moves.
     """
     poses = np.asarray(cameras.world_from_camera)
     moved = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=-1).max()
@@ -77,7 +80,7 @@ def repeated(target: UInt8[np.ndarray, "f h w 3"], cameras: Cameras) -> Static:
     turned = np.degrees(2 * np.arcsin(np.minimum(chords.max() / np.sqrt(8), 1)))
     if moved > MAX_MOVED_M or turned > MAX_TURNED_DEG:
         raise InputError(
-            "The first frame of a video can only be repeated if its camera is fixed, to "
+            "The first frame of a video can only be repeated if its camera is fixed, within "
             f"{MAX_MOVED_M:g} m and {MAX_TURNED_DEG:g} degrees: this one moves by up to "
             f"{moved:.3f} m and turns by up to {turned:.1f} degrees. Give a scene to render along "
             "its path. (--scene)"
@@ -93,10 +96,10 @@ def static_triplet(
     meshes: MovingMesh | None = None,
     target: UInt8[np.ndarray, "f h w 3"] | None = None,
 ) -> Triplet:
-    """Return a triplet of DWM: a static scene, hand meshes along the action, and the ground truth.
+    """Return a DWM triplet: a static scene, hand meshes along the action, and the ground truth.
 
-    By default the meshes are posed from the action's keypoints, left hand before right hand. Raises
-    `InputError` if lengths or sizes disagree, or for keypoints in another order.
+    `meshes` default to meshes posed from the action's keypoints, left hand before right hand.
+    Raises `InputError` if lengths or sizes disagree, or if the keypoints are in another order.
     """
     cameras = action.cameras
     shape = len(cameras.world_from_camera), cameras.height, cameras.width
@@ -107,7 +110,7 @@ def static_triplet(
     if len(mesh.vertices_m) != shape[0]:
         raise InputError(
             f"The hands have {len(mesh.vertices_m)} frames, the cameras {shape[0]}: both must have "
-            "one for each frame. (--mano-poses)"
+            "the same number. (--mano-poses)"
         )
     return Triplet(
         video_id=video_id,

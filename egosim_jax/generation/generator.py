@@ -2,14 +2,14 @@
 
     triplets --pack--> Batch --encode--> Condition --denoise--> latents --decode--> clips
 
-Each arrow is one compiled program (`compiled.py`); `encoding.py` has the first two. All denoising
-steps are one scan, without a round trip to the host. Embeddings, cross-attention keys and values
-and the condition's part of the patch embedding do not change between steps: they are computed
-before the scan. The noise is donated. An item's noise depends on its own seed only, so that a clip
-does not depend on its batch.
+`pack` is NumPy; each other arrow is one compiled program (`compiled.py`). All denoising steps are
+one scan, without a round trip to the host. Embeddings, cross-attention keys and values and the
+condition's part of the patch embedding do not change between steps: they are computed before the
+scan. The noise is donated. An item's noise depends only on its seed, so a clip does not depend on
+its batch.
 
-On a mesh (`sharding.py`) every batch is dealt out over data x fsdp; the devices along context share
-the denoising of a clip, and each of them encodes and decodes it, too.
+On a mesh (`sharding.py`), data x fsdp splits the batch. Devices along context share the denoising
+of a clip; each of them encodes and decodes the complete clip.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from jaxtyping import Array, Float, Key, UInt8
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
-from egosim_jax.conditioning.video import to_model, to_uint8
+from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import (
+    SOLVER_NOISE,
     batch_shapes,
     encode_condition,
     keys_for,
@@ -58,13 +59,13 @@ T = TypeVar("T")
 
 
 class NonFiniteError(FloatingPointError):
-    """Latents of some clips of a batch are NaN or infinite; the others are in order."""
+    """Some clips of a batch have NaN or infinite latents; the others are valid."""
 
-    def __init__(self, names: Sequence[str], places: Sequence[int]):
-        """Name the clips at `places` of the batch whose ids are `names`."""
-        bad = [names[n] for n in places]
-        super().__init__(f"The latents of {bad} are not finite (NaN or infinity).")
-        self.places = tuple(places)
+    def __init__(self, names: Sequence[str], bad: Sequence[int]):
+        """`names` are the ids of all clips of the batch, `bad` the indices of the failed ones."""
+        failed = [names[n] for n in bad]
+        super().__init__(f"The latents of {failed} are not finite (NaN or infinity).")
+        self.bad = tuple(bad)
 
 
 def denoise(
@@ -79,8 +80,9 @@ def denoise(
     `keys`, one for each item, draw the noise that a stochastic solver adds.
     """
     if config.strength is not None and condition.prior is not None:
-        first = jnp.asarray(config.process.times(config.visited)[0], jnp.float32)
-        noise = config.process.add_noise(condition.prior, noise, first)
+        # SDEdit: the prior, noised to the first level, is the start instead of a condition.
+        start = jnp.asarray(config.process.times(config.visited)[0], jnp.float32)
+        noise = config.process.add_noise(condition.prior, noise, start)
         condition = condition.drop("prior")
     channels = config.layout.condition_channels(condition, noise)
 
@@ -90,6 +92,7 @@ def denoise(
 
     text = jnp.asarray(condition.text)
     conditional = branch(text)
+    # At scale 1 guidance returns the conditional branch: do not compute the other one.
     guided = config.guidance.scale != 1
     unconditional = branch(condition.drop("text").text) if guided else conditional
     return integrate(
@@ -103,7 +106,7 @@ def denoise(
 
 
 class Generator:
-    """Model that is ready to generate, on one device or on the devices of a mesh."""
+    """Model that is ready to generate, on one device or on a mesh."""
 
     def __init__(
         self,
@@ -114,6 +117,7 @@ class Generator:
         renderer: Renderer = jitted,
     ):
         self.config = config
+        self.mesh = mesh
         self.renderer = renderer
         self.networks = networks = shard_params(networks, mesh)
         self._encode = CompiledFn(
@@ -136,7 +140,7 @@ class Generator:
         )
         self._denoise = CompiledFn(
             lambda dit, condition, noise, *seeds: denoise(
-                dit, condition, noise, config, *map(_step_keys, seeds)
+                dit, condition, noise, config, *(keys_for(s, SOLVER_NOISE) for s in seeds)
             ),
             networks.dit,
             mesh=mesh,
@@ -163,10 +167,10 @@ class Generator:
     ) -> Generator:
         """Load a model, by name or config, from a weights folder.
 
-        Without a folder, these are the weights that come with the package or were fetched. `lora`
-        is a file or folder in any naming that `egosim convert` reads. Raises `InputError` if
-        config, weights or LoRA are missing or do not fit each other, or if the LoRA names another
-        base.
+        Without a folder, loads the weights that are shipped with the package or were fetched.
+        `lora` is a file or folder in any naming that `egosim convert` reads. Raises `InputError`
+        if config, weights or LoRA are missing or do not fit each other, or if the LoRA names
+        another base model.
         """
         from egosim_jax import configs
 
@@ -188,14 +192,14 @@ class Generator:
         yield "encode", self._encode, (arrays,)
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
         yield "noise", self._noise, (seeds,)
-        given = self._encode.shapes(arrays), self._noise.shapes(seeds), *self._stepping(seeds)
-        yield "denoise", self._denoise, given
-        yield "decode", self._decode, (self._denoise.shapes(*given),)
+        inputs = self._encode.shapes(arrays), self._noise.shapes(seeds), *self._step_seeds(seeds)
+        yield "denoise", self._denoise, inputs
+        yield "decode", self._decode, (self._denoise.shapes(*inputs),)
 
     def compile(self, batch: int) -> None:
         """Compile all functions of `generate` for batches of this size."""
-        for _, program, given in self.programs(batch):
-            program.compile(*given)
+        for _, program, inputs in self.programs(batch):
+            program.compile(*inputs)
 
     def generate(
         self,
@@ -206,7 +210,7 @@ class Generator:
     ) -> list[Clip]:
         """Generate one clip for each triplet, from the noise of its seed.
 
-        `without` hides one condition, as training does (`conditioning/dropout.py`). Raises
+        `without` drops one condition, as training does (`conditioning/condition.py`). Raises
         `InputError` if a mesh does not divide the batch, and `NonFiniteError` naming the clips
         whose latents are not finite.
         """
@@ -219,11 +223,12 @@ class Generator:
         *,
         without: ConditionName | None = None,
     ) -> Float[Array, "b f h w z"]:
-        """Return the latents that `generate` decodes; raises what it raises."""
+        """Return the latents that `generate` decodes; raises the same errors."""
         condition = self._encode(pack(triplets, self.config, seeds))
         if without is not None:
             condition = condition.drop(without)
-        latents = self._denoise(condition, self.noise(seeds), *self._stepping(last_32_bits(seeds)))
+        step_seeds = self._step_seeds(last_32_bits(seeds))
+        latents = self._denoise(condition, self.noise(seeds), *step_seeds)
         bad = [n for n, latent in enumerate(np.asarray(latents)) if not np.isfinite(latent).all()]
         if bad:
             raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
@@ -234,7 +239,7 @@ class Generator:
     ) -> UInt8[np.ndarray, "f h w 3"]:
         """Generate one clip of a simulation (`simulator.VideoGenerator`).
 
-        Raises what `condition` raises.
+        Raises the errors of `condition` and `generate`.
         """
         check_seed(seed, name="seed")
         return self.generate([self.condition(view, action, first_frame)], [seed])[0].frames
@@ -251,16 +256,16 @@ class Generator:
             raise InputError(
                 f"{self.config.name} is conditioned on a video of the whole scene and on hand "
                 "meshes; the view of a state has holes, and its hands are skeletons. Generate from "
-                "triplets (egosim generate --metadata), or simulate with a model of EgoSim's."
+                "triplets (egosim generate --metadata), or simulate with an EgoSim model."
             )
         video = self.config.video
         shape = (video.frames, video.height, video.width)
         check_video("The view", view.frames, shape)
-        check_video("The first frame, as a clip of one,", first_frame[None], (1, *shape[1:]))
+        check_video("The first frame (a video of one frame)", first_frame[None], (1, *shape[1:]))
         if len(action.joints_m) != video.frames:
             raise InputError(
                 f"The action has {len(action.joints_m)} frames, the clips of {self.config.name} "
-                f"have {video.frames}: give as many cameras and hands."
+                f"have {video.frames}: give cameras and hands for {video.frames} frames."
             )
         return Triplet(
             video_id="clip",
@@ -272,7 +277,7 @@ class Generator:
         )
 
     def fingerprint(self) -> str:
-        """Return the content hash of the config and all weights, as they are in memory."""
+        """Return the content hash of the config and all weights in memory."""
         state = nnx.to_flat_state(nnx.state(self.networks, nnx.Param))
         return fingerprint(
             {
@@ -289,8 +294,8 @@ class Generator:
         """Return the initial noise of each seed; only its last 32 bits matter."""
         return self._noise(last_32_bits(seeds))
 
-    def _stepping(self, seeds: T) -> tuple[T, ...]:
-        """Return the further arguments of a stochastic solver: the seeds."""
+    def _step_seeds(self, seeds: T) -> tuple[T, ...]:
+        """Return the seeds as last argument of `denoise`; nothing if the solver adds no noise."""
         return (seeds,) if self.config.solver.stochastic else ()
 
     def _clips(self, latents: Float[Array, "b f h w z"]) -> list[Clip]:
@@ -298,19 +303,14 @@ class Generator:
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
 
 
-def _step_keys(seeds: Array) -> Key[Array, " b"]:
-    """Return the key of each seed's noise at the solver's steps, other than its starting noise."""
-    return keys_for(seeds, 1)
-
-
 def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    """Iterate over the items in batches of `size`; the last one may be smaller."""
+    """Yield the items in batches of `size`; the last one may be smaller."""
     for first in range(0, len(items), size):
         yield items[first : first + size]
 
 
 def targets_of(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
-    """Return the target videos. Raises `InputError` naming the clips that have none."""
+    """Return the target videos. Raises `InputError` naming the clips without one."""
     without = [t.video_id for t in triplets if t.target is None]
     if without:
         raise InputError(f"{', '.join(without)}: no target to encode. (column video)")

@@ -1,8 +1,8 @@
-"""Ranking of candidate actions by the goal that their generated videos reach.
+"""Ranking of candidate actions by how well their generated videos reach a goal.
 
-Each candidate is generated with several seeds. Its score is a mean over them: the negative LPIPS of
-the last frame to an image of the goal, or the similarity of the video to a text, by X-CLIP. The
-best candidate has the highest score. (Kim et al. 2026, Dexterous World Models, action evaluation.)
+Each candidate is generated with several seeds. Its score is the mean over them: the negative LPIPS
+of the last frame to a goal image, or the X-CLIP similarity of the video to a text. The highest
+score is best. (Kim et al. 2026, Dexterous World Models, action evaluation.)
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from egosim_jax.types import InputError
 
 Score = Callable[[UInt8[np.ndarray, "f h w 3"]], float]
 """Function that scores a video; higher is better."""
-STRETCH = 0.02
+MAX_STRETCH = 0.02
 """Maximum relative difference between the aspect ratios of a goal image and the clips."""
 MEASURES = {"score": ("score", "{:.4f}"), "rank": ("rank", "{:.0f}")}
 
@@ -42,7 +42,7 @@ class Ranked:
     scores: tuple[float, ...]
     """Score of each seed's video; higher is better."""
     rank: int
-    """Place of the candidate, from 1."""
+    """Rank of the candidate; 1 is the best."""
 
     @property
     def score(self) -> float:
@@ -51,16 +51,16 @@ class Ranked:
 
 
 def by_image(goal: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Score:
-    """Return the score of a video whose last frame shall look like an image (LPIPS of AlexNet).
+    """Return a score: the negative LPIPS (AlexNet) of a video's last frame to a goal image.
 
-    The image is resized to `size`, rows and columns of the videos. Raises `InputError` if it has
-    another shape than they, so that resizing would stretch it, or LPIPS is not installed.
+    The image is resized to `size`, height and width of the videos. Raises `InputError` if that
+    would stretch it, or if LPIPS is not installed.
     """
     (rows, columns), (height, width) = goal.shape[:2], size
-    if abs(columns * height / (rows * width) - 1) > STRETCH:
+    if abs(columns * height / (rows * width) - 1) > MAX_STRETCH:
         raise InputError(
-            f"The image of the goal has {columns}x{rows} pixels and would be stretched to the "
-            f"{width}x{height} of the clips: crop it to their shape. (--goal-image)"
+            f"The goal image has {columns}x{rows} pixels and would be stretched to the "
+            f"{width}x{height} of the clips: crop it to their aspect ratio. (--goal-image)"
         )
     network, image = Lpips.load("alex"), resize_image(goal, height, width)[None]
 
@@ -71,12 +71,12 @@ def by_image(goal: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Score:
 
 
 def by_text(goal: str, folder: Path | None) -> Score:
-    """Return the score of a video that a text shall describe, by the X-CLIP model of a folder."""
+    """Return a score: the similarity of a video to a text, by the X-CLIP model in a folder."""
     if folder is None:
         raise InputError(
-            f"Videos cannot be compared with the text {goal!r} without a network: that takes a "
-            "folder of an X-CLIP model. Download microsoft/xclip-base-patch32 and name its folder, "
-            "or give an image of the goal (--goal-image). (--xclip)"
+            f"Comparing videos with the text {goal!r} needs the folder of an X-CLIP model: "
+            "download microsoft/xclip-base-patch32 and name its folder, or give a goal image "
+            "(--goal-image). (--xclip)"
         )
     network = XClip(folder)
     network.check_installed()
@@ -94,10 +94,10 @@ def order(scores: Mapping[str, Sequence[float]]) -> list[Ranked]:
 
 
 def rank(jobs: Sequence[BatchJob], windows: Sequence[Window], score: Score) -> list[Ranked]:
-    """Generate every candidate by each job, which differ in their seed, and rank them.
+    """Generate every candidate with each job, one per seed, and rank the candidates.
 
-    Finished clips are not generated again, and the weights of the first job are loaded once. Raises
-    `InputError` if a candidate is invalid, has no clip, or one of other conditions.
+    Finished clips are skipped, and the weights are loaded once, by the first job. Raises
+    `InputError` if a candidate is invalid, has no clip, or has a clip of other conditions.
     """
     _, rejected = jobs[0].check(windows)
     if rejected:
@@ -112,8 +112,8 @@ def rank(jobs: Sequence[BatchJob], windows: Sequence[Window], score: Score) -> l
             path = job.out / f"{name}.mp4"
             if not path.exists():
                 raise InputError(
-                    f"The candidate {name} has no clip in {job.out}, whose results.jsonl says why: "
-                    "all candidates must be generated to be ranked. (--actions)"
+                    f"The candidate {name} has no clip in {job.out}; its results.jsonl says why. "
+                    "All candidates must be generated to be ranked. (--actions)"
                 )
             found.append(score(read_video(path).frames))
     return order(scores)

@@ -1,7 +1,7 @@
-"""Clips whose frames are known as they are decoded.
+"""Streaming: frames of a clip as soon as they are decoded.
 
-A causal video VAE decodes one latent frame after the other, so the first frames of a clip are known
-before the last ones are decoded. The frames are those that decoding the whole clip gives.
+A causal video VAE decodes one latent frame after the other, so the first frames of a clip are ready
+before the last ones are decoded. They are the frames that decoding the whole clip gives.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 from jaxtyping import Array, Float, UInt8
 
-from egosim_jax.conditioning.video import to_uint8
+from egosim_jax.conditioning.pixels import to_uint8
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.generator import Generator
 from egosim_jax.types import Action, Triplet, View, check_seed
@@ -29,20 +28,25 @@ class CausalCodec(Protocol):
     def decode_next(
         self, latents: Float[Array, "b 1 h w z"], cache: Any
     ) -> tuple[Float[Array, "b g h2 w2 3"], Any]:
-        """Return the frames of the next latent frame, and the memory for the one after it."""
+        """Return the frames of the next latent frame, and the cache for the one after it."""
         ...
 
 
 class Streamer:
     """Generator that yields frames as they are decoded (`simulator.StreamedGenerator`)."""
 
-    def __init__(self, generator: Generator, mesh: Mesh | None = None):
-        """`mesh` is the generator's. A VAE that is not causal gives all frames at once."""
+    def __init__(self, generator: Generator):
+        """Stream a generator's clips; if its VAE is not causal, all frames are one group."""
         self.renderer = generator.renderer
         self._generator = generator
         vae = generator.networks.vae
         self._next = (
-            CompiledFn(_decode_next, vae, mesh=mesh, cache_key=("decode next", generator.config))
+            CompiledFn(
+                _decode_next,
+                vae,
+                mesh=generator.mesh,
+                cache_key=("decode next", generator.config),
+            )
             if isinstance(vae, CausalCodec)
             else None
         )
@@ -52,7 +56,7 @@ class Streamer:
         return self._generator.fingerprint()
 
     def fingerprint(self) -> str:
-        """Return the generator's content hash: streaming is no property of a clip."""
+        """Return the generator's content hash: streaming does not change a clip."""
         return self._fingerprint
 
     def compile(self, batch: int = 1) -> None:
@@ -65,6 +69,7 @@ class Streamer:
             program.compile(*shapes)
         latents = jax.ShapeDtypeStruct((batch, 1, *whole.shape[2:]), whole.dtype)
         cache = None
+        # The shapes of the cache are constant from the third latent frame on.
         for _ in range(min(3, whole.shape[1])):
             self._next.compile(latents, cache)
             cache = self._next.shapes(latents, cache)[1]
@@ -72,15 +77,15 @@ class Streamer:
     def condition(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
     ) -> Triplet:
-        """Return the conditions of a clip. Raises what `Generator.condition` raises."""
+        """Return the conditions of a clip; raises the errors of `Generator.condition`."""
         return self._generator.condition(view, action, first_frame)
 
     def groups(
         self, triplets: Sequence[Triplet], seeds: Sequence[int]
     ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
-        """Yield the frames of a clip of each triplet: one, then four for each latent frame.
+        """Yield groups of frames of one clip per triplet: one frame, then four per latent frame.
 
-        Raises what `Generator.generate` raises, before the first group.
+        Raises the errors of `Generator.generate`, before the first group.
         """
         if self._next is None:
             clips = self._generator.generate(triplets, seeds)

@@ -143,7 +143,7 @@ class DenoiserConfig(NetworkConfig, Protocol):
         ...
 
     def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
-        """Count a forward pass of one sample, of so many latent cells, text and image tokens."""
+        """Return the FLOPs of a forward pass of one sample, by its latent cells and tokens."""
         ...
 
 
@@ -169,10 +169,10 @@ class VideoCodecConfig(NetworkConfig, Protocol):
 
 @runtime_checkable
 class ChunkedCodecConfig(Protocol):
-    """Config of a video codec that takes fewer lengths than its strides allow."""
+    """Config of a video codec that supports only some of the lengths that its strides allow."""
 
     def check_frames(self, frames: int) -> None:
-        """Raise `InputError` for a number of frames that the codec does not take."""
+        """Raise `InputError` for a number of frames that the codec does not support."""
         ...
 
 

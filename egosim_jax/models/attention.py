@@ -34,15 +34,16 @@ from egosim_jax.types import InputError
 Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
 """Attention kernel.
 
-`xla` runs anywhere, on some heads at a time, so that few scores are in memory (`SCORES`); `cudnn`
-is the flash kernel of NVIDIA GPUs (bfloat16 or float16 only); `hopper` is the inference kernel of
-H100 and H200, replaced by cuDNN's where it does not apply, as under differentiation; `splash` runs
-on TPUs (elsewhere it is interpreted, for tests); `auto` picks the device's kernel if it applies."""
+    xla      runs anywhere; computes a few heads at a time to save memory (`SCORES`)
+    cudnn    flash kernel of NVIDIA GPUs, for bfloat16 and float16
+    hopper   inference kernel of H100 and H200; cuDNN's where it does not apply, as in training
+    splash   flash kernel of TPUs; interpreted elsewhere, for tests
+    auto     the device's kernel if it applies
+"""
 SCORES = 2**26
 """Bytes of scores that the `xla` kernel computes at a time, or one head's if these are more.
 
-The heads of a small model are computed all at once, which is faster. The heads of a long video
-are computed one by one.
+A small model's heads are computed all at once, which is faster; a long video's, one by one.
 """
 SELF_ATTENTION = "self_attention"
 """Checkpoint name of the residuals that a kernel's backward pass needs."""
@@ -64,10 +65,10 @@ def attention(
 ) -> Float[Array, "b n h k"]:
     """Attend without a mask; scores and softmax are float32 in every kernel.
 
-    `bias` is added to the scores; `scale` is 1/sqrt(k) unless given. The flash kernels take no
-    dense bias, so that only the text encoder, which has few tokens, passes one. `over` says what
-    the devices that share a sample divide among them, on a mesh that has such: heads, if there are
-    as many keys as queries, or queries, if there are few keys. Each then runs the kernel by itself.
+    `bias` is added to the scores; `scale` defaults to 1/sqrt(k). The flash kernels support no dense
+    bias: only the text encoder, which has few tokens, passes one. On a mesh, `over` is the axis
+    that the devices along context divide: heads, if there are as many keys as queries, or queries,
+    if there are few keys. Each device then runs the kernel by itself.
     """
     if over is not None and several_devices():
         _check_parts(q.shape, over)
@@ -82,7 +83,7 @@ def attention(
             out_specs=queries,
             check_vma=False,
         )
-        # Said outright, or the compiler would split the weights of q, k and v by heads, too.
+        # Without this, the compiler would also split the weights of q, k and v by heads.
         tokens = partial(constrain, axes=("batch", "tokens", None, None))
         if over == "heads":
             k, v = tokens(k), tokens(v)
@@ -92,7 +93,7 @@ def attention(
     scale = float(q.shape[-1] ** -0.5) if scale is None else scale
     kernel = _best(q) if kernel == "auto" else kernel
     if kernel == "hopper":
-        from egosim_jax.models import hopper  # which takes a third of a second
+        from egosim_jax.models import hopper  # the import takes a third of a second
 
         return hopper.attend(q, k, v, scale=scale)
     if kernel == "cudnn":
@@ -105,7 +106,7 @@ def attention(
 
 
 def _best(q: jax.Array) -> Kernel:
-    """Return the kernel of the device, if it can compute this."""
+    """Return the device's kernel if it supports these inputs, else `xla`."""
     size = q.shape[-1]
     if platform() == "gpu" and q.dtype.itemsize == 2 and size % 8 == 0 and size <= 128:
         return "hopper" if device_kind().startswith(HOPPER) else "cudnn"

@@ -1,8 +1,8 @@
 """Attention by the vendors' flash kernels: cuDNN on NVIDIA GPUs, splash on TPUs.
 
-Both never hold the scores, forward or backward. Each wants lengths that the video's tokens or the
-image's 257 do not have. Padding is masked by lengths or by segments, never by a dense mask, which
-would be as large as the scores.
+Neither stores the scores, forward or backward. Both need lengths that the video's tokens and the
+image's 257 tokens do not have, so inputs are padded. Padding is masked by lengths or by segments: a
+dense mask would be as large as the scores.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def splash(
 ) -> Queries:
     """Attend by the splash kernel.
 
-    `name` is given to what its backward pass needs of the forward pass, for checkpoint policies;
-    `interpret` runs it anywhere, slowly.
+    `name` names the residuals of the backward pass for checkpoint policies; `interpret` runs the
+    kernel anywhere, slowly.
     """
     from jax.experimental.pallas.ops.tpu.splash_attention import splash_attention_kernel as kernel
     from jax.experimental.pallas.ops.tpu.splash_attention import splash_attention_mask as masks

@@ -7,8 +7,8 @@ sum l of a row, in base 2,
     s  = scale · log2(e) · q kᵀ,   t' = max(t, max s),   p = 2^(s - t')
     l <- 2^(t - t') l + sum p,     o <- 2^(t - t') o + p v,          out = o / l
 
-so that the scores are never in memory. The tensor cores are given the next block's scores and this
-block's p v together, and the exponentials of the next block are taken while p v is under way
+so the scores are never in memory. The tensor cores get the next block's scores and this block's
+p v together; the exponentials of the next block are computed while p v runs
 (Shah et al. 2024, "FlashAttention-3", section 3.2).
 """
 
@@ -30,13 +30,13 @@ from egosim_jax.models import flash
 ROWS = 64
 """Queries of a warpgroup: the height of Hopper's matrix instructions."""
 COMPUTING = 2
-"""Warpgroups of the kernel that compute, besides the one that loads."""
+"""Number of computing warpgroups; one more loads."""
 BLOCK = 128
-"""Keys at a time: with more, accumulators do not fit the registers."""
+"""Keys of a block: with more, accumulators do not fit the registers."""
 STAGES = 2
 """Blocks of keys and values in shared memory."""
 MANY_KEYS = 8 * BLOCK
-"""From here on, filling the pipeline costs less than it gains over cuDNN."""
+"""Number of keys from which the kernel is faster than cuDNN, despite filling its pipeline."""
 REGISTERS = {"computing": 240, "fetching": 24}
 """Registers of a thread, by the kind of its warpgroup."""
 
@@ -45,7 +45,7 @@ Keys = Float[Array, "b m h k"]
 
 
 def attend(q: Queries, k: Keys, v: Keys, *, scale: float) -> Queries:
-    """Attend, in bfloat16 or float16 with float32 sums; by cuDNN where the kernel does not fit."""
+    """Attend in bfloat16 or float16 with float32 sums; by cuDNN if the kernel does not fit."""
     return _attend(q, k, v, scale) if fits(q, k) else flash.cudnn(q, k, v, scale=scale)
 
 
@@ -113,7 +113,7 @@ def _tile(
     queries_here: Any,
     **memory: Any,
 ) -> None:
-    """All of a block of threads: each warpgroup takes its part."""
+    """Body of a block of threads: each warpgroup runs its part."""
     warpgroup, head, sample = (lax.axis_index(x) for x in ("warpgroup", "head", "sample"))
 
     @pl.when(warpgroup < COMPUTING)
@@ -160,7 +160,7 @@ def _walk(
     keys_done: Any,
     values_done: Any,
 ) -> jax.Array:
-    """One warpgroup's way over all keys; `o` accumulates. Returns the output in float32."""
+    """Loop of one warpgroup over all keys; `o` accumulates. Return the output in float32."""
     scores = partial(pl.run_scoped, s=gpu.ACC((ROWS, BLOCK), jnp.float32))
     across = lambda x: lax.broadcast_in_dim(x, (ROWS, BLOCK), (0,))  # noqa: E731
     over = lambda x: lax.broadcast_in_dim(x, o.shape, (0,))  # noqa: E731

@@ -167,9 +167,9 @@ def modulate(
 def init_sharded(make: Callable[..., Any], *args: Any, out_shardings: Any = None) -> Any:
     """Run an initializer as one compiled program, with sharded outputs.
 
-    With its key in `args` the program is the same for every seed. Drawing hundreds of random arrays
-    is a long program that runs once, so that on a CPU, where optimizing it would take longer than
-    training a tiny model, it is compiled as it is.
+    With its key in `args`, the program is the same for every seed. It draws hundreds of arrays and
+    runs once. On a CPU it is compiled without optimization, which would take longer than training a
+    tiny model.
     """
     program = jax.jit(make, out_shardings=out_shardings).lower(*args)
     on_cpu = jax.default_backend() == "cpu"

@@ -47,7 +47,7 @@ class Delta:
 
 @dataclass(frozen=True, kw_only=True)
 class Value:
-    """Value in full that replaces a weight, such as DWM's patch projection."""
+    """Full value that replaces a weight, such as DWM's patch projection."""
 
     array: np.ndarray
     """New value of the weight."""
@@ -56,11 +56,11 @@ class Value:
 Change = Delta | Value | np.ndarray
 """Low-rank change of the linear layer at a path, or value or difference of the weight at a path."""
 MAX_RANK = 2048
-"""Highest rank that is read; with the network's own widths it bounds the memory."""
+"""Maximum rank; with the network's own widths it bounds the memory."""
 
 
 def linears(network: Any) -> Iterator[tuple[str, Linear]]:
-    """Iterate over the linear layers of a network with their dotted paths."""
+    """Yield the linear layers of a network with their dotted paths."""
     for path, module in nnx.iter_modules(network):
         if isinstance(module, Linear):
             yield ".".join(map(str, path)), module
@@ -166,8 +166,8 @@ def start(
     """Add trainable low-rank changes to the linear layers that match `targets`, in place.
 
     A is drawn as PEFT does, uniformly from ±1 / sqrt(in) (Kaiming's with a = sqrt(5)), and B is 0,
-    so that nothing changes before the first update. Raises `InputError` if no linear layer matches
-    `targets`, or no weight a pattern of `also_train`.
+    so the network does not change before the first update. Raises `InputError` if no linear layer
+    matches `targets`, or no weight matches a pattern of `also_train`.
     """
     if rank < 1:
         raise InputError(f"The rank of a LoRA must be at least 1, not {rank}.")
@@ -234,7 +234,7 @@ def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) 
 def misfit(
     shapes: Mapping[str, tuple[int, ...]], path: str, down: tuple[int, ...], up: tuple[int, ...]
 ) -> str | None:
-    """Return why a pair of such shapes does not fit the linear layer at a path, or None."""
+    """Return why a pair of these shapes does not fit the linear layer at a path, or None."""
     kernel = shapes.get(f"{path}.kernel", ())
     if len(kernel) not in (2, 3):  # of one layer, or of a stack of them
         return "is not a linear layer"

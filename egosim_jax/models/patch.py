@@ -1,7 +1,7 @@
 """Patch embedding of noisy latents and their condition.
 
-The embedding is linear, so that the contribution of the condition, which is the same at every
-denoising step, is computed once.
+The embedding is linear, so the contribution of the condition, which is the same at every denoising
+step, is computed once.
 """
 
 from __future__ import annotations

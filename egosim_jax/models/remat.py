@@ -1,4 +1,4 @@
-"""Rematerialization of a transformer's blocks: what the backward pass keeps or recomputes.
+"""Rematerialization of transformer blocks: activations that the backward pass recomputes.
 
 A block names its input (`name_input`) and the outputs of its attention projections
 (`name_projection`), and is scanned with the `wrapper` of a level.
@@ -50,7 +50,7 @@ def name_projection(x: jax.Array) -> jax.Array:
 
 
 def wrapper(level: Level) -> Callable[[Callable], Callable] | None:
-    """Return what wraps the scanned body of a level (`scan_blocks`); None without recomputation."""
+    """Return the wrapper of the scanned body (`scan_blocks`); None without recomputation."""
     checkpoint = partial(jax.checkpoint, prevent_cse=False)
     return {
         "none": None,

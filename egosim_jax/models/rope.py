@@ -1,9 +1,9 @@
 """Rotary position embedding over frames, rows and columns.
 
 A head of size k holds k/2 pairs (x_2j, x_2j+1), read as complex numbers. A token at frame f, row r
-and column c turns its first pairs by f·w_i, the next k//6 by r·w_i and the last k//6 by c·w_i,
-with w_i = 10000^(-i/p) for the p pairs of that axis. Queries and keys turned this way meet in a
-product that depends only on the difference of their positions. (Wan 2.1: 22, 21 and 21 pairs of
+and column c rotates its first pairs by f·w_i, the next k//6 by r·w_i and the last k//6 by c·w_i,
+with w_i = 10000^(-i/p) for the p pairs of that axis. The product of a query and a key then depends
+only on the difference of their positions. (Wan 2.1: 22, 21 and 21 pairs of
 a head of 128.)
 """
 
@@ -32,12 +32,12 @@ def rotations(frames: int, rows: int, columns: int, head_dim: int) -> Float[Arra
 def rotations_at(
     positions: tuple[np.ndarray, np.ndarray, np.ndarray], split: tuple[int, int, int]
 ) -> Float[Array, "n k 2"]:
-    """For every token, in the order (frame, row, column), what turns each channel of a head.
+    """Return the cosine and sine of each channel of a head, by token in the order (f, r, c).
 
     `positions` are the coordinates of frames, rows and columns, and `split` is the number of pairs
     that rotate with each. Channels x_2j and x_2j+1 have the same cosine c; their sines are -s and
-    s, so that a turned channel is its own value times the cosine plus the other's of the pair times
-    the sine. Angles are taken in float64 on the host; only one small table per axis enters the
+    s: a rotated channel is its own value times the cosine, plus the other channel of the pair times
+    the sine. Angles are computed in float64 on the host; only one small table per axis enters the
     program.
     """
     size = tuple(len(p) for p in positions)

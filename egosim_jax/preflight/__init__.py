@@ -1,6 +1,6 @@
-"""Compile a program for a machine that need not be present, and report its costs.
+"""Compilation of a program for a machine that need not be present, and a report of its costs.
 
-Programs come from the caller. Nothing here knows models or training.
+Callers pass the program: nothing here knows models or training.
 
     targets   target machines
     report    memory, collectives and roofline time, and whether it fits

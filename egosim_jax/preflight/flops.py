@@ -1,8 +1,8 @@
 """FLOPs of a traced program, counted in its jaxpr.
 
-Matrix products and convolutions are counted, a multiplication and an addition as two FLOPs, and
-those inside the flash attention kernels, which a jaxpr only names. Rematerialization in a backward
-pass counts; equations whose results are unused do not.
+Counts matrix products and convolutions, with two FLOPs for a multiplication and an addition. Flash
+attention kernels, which a jaxpr only names, count by the products inside. Rematerialization in a
+backward pass counts; equations with unused results do not.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ KERNELS = {
     "dot_product_attention_bwd_wrapper": 5,
     "hopper_attention": 2,
 }
-"""Products in jax's cuDNN kernels, whose backward recomputes the scores, and in ours."""
+"""Products in jax's cuDNN kernels and in ours; the backward pass recomputes the scores."""
 SPLASH = {"splash_mha_fwd": 2, "splash_mha_dkv": 5}
-"""Products in the splash kernels, by the beginning of the name; the backward is fused."""
+"""Products in the splash kernels, by the beginning of the name; the backward pass is fused."""
 
 
 def count(jaxpr: Any) -> float:

@@ -4,9 +4,8 @@ The text is a list of computations, each a list of instructions
 
     %name = type opcode(%operand, ...), attribute=value, ..., metadata={op_name="..."}
 
-A loop's trip count is the one that the compiler found, or the bound in the loop's condition. The
-instructions of a fusion are one pass over memory; all others read their operands and write their
-results.
+A loop's trip count is the compiler's, or else the bound in the loop's condition. A fusion's
+instructions are one pass over memory; all others read their operands and write their results.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class Instruction:
 
     @property
     def source(self) -> str:
-        """Return the traced operation it comes from; empty if the compiler added it."""
+        """Return the traced operation that it comes from; empty if the compiler added it."""
         found = _OP_NAME.search(self.attributes)
         return found.group(1) if found else ""
 
@@ -163,7 +162,7 @@ class HloModule:
         return sorted(arrays, key=lambda array: (-array.bytes, array.source))[:count]
 
     def _sent_in(self, computation: str) -> Iterator[tuple[Instruction, float]]:
-        """Yield the collectives of a computation and its fusions, and the bytes each sends."""
+        """Yield each collective of a computation and its fusions, and the bytes that it sends."""
         have = self.computations[computation]
         for instruction in have.values():
             if instruction.opcode == "fusion":
@@ -215,7 +214,7 @@ class HloModule:
         return sum(operands) + instruction.bytes - given
 
     def _fused(self, inner: Mapping[str, Instruction], out: int) -> int:
-        """Return the bytes of a fusion: the slices it takes and those it updates."""
+        """Return the bytes of a fusion; for a sliced or updated array, only the slice counts."""
         users: dict[str, list[Instruction]] = defaultdict(list)
         for instruction in inner.values():
             for name in instruction.operands:

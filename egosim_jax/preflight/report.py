@@ -63,7 +63,7 @@ class Report:
     compute_s: float
     """Seconds for the FLOPs at the devices' peak."""
     memory_s: float
-    """Seconds for the memory traffic, if every operation reads and writes once."""
+    """Seconds for the memory traffic, if every operation reads and writes memory once."""
     link_s: float
     """Seconds for the collectives."""
     compile_s: float
@@ -81,7 +81,7 @@ class Report:
 
     @property
     def roofline_s(self) -> float:
-        """Return the roofline time: the longest of the three, if the others overlap with it."""
+        """Return the roofline time: the longest of the three times, if they overlap fully."""
         return max(self.compute_s, self.memory_s, self.link_s)
 
 
@@ -105,7 +105,7 @@ class OutOfMemory:
 def compile_for(
     target: Target, traced: Any, *, model_flops: float = math.nan, resident: int = 0
 ) -> Report | OutOfMemory:
-    """Compile what `jax.jit` traced for the target's devices, and report its costs."""
+    """Compile a trace of `jax.jit` for the target's devices, and report its costs."""
     begun = time.perf_counter()
     try:
         compiled = traced.lower().compile()
@@ -162,7 +162,7 @@ def inspect(
 
 
 def parse_oom(error: Exception, target: Target) -> OutOfMemory:
-    """Parse a compiler's out-of-memory error. Raises any other error again."""
+    """Parse a compiler's out-of-memory error; raise any other error again."""
     found = next(filter(None, (needs.search(str(error)) for needs in _NEEDS)), None)
     if found is None:
         raise error

@@ -1,7 +1,7 @@
 """Target machines to compile for; the machine need not be present.
 
-XLA's compilers for NVIDIA GPUs and for TPUs come with jax's packages and run anywhere. A TPU slice
-is given to them by its name, a GPU by the properties that its driver would report.
+XLA's compilers for NVIDIA GPUs and for TPUs come with jax's packages and run anywhere. They take a
+TPU slice by its name, and a GPU by the properties that its driver would report.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ DEVICES: Mapping[str, Device] = {
         link=900e9,
         chip=Chip(capability=(10, 0), cores=148, shared=233472, l2=132644864, clock_ghz=1.965),
     ),
-    # Google's pages on each TPU version, all links of a chip together, one way; memory as the
-    # compiler has it.
+    # Google's pages on each TPU version; links one way, all of a chip together; memory as the
+    # compiler reports it.
     "v5e": Device(
         kind="TPU v5 lite",
         platform="tpu",
@@ -132,7 +132,7 @@ OFFLINE_ENV = {
     "TPU_WORKER_HOSTNAMES": "localhost",
     "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",
 }
-"""Environment variables with which the compilers look for no driver, TPU host or lock."""
+"""Environment variables that stop the compilers from looking for a driver, TPU host or lock."""
 GPU_SHARE = 0.95
 """Share of a GPU's memory that XLA may allocate, with the settings of docs/train.md."""
 
@@ -171,9 +171,9 @@ def parse(name: str) -> tuple[str, str]:
 
 
 def compile_offline() -> None:
-    """Set up this process to compile for absent devices: for entry points, before jax starts.
+    """Set up this process to compile for absent devices; an entry point calls it before jax starts.
 
-    Sets the variables of `OFFLINE_ENV` and leaves jax the CPU only.
+    Sets the variables of `OFFLINE_ENV`, and limits jax to the CPU.
     """
     import jax
 
@@ -183,7 +183,7 @@ def compile_offline() -> None:
 
 
 def find(name: str) -> Target:
-    """Return a target by its name: `h200:8`, `v5p:2x2x2`, `cpu:1`.
+    """Return a target by name: `h200:8`, `v5p:2x2x2`, `cpu:1`.
 
     GPUs and TPUs need `compile_offline`. Raises `InputError` if the target is unknown, or its
     compiler is not installed.

@@ -1,13 +1,13 @@
 """Rendering of points, hands and meshes along a camera path.
 
 Two modules satisfy `Renderer` and draw the same images: `reference` in NumPy and `jitted` in JAX.
-Reading and writing of scenes is in `state`. Sources: EgoSim, section 3.2 (rendering of the prior),
+Scenes are read and written in `state`. Sources: EgoSim, section 3.2 (rendering of the prior),
 and the released `render_16fps_aligned.py`; colors and sizes of the hands are measured on the
 published videos.
 
     Renderer, get        interface, and a renderer by name
     hand_mesh, mano      meshes of hands
-    portrait, rerun_log  views of a state for humans
+    portrait, rerun_log  images and recordings of a state
 """
 
 from __future__ import annotations

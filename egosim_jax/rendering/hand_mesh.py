@@ -1,16 +1,16 @@
 """Skinned mesh of a hand over 21 keypoints, which needs no licensed hand model.
 
 The template is the level set of a smooth union of cones, one along each bone of an open right hand
-and some across the palm; its triangles come from naive surface nets. Keypoints pose it by linear
-blend skinning. A bone that goes from p to q, and from r along the unit vector d with length l in
-the template, moves the point x to
+and some across the palm. Its triangles come from naive surface nets. Keypoints pose it by linear
+blend skinning. Let a bone go from p to q; in the template it starts at r and has the direction d
+and the length l. It moves the point x to
 
     p + R (s (x - r) + (|q - p| / l - s) ((x - r) . d) d)
 
-where s is the median ratio of the bones' lengths, so that fingers are as long and as thick as the
-hand is large, and R is the rotation of the bone's parent followed by the smallest one that turns
-the bone onto its place. The parent of the bones of the palm is the least-squares rotation of the
-palm. A left hand is the mirror image of a right one.
+where s is the median of the bones' length ratios, so the thickness of fingers follows the size of
+the hand. R is the rotation of the bone's parent, followed by the smallest rotation that aligns the
+bone. The parent of palm bones is the least-squares rotation of the palm. A left hand is the mirror
+image of a right one.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ RADII_MM = np.array(
 )  # fmt: skip
 """Radius of the hand at each keypoint in millimeters."""
 ACROSS = ((1, 5), (5, 9), (9, 13), (13, 17))
-"""Pairs of keypoints with flesh between them that is no bone."""
+"""Pairs of keypoints joined by soft tissue, not a bone."""
 PALM = [0, 5, 9, 13, 17]
 """Keypoints that hardly move relative to each other."""
 BLEND_MM, VOXEL_MM = 3.0, 4.0
-"""Radius of the rounding between bones and of the blending of their motions; grid of the mesh."""
+"""Blending radius of the bones' shapes and motions; voxel size of the mesh."""
 
 
 class Template(NamedTuple):
@@ -63,8 +63,8 @@ def pose_hands(
 ) -> MovingMesh:
     """Return the meshes of n hands along their keypoints, in the colors of their sides.
 
-    A hand with a joint that is not finite is missing from that frame. Without `sides` there are a
-    left and a right hand, in this order. Raises `InputError` for other numbers of joints or sides.
+    A hand with a non-finite joint is missing from that frame. `sides` defaults to a left and a
+    right hand, in this order. Raises `InputError` for another number of joints or sides.
     """
     sides = ("left", "right") if sides is None else tuple(sides)
     shape = np.shape(joints_m)
@@ -122,6 +122,7 @@ def _rotations(
         "fkc,kd->fcd", posed - posed.mean(axis=1, keepdims=True), rest - rest.mean(axis=0)
     )
     u, _, vt = np.linalg.svd(covariance)
+    # A proper rotation, never a reflection.
     u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
     palm = u @ vt
     rotations = np.empty((len(joints), len(along), 3, 3))
@@ -140,6 +141,7 @@ def _smallest_rotation(
     cross = np.zeros((len(start), 3, 3))
     cross[:, [2, 0, 1], [1, 2, 0]] = np.stack([x, y, z], axis=-1)
     cross[:, [1, 2, 0], [2, 0, 1]] = -np.stack([x, y, z], axis=-1)
+    # Opposite vectors have no unique rotation; the bound keeps the result finite.
     cosine = np.maximum((start * end).sum(axis=-1), -0.999)
     return np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
 
@@ -174,7 +176,7 @@ def _gap(points: Float[np.ndarray, "n 3"], a: int, b: int) -> Float[np.ndarray, 
 
 
 def _weights(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 20"]:
-    """Return the shares of the bones: of the nearest one and those that share a joint with it."""
+    """Return the weights of the nearest bone and of the bones that share a joint with it."""
     bones = SKELETONS["human"].bones
     gaps = np.stack([_gap(points, a, b) for a, b in bones.tolist()], axis=1)
     touching = (bones[:, None, :, None] == bones[None, :, None, :]).any(axis=(2, 3))
@@ -186,7 +188,7 @@ def _weights(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 20"]:
 def _surface_net(
     level: Float[np.ndarray, "x y z"],
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
-    """Return the surface of level 0: a vertex in each cell that it crosses, in cells (Gibson 1998).
+    """Return the surface of level 0, in cells: one vertex in each cell it crosses (Gibson 1998).
 
     The vertex is the mean of the crossings of the cell's edges; the four cells around a crossed
     edge share a square.

@@ -1,7 +1,7 @@
-"""Renderer in JAX, which the product uses; it draws the same images as `reference`.
+"""Renderer in JAX, the default; it draws the same images as `reference`.
 
-Points: all squares of a given size are the same square moved by integer offsets. So each point is
-written into one cell only, the cell of its first pixel. A pixel sees the nearest of p x p
+Points: all squares of one size are the same square at integer offsets. So each point is written
+into one cell only, the cell of its first pixel. A pixel sees the nearest of p x p
 neighboring cells: p^2 comparisons per pixel instead of p^2 writes per point.
 
 Hands: a shape is intersected only with the rays of the tiles that its bounding box meets.
@@ -44,7 +44,7 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
 
     Raises `InputError` if the first frame shows no point.
     """
-    # Points are padded to few different counts, so that a growing state rarely compiles again.
+    # Pad to one of a few counts, so that a growing state rarely recompiles.
     count = len(state.points_m)
     block = 1 << max(count.bit_length() - 3, 12)
     missing = -count % block
@@ -71,7 +71,7 @@ def splat(
     points_m: Float[Array | np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
 ) -> tuple[Float32[Array, "f h w"], Int32[Array, "f h w"]]:
     """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none."""
-    with jax.enable_x64(True):  # as `reference`: of close points, float32 would show another
+    with jax.enable_x64(True):  # as in `reference`: in float32 another of two close points may win
         return _splat(
             points_m,
             invert(cameras.world_from_camera).astype(np.float64),
@@ -97,7 +97,7 @@ def _splat(
     points = points_m.astype(jnp.float64).T
 
     def frame(camera_from_world: Array) -> tuple[Array, Array]:
-        # Written out: as a product of matrices with three columns it takes ten times as long.
+        # Written by components: a product of matrices with three columns takes ten times as long.
         x, y, z = (
             (a * points[0] + b * points[1] + c * points[2] + shift).astype(jnp.float32)
             for a, b, c, shift in camera_from_world[:3]
@@ -127,7 +127,7 @@ def _splat(
 def _nearest_square(
     depth: Float32[Array, "r c"], number: Int32[Array, "r c"], point_px: int
 ) -> tuple[Float32[Array, "h w"], Int32[Array, "h w"]]:
-    """Return the nearest of the p x p cells that cover each pixel; among equals the first."""
+    """Return the nearest of the p x p cells that cover each pixel; at equal depth the first."""
     height, width = (extent - point_px + 1 for extent in depth.shape)
     best = depth[:height, :width], number[:height, :width]
     for down in range(point_px):
@@ -213,7 +213,7 @@ def _draw_chunk(
     intrinsics_px: Float32[Array, "3 3"],
     columns: int,
 ) -> Canvas:
-    """Draw each shape into its tile; of equally near ones the first is seen."""
+    """Draw each shape into its tile; at equal depth the first shape is visible."""
     x, y = pixel_rays(tile, intrinsics_px, columns)
     return put(canvas, tile, _meet(x, y, start, end, radius), color[:, None, None])
 
@@ -227,7 +227,7 @@ def _meet(
 ) -> Float32[Array, "k p p"]:
     """Return the depth at which rays (x, y, 1) enter a sphere (start = end) or a tube, or infinity.
 
-    Written by components: as products of matrices with three columns it takes ten times as long.
+    Written by components: products of matrices with three columns take ten times as long.
     """
     along = end - start
     length = jnp.sqrt((along**2).sum(axis=-1))
@@ -239,7 +239,7 @@ def _meet(
     cosine = x * ax + y * ay + az
     cx, cy, cz = x - cosine * ax, y - cosine * ay, 1 - cosine * az
     a = cx**2 + cy**2 + cz**2
-    # The nearest point of each ray to the axis first: b^2 - a c would cancel in float32.
+    # From the ray's nearest point to the axis: b^2 - a c would cancel in float32.
     b = cx * ox + cy * oy + cz * oz
     share = b / a
     gap = (ox - share * cx) ** 2 + (oy - share * cy) ** 2 + (oz - share * cz) ** 2

@@ -1,4 +1,4 @@
-"""Hands of MANO (Romero et al. 2017) from the user's own model file, which is not ours to ship.
+"""MANO hands (Romero et al. 2017) from the user's own model file, which we may not ship.
 
 With shape b, rotations R_0 ... R_15 of the wrist and 15 joints given as axis times angle, and the
 model's arrays, the vertices are
@@ -27,7 +27,7 @@ from egosim_jax.rendering.mesh import HAND_COLORS, MovingMesh, Side, join_meshes
 from egosim_jax.types import InputError
 
 JOINTS, BETAS = 16, 10
-"""Number of joints, the wrist included, and of coefficients of the shape."""
+"""Number of joints, including the wrist, and number of shape coefficients."""
 
 
 @no_type_check
@@ -38,11 +38,11 @@ class Mano:
     v_template: Float[np.ndarray, "v 3"]
     """Vertices of the mean shape in meters."""
     shapedirs: Float[np.ndarray, "v 3 10"]
-    """Displacement of the vertices for each coefficient of the shape."""
+    """Displacement of the vertices for each shape coefficient."""
     posedirs: Float[np.ndarray, "v 3 135"]
     """Displacement of the vertices for each entry of the joints' rotations."""
     j_regressor: Float[np.ndarray, "16 v"]
-    """Weights of the vertices in the joints."""
+    """Weights of the vertices in each joint's position."""
     weights: Float[np.ndarray, "v 16"]
     """Share of each joint in the motion of each vertex."""
     parents: tuple[int, ...]
@@ -50,7 +50,7 @@ class Mano:
     triangles: Int[np.ndarray, "t 3"]
     """Vertex indices of each triangle."""
     hands_mean: Float[np.ndarray, " 45"]
-    """Mean pose, which some data give their poses relative to."""
+    """Mean pose; some datasets give poses relative to it."""
 
     def __post_init__(self) -> None:
         """Check shapes, parents, triangles, and that all values are finite."""
@@ -76,7 +76,7 @@ class Mano:
             )
         if not 0 <= self.triangles.min() <= self.triangles.max() < count:
             raise InputError(
-                f"Triangles of the hand model name vertices up to {self.triangles.max()}: there "
+                f"Triangles of the hand model use vertices up to {self.triangles.max()}: there "
                 f"are {count}. (--mano-right, --mano-left)"
             )
 
@@ -93,10 +93,10 @@ class ManoPoses:
     translation_m: Float[np.ndarray, "f n 3"]
     """Translation of the vertices in meters."""
     betas: Float[np.ndarray, "n 10"]
-    """Coefficients of the shapes."""
+    """Shape coefficients of each hand."""
 
     def __post_init__(self) -> None:
-        """Check shapes, and that a hand of a frame is given completely or not at all."""
+        """Check shapes, and that each hand of a frame is complete or missing."""
         frames, hands = (
             np.shape(self.global_orient)[:2] if np.ndim(self.global_orient) == 3 else (0, 0)
         )
@@ -116,8 +116,8 @@ class ManoPoses:
         if broken.any() or not np.isfinite(self.betas).all():
             frame, hand = np.argwhere(broken)[0].tolist() if broken.any() else (0, 0)
             raise InputError(
-                f"Hand {hand} of frame {frame} has parameters that are not finite and others that "
-                "are: give all of a hand, or NaN for all where it is missing. (--mano-poses)"
+                f"Hand {hand} of frame {frame} is only partly finite: give all parameters of a "
+                "hand, or NaN for all where it is missing. (--mano-poses)"
             )
 
     @property
@@ -127,7 +127,7 @@ class ManoPoses:
 
 
 def read_mano(path: Path) -> Mano:
-    """Read MANO_RIGHT.pkl or MANO_LEFT.pkl. Raises `InputError` if it is not such a file."""
+    """Read MANO_RIGHT.pkl or MANO_LEFT.pkl. Raises `InputError` for any other file."""
     arrays = read_model(path)
     names = (
         "v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f",
@@ -135,8 +135,8 @@ def read_mano(path: Path) -> Mano:
     )  # fmt: skip
     if missing := [name for name in names if name not in arrays]:
         raise InputError(
-            f"{quote_path(path)} has no {', '.join(missing)}: it is not a hand model of MANO. Give "
-            "MANO_RIGHT.pkl or MANO_LEFT.pkl of mano.is.tue.mpg.de. (--mano-right, --mano-left)"
+            f"{quote_path(path)} has no {', '.join(missing)}: it is not a MANO hand model. Give "
+            "MANO_RIGHT.pkl or MANO_LEFT.pkl from mano.is.tue.mpg.de. (--mano-right, --mano-left)"
         )
     table, triangles = arrays["kintree_table"], arrays["f"]
     if table.shape != (2, JOINTS) or triangles.ndim != 2 or triangles.shape[1] != 3:
@@ -168,15 +168,15 @@ def mano_hands(
     """Return the meshes of a left and a right hand, in this order, in the colors of their sides.
 
     Without a model of the left hand, its poses are read as right-hand poses, as HaMeR estimates
-    them. The right hand is posed, mirrored in x, then moved by the translation. So the global
-    orientation is in mirrored axes of the world: where HaMeR's is G and R turns its camera to the
-    world, it is (M R M) G with M = diag(-1, 1, 1). `add_mean` is for poses relative to the mean
-    pose. Raises `InputError` for another number of hands.
+    them: the right hand is posed, mirrored in x, then translated. So the global orientation is in
+    mirrored world axes. If HaMeR's is G and R rotates its camera to the world, it is (M R M) G
+    with M = diag(-1, 1, 1). `add_mean` is for poses relative to the mean pose.
+    Raises `InputError` for another number of hands.
     """
     if poses.global_orient.shape[1] != 2:
         raise InputError(
             f"The poses have {poses.global_orient.shape[1]} hands: there must be 2, left before "
-            "right; a missing one has NaN. (--mano-poses)"
+            "right; a missing hand has NaN. (--mano-poses)"
         )
     sides: tuple[Side, Side] = ("left", "right")
     models = (left or right, right)
@@ -236,7 +236,7 @@ def rotations_of(turns: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"
     x, y, z = np.moveaxis(turns, -1, 0)
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
-    small = angle < 1e-8
+    small = angle < 1e-8  # where the quotients are 0 / 0: their limits
     safe = np.where(small, 1.0, angle)
     first = np.where(small, 1.0, np.sin(safe) / safe)
     second = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)

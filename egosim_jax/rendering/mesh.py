@@ -1,12 +1,12 @@
-"""Triangle meshes that move, and how they are shaded.
+"""Moving triangle meshes, and their shading.
 
 The only light is at the camera. A surface of color c in [0, 1] whose unit normal has the cosine k
 with the direction towards the camera is drawn as
 
     c * (AMBIENT + DIFFUSE * max(0, k)),    clipped to [0, 1]
 
-with the normal interpolated between vertices (Phong). Faces seen from behind have a negative cosine
-and so ambient light only. Source: the hand videos of DWM (CVPR 2026), drawn by PyTorch3D's
+with the normal interpolated between vertices (Phong). Faces seen from behind have a negative
+cosine, so only ambient light. Source: the hand videos of DWM (CVPR 2026), drawn by PyTorch3D's
 rasterizer at pixel centers, without antialiasing and without the scene that may hide the hands.
 """
 
@@ -29,8 +29,8 @@ HAND_COLORS: dict[Side, tuple[float, float, float]] = {
 """RGB in [0, 1] of hand meshes: DWM's."""
 AMBIENT, DIFFUSE = 0.7, 0.6
 """Intensities of the light."""
-MASK_SUM = 100
-"""Largest sum of the three color values of a pixel that is not of a hand."""
+MAX_BACKGROUND_SUM = 100
+"""Maximum sum of the three color values of a pixel without a hand."""
 
 
 @no_type_check
@@ -70,7 +70,7 @@ class MovingMesh:
 
 
 def join_meshes(meshes: Sequence[MovingMesh]) -> MovingMesh:
-    """Return one mesh of several that have equally many frames."""
+    """Join meshes that have the same number of frames into one."""
     starts = np.cumsum([0, *(mesh.vertices_m.shape[1] for mesh in meshes)])
     return MovingMesh(
         vertices_m=np.concatenate([mesh.vertices_m for mesh in meshes], axis=1),
@@ -94,9 +94,9 @@ def vertex_normals(
 
 
 def hand_mask(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w 3"]:
-    """Return a hand video as a binary one: white where red, green and blue add up to over 100.
+    """Return the silhouettes of a hand video: white where red, green and blue add up to over 100.
 
-    It is the hand condition of one of DWM's ablations.
+    This is the hand condition of a DWM ablation.
     """
-    white = frames.astype(np.int32).sum(axis=-1, keepdims=True) > MASK_SUM
+    white = frames.astype(np.int32).sum(axis=-1, keepdims=True) > MAX_BACKGROUND_SUM
     return np.where(white, np.uint8(255), np.uint8(0)).repeat(3, axis=-1)

@@ -1,9 +1,9 @@
 """Renderer of shaded meshes in JAX, which draws the same images as `mesh_reference`.
 
 With the corners a, b, c of a triangle in camera coordinates, a ray d from the camera leaves them on
-one side if d . (b x c), d . (c x a) and d . (a x b) have one sign; divided by their sum they are
+one side if d . (b x c), d . (c x a) and d . (a x b) have one sign. Divided by their sum they are
 the barycentric coordinates, and d meets the plane at the depth a . (b x c) / sum. Both triangles of
-an edge calculate the same product, so that no ray passes between them.
+an edge compute the same product, so no ray passes between them.
 """
 
 from __future__ import annotations

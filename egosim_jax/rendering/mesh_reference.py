@@ -16,7 +16,7 @@ def draw_mesh(
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
     """Draw a mesh; return the image and its depth, black and infinite off the mesh.
 
-    Triangles with a vertex that is not finite are missing. Nothing nearer than 1 cm is drawn.
+    Triangles with a non-finite vertex are missing. Nothing nearer than 1 cm is drawn.
     """
     shape = len(mesh.vertices_m), cameras.height, cameras.width
     image, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, np.inf, np.float32)
@@ -61,8 +61,8 @@ def draw_scene(
         mask[frame][seen] = 0
     if mask[0].all():
         raise InputError(
-            f"None of the {len(triangles)} triangles of the scene is seen in the first frame: the "
-            "camera must look at the scene, in the same world coordinates."
+            f"None of the {len(triangles)} triangles of the scene is visible in the first frame: "
+            "the camera must look at the scene, in the same world coordinates."
         )
     return image, mask
 

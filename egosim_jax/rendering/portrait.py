@@ -19,11 +19,11 @@ Up = Literal["z", "-y"]
 UP_AXES: dict[Up, tuple[float, float, float]] = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
 """Unit vector of each axis that may point up."""
 SIDES, ABOVE = (-40.0, 0.0, 40.0), 30.0
-"""Directions of the cameras in degrees: around the vertical, and above the horizon."""
+"""Angles of the cameras in degrees: around the vertical axis, and above the horizon."""
 DISTANCE, FIELD_OF_VIEW = 3.0, 50.0
-"""Distance of the cameras in radii, and their horizontal field of view in degrees.
+"""Distance of the cameras in radii, and horizontal field of view in degrees.
 
-The radius contains three quarters of the points.
+Three quarters of the points are within the radius.
 """
 HEIGHT, WIDTH = 480, 640
 
@@ -42,8 +42,8 @@ def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:
 def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
     """Return images of a state from the left, the front and the right, slightly from above.
 
-    The front is where a wearer looks from: along y if z is up, along z if -y is. Points are as
-    large as the distance between neighbors.
+    The front view looks the way a wearer does: along y if z is up, along z if -y is up. The point
+    size is the distance between neighboring points.
     """
     import open3d as o3d
 

@@ -1,8 +1,8 @@
 """Renderer in NumPy, and Open3D for meshes, the reference for `jitted`; it does not import jax.
 
 A point at depth z that projects to (u, v) is a square of p x p pixels: those (i, j) with
--p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. A pixel sees the nearest of the points that cover it,
-and among equally near ones the first. A joint is a sphere, a bone the tube between two joints; a
+-p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. A pixel sees the nearest of the points that cover it;
+at equal depth, the first. A joint is a sphere, a bone the tube between two joints; a
 pixel shows the shape that its ray meets first, without shading.
 """
 
@@ -32,8 +32,7 @@ def splat(
 ) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
     """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none.
 
-    Points with a coordinate that is not finite, nearer than 1 cm or farther than 100 m are not
-    drawn.
+    Points that are not finite, nearer than 1 cm or farther than 100 m are not drawn.
     """
     shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
     depth, index = np.full(shape, np.inf, np.float32), np.full(shape, -1)
@@ -46,7 +45,7 @@ def splat(
         u, v = project(focal, local)
         # One key for depth and number: the bits of positive floats sort as the floats do.
         keys = local[:, 2].copy().view(np.uint32).astype(np.uint64) << 32 | number
-        order = np.argsort(keys)[::-1]  # of equal cells the last one counts: the nearest point
+        order = np.argsort(keys)[::-1]  # the last write to a cell wins: the nearest point
         column, row = (np.ceil(x[order] - point_px / 2).astype(int) for x in (u, v))
         keys, best = keys[order], np.full(shape[1] * shape[2], NO_POINT)
         for down in range(point_px):
@@ -79,8 +78,8 @@ def unobserved(
 ) -> UInt8[np.ndarray, "f h w"]:
     """Return the mask, 255 where no point is seen.
 
-    In training data, the points of the mask are twice as large as the points of the image. A view
-    of the state has points of one size, and `dilate` widens the mask's observed part by a pixel.
+    In training data, the mask's points are twice as large as the image's. A view of the state has
+    points of one size, so `dilate` widens the mask's observed part by a pixel instead.
     """
     drawn = index >= 0
     if not dilate:
@@ -111,8 +110,8 @@ def check_visible(index: Int[np.ndarray, "h w"], count: int) -> None:
     """Raise `InputError` if no pixel of the first frame sees one of the scene's points."""
     if (index < 0).all():
         raise InputError(
-            f"None of the {count} points of the scene is seen in the first frame: the camera must "
-            "look at the scene, from 1 cm to 100 m away."
+            f"None of the {count} points of the scene is visible in the first frame: the camera "
+            "must look at the scene, from 1 cm to 100 m away."
         )
 
 
@@ -121,8 +120,8 @@ def draw_hands(
 ) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
     """Draw n hands; return the image and its depth, black and infinite where there is no hand.
 
-    A hand with a joint that is not finite is missing from that frame. Nothing nearer than 1 cm or
-    behind the camera is drawn.
+    A hand with a non-finite joint is missing from that frame. Nothing nearer than 1 cm or behind
+    the camera is drawn.
     """
     skeleton = SKELETONS[kind]
     frames, height, width = len(joints_m), cameras.height, cameras.width
@@ -154,7 +153,7 @@ def _window(
 ) -> tuple[slice, slice]:
     """Return the rows and columns that may show a shape: the bounds of its projected box."""
     low, high = np.minimum(start, end) - radius, np.maximum(start, end) + radius
-    if low[2] < NEAR_M:  # its corners have no projection; `_meet` drops the part behind the camera
+    if low[2] < NEAR_M:  # corners behind the camera cannot be projected; `_meet` clips
         return slice(0, cameras.height), slice(0, cameras.width)
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
     u, v = project(cameras.intrinsics_px, corners)

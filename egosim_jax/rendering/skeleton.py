@@ -21,7 +21,7 @@ NEAR_M, FAR_M = 0.01, 100.0
 """Near and far plane in meters: nothing outside them is drawn."""
 
 GAMMA = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
-"""Tone curve of the original renderer: c -> c^(1/2.2), applied to values that are not linear."""
+"""Tone curve of the original renderer: c -> c^(1/2.2), applied to nonlinear values."""
 
 THUMB, INDEX, MIDDLE = (238, 130, 238), (255, 99, 71), (230, 245, 250)
 RING, LITTLE = (173, 255, 47), (0, 152, 191)
@@ -50,4 +50,4 @@ def _robot() -> Skeleton:
 
 
 SKELETONS: dict[Kind, Skeleton] = {"human": _human(), "robot": _robot()}
-"""Skeleton of each kind of hand; human ones have the original's tone curve, grippers do not."""
+"""Skeleton of each kind of hand; only human hands have the original's tone curve."""

@@ -1,7 +1,6 @@
-"""Square tiles of an image: a shape is drawn only in those that its bounding box meets.
+"""Square tiles of an image: a shape is drawn only in the tiles that its bounding box meets.
 
-So that jax compiles once for images of one size, pairs of shape and tile are drawn in chunks of
-equal length.
+Pairs of shape and tile are drawn in chunks of equal length, so jax compiles once per image size.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from egosim_jax.rendering.skeleton import NEAR_M
 from egosim_jax.types import Cameras
 
 TILE_PX, CHUNK = 16, 256
-"""Side of a tile in pixels, and pairs of shape and tile that are drawn at a time."""
+"""Side of a tile in pixels, and number of pairs of shape and tile in a chunk."""
 
 Canvas = tuple[Float32[Array, "t p p"], UInt8[Array, "t p p 3"]]
 """Depth and colors of all tiles of an image."""
@@ -89,10 +88,10 @@ def _bounding_tiles(
     cameras: Cameras,
     tiles: tuple[int, int],
 ) -> tuple[Int[np.ndarray, "s 2"], Int[np.ndarray, "s 2"]]:
-    """Return the first row and column of tiles of each shape, and those after the last.
+    """Return row and column of each shape's first tile, and of the tile after its last.
 
-    They bound the image of the corners of the box around the shape. A shape that reaches nearer
-    than `NEAR_M` may be anywhere in the image; one that is nearer as a whole has no tiles.
+    They bound the projected corners of the shape's box. A shape that crosses the near plane may be
+    anywhere in the image and gets all tiles; a shape in front of it gets none.
     """
     box = np.stack([low_m, high_m], axis=1)
     near = low_m[:, 2] < NEAR_M
@@ -127,7 +126,7 @@ def put(
     depth: Float32[Array, "k p p"],
     colors: UInt8[Array, "k q r 3"],
 ) -> Canvas:
-    """Draw each shape into its tile; of equally near ones the first is seen."""
+    """Draw each shape into its tile; at equal depth the first shape is visible."""
     before, image = canvas
     count = len(tile)
     nearest = before.at[tile].min(depth)

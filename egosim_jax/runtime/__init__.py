@@ -1,4 +1,4 @@
-"""Process-wide services of every command; nothing here knows models, scenes or files.
+"""Services of every command's process; nothing here knows models, scenes or files.
 
 command      parsing, error messages and exit codes
 interrupts   Ctrl-C during imports and afterwards

@@ -55,15 +55,15 @@ class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
 
 
 HelpGroups = Mapping[str, tuple[str, ...]]
-"""Type of a command's `help_groups`: fields by the title of their group in its help.
+"""Fields of a command by the title of their group in `--help`.
 
-The help begins with all other fields: the few that one changes.
+Fields without a group come first: the few that users change.
 """
 
 
 @runtime_checkable
 class Command(Protocol):
-    """Command line that was parsed into a dataclass, which may have `help_groups`."""
+    """Dataclass of a parsed command line; it may have `help_groups`."""
 
     def run(self) -> int:
         """Run the command and return the exit code."""
@@ -82,13 +82,13 @@ def main(
     """Parse a command line into one of the dataclasses `commands`, run it, return its exit code.
 
     The command runs inside the context manager that `context` makes after parsing. `others` are
-    subcommands that are not parsed here, to be suggested for mistyped ones. Results go to
-    stdout, progress and errors to stderr. A wrong option or invalid input prints one message; a
-    traceback means a defect of the program.
+    subcommands that other programs parse, for the suggestion after a typo. Results go to stdout,
+    progress and errors to stderr. A wrong option or invalid input prints one message; a traceback
+    means a bug.
     """
 
     given = list(sys.argv[1:] if args is None else args)
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax also raises what it logs
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax raises its errors too
 
     def run() -> int:
         import tyro
@@ -109,17 +109,16 @@ def main(
         with context():
             code = command.run()
         if args is None:
-            interrupts.ignore()  # the process ends, and nothing is left to continue
+            interrupts.ignore()  # the process ends: there is nothing to continue
         return code
 
     return run_with_exit_codes(run)
 
 
 def _rules(args: Sequence[str]) -> ConstructorRegistry:
-    """Return tyro's rule for our dataclasses: a class with `help_groups` has a box for each.
+    """Return tyro's rule for our dataclasses: the help has a box for each of the `help_groups`.
 
-    Where a script of completions is printed, descriptions end after the first line: each is a line
-    of the script's output.
+    In a completion script a description is one line, so only its first line is kept there.
     """
     import tyro
     from tyro.constructors import (
@@ -153,7 +152,7 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
             return None
         groups: Mapping[str, tuple[str, ...]] = getattr(info.type, "help_groups", {})
         fields = {field.name: described(field) for field in spec.fields}
-        if "command" in fields:  # a subcommand's options have no prefix, in their titles neither
+        if "command" in fields:  # no prefix for a subcommand's options and their titles
             kind = Annotated[fields["command"].type, tyro.conf.arg(name="")]
             fields["command"] = replace(fields["command"], type=kind)
         boxes = []
@@ -167,7 +166,7 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
                 values |= values.pop(title)
             return spec.instantiate(**values)
 
-        make.__doc__ = info.type.__doc__  # the description that the help begins with
+        make.__doc__ = info.type.__doc__  # the first lines of the help
         nested = [field for field in fields.values() if is_dataclass(field.default)]
         single = [field for field in fields.values() if not is_dataclass(field.default)]
         return StructConstructorSpec(instantiate=make, fields=(*single, *boxes, *nested))
@@ -178,7 +177,7 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
 def _mistyped(
     commands: Any, args: Sequence[str], program: str, others: Sequence[str] = ()
 ) -> str | None:
-    """Return an error message for an unknown subcommand, or None; it names the nearest."""
+    """Return an error message that suggests a name for an unknown subcommand, or None."""
     known = {part.__metadata__[0].name: part.__origin__ for part in get_args(commands)}
     if not known or not args or args[0].startswith("-") or args[0] in others:
         return None
@@ -209,7 +208,7 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
             return ExitCode.FAILED
         if (reason := system_failure(error)) is not None:
             print(f"error: {reason}", file=sys.stderr)
-        else:  # a defect of the program: show where
+        else:  # a bug: show where
             traceback.print_exc()
         return ExitCode.FAILED
     finally:
@@ -217,7 +216,7 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
 
 
 def _reader_ended() -> bool:
-    """Return True if nobody reads stdout any more, as behind `head`; discard further output."""
+    """Return True if the reader of stdout has exited, such as `head`; discard further output."""
     try:
         number = sys.stdout.fileno()
     except (
@@ -235,9 +234,9 @@ def _reader_ended() -> bool:
 
 
 def system_failure(error: BaseException) -> str | None:
-    """Return a one-line message for an error of the system (disk, permissions, memory), or None.
+    """Return a one-line message for a system error (disk, permissions, memory), or None.
 
-    Libraries in C++ raise their own errors, with the system's reason in their text.
+    C++ libraries raise other errors, which have the system's reason in their text.
     """
     seen: BaseException | None = error
     while seen is not None:
@@ -263,14 +262,14 @@ REFUSALS = {
     errno.EROFS: _WRITABLE,
     errno.EACCES: _WRITABLE,
     errno.EPERM: _WRITABLE,
-    errno.ENOTDIR: "A file is where a folder has to be: choose another path.",
-    errno.EISDIR: "A folder is where a file has to be: choose another path.",
+    errno.ENOTDIR: "A file exists where a folder is needed: choose another path.",
+    errno.EISDIR: "A folder exists where a file is needed: choose another path.",
     errno.EEXIST: "The path exists already: choose another path.",
     errno.ENAMETOOLONG: "Choose a shorter path.",
     errno.ELOOP: "Links are not followed here: give the real path.",
     errno.ENOENT: "Check the path.",
-    errno.EMFILE: "Raise the limit of open files (ulimit -n).",
+    errno.EMFILE: "Raise the limit on open files (ulimit -n).",
     errno.EBUSY: "A mount point cannot be replaced: choose a folder inside it.",
     errno.EIO: "Check the disk.",
 }
-"""Errors of the system that a user can fix, and the fix."""
+"""System errors that a user can fix, and the fix."""

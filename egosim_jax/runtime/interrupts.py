@@ -1,4 +1,8 @@
-"""Ctrl-C at any time, also during imports: one line with the command that continues."""
+"""Ctrl-C at any time: print one line with the command that continues.
+
+A program imports this module and calls `expect` before its large imports, which take seconds. So it
+imports only the standard library, and is not part of `command.py`.
+"""
 
 from __future__ import annotations
 
@@ -6,35 +10,20 @@ import os
 import shlex
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from types import FrameType
 
 
 def expect() -> None:
-    """Install the handler of Ctrl-C; a program calls this before its large imports."""
+    """Install the handler of Ctrl-C."""
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, _interrupt)
 
 
 def ignore() -> None:
-    """Ignore Ctrl-C from now on; a program calls this when its work is done."""
+    """Ignore Ctrl-C, once the work is done."""
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-@contextmanager
-def not_inherited() -> Iterator[None]:
-    """Make child processes that are started in this context ignore Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def print_how_to_continue() -> None:
@@ -43,7 +32,7 @@ def print_how_to_continue() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise `KeyboardInterrupt`; during an import, exit: half-imported libraries may crash."""
+    """Raise `KeyboardInterrupt`; exit during an import: half-imported libraries may crash."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             print_how_to_continue()

@@ -1,19 +1,19 @@
-"""Calls of a function in worker processes that start without the parent's state."""
+"""Calls of a function in worker processes that do not inherit the parent's state."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from egosim_jax.runtime import interrupts
-
 T = TypeVar("T")
 THREADS = "OPENBLAS_NUM_THREADS"
-"""Variable that a library of linear algebra reads when it is imported."""
+"""Environment variable that OpenBLAS reads when it is imported."""
 
 
 def run_in_processes(
@@ -27,7 +27,7 @@ def run_in_processes(
     context = multiprocessing.get_context("spawn")  # a forked jax or Open3D may hang
     pool = ProcessPoolExecutor(max(1, min(workers, len(calls))), mp_context=context)
     try:
-        with interrupts.not_inherited(), _one_thread_each():
+        with _ctrl_c_ignored(), _one_thread_each():
             tasks = {pool.submit(run, *call): number for number, call in enumerate(calls)}
         for task in as_completed(tasks):
             yield tasks[task], task.result()
@@ -37,9 +37,9 @@ def run_in_processes(
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Give processes that are started in this context one thread of linear algebra, if not set.
+    """Give child processes that start in this context one OpenBLAS thread, unless it is set.
 
-    Two processes that share the cores by threads take twice as long.
+    If each process has a thread per core, two processes take twice as long.
     """
     if THREADS in os.environ:
         yield
@@ -49,3 +49,16 @@ def _one_thread_each() -> Iterator[None]:
         yield
     finally:
         del os.environ[THREADS]
+
+
+@contextmanager
+def _ctrl_c_ignored() -> Iterator[None]:
+    """Make child processes that start in this context ignore Ctrl-C; the parent stops them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 PLAIN_SECONDS = 10.0
-"""Least time between two plain lines, in seconds."""
+"""Minimum time between two plain lines, in seconds."""
 
 
 def track(items: Iterable[T], verb: str, *, total: int) -> Iterator[T]:

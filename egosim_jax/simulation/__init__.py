@@ -1,7 +1,6 @@
 """The closed loop over a state, and its inputs; nothing here imports jax.
 
-Any callable can generate and any callable can perceive. Our generator is in `generation`, our
-perception in `perception`.
+Any callable can generate, and any callable can perceive: ours are in `generation` and `perception`.
 
     simulator   Simulator: render, generate, perceive, fuse
     rollout     Rollout: the same, journaled and resumable

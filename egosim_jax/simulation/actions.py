@@ -18,13 +18,13 @@ from egosim_jax.state.depth import DEPTH_M
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
 
 MAX_SPEED_M_S = 20.0
-"""Fastest camera that is accepted, in meters per second."""
+"""Maximum speed of the camera, in meters per second."""
 ARRAYS = ("world_from_camera", "intrinsics_px", "joints_m")
-"""Arrays of a file of an action."""
-PLACES = "_hands.npz"
-"""Suffix of the file with the joints of all hands, next to the action's file."""
+"""Arrays of an action file."""
+HANDS_SUFFIX = "_hands.npz"
+"""Suffix of the file with the joints of all hands, next to the action file."""
 MAX_JSON_BYTES = 256 << 20
-"""Largest .json file of an action in bytes."""
+"""Maximum size of a .json action file in bytes."""
 _FINGERS = np.arange(1, 21).reshape(5, 4)
 ORDERS = {
     "MANO's (index, middle, little, ring, thumb, then the tips)": np.array(
@@ -35,18 +35,18 @@ ORDERS = {
     "with the wrist last": np.array([20, *range(20)]),
     "by joint, each over all fingers": np.array([0, *np.arange(1, 21).reshape(4, 5).T.ravel()]),
 }
-"""Other orders of a human hand's joints in use, as indices that bring them into ours."""
-UNEQUAL = 1.4
-"""Median ratio of the lengths of a gripper's fingers that is too large to be one in our order."""
-SHORTER = 0.75
-"""Bones shorter by this factor under another order mean that the joints are in that order."""
+"""Other joint orders of human hands, as indices that convert them to ours."""
+MAX_FINGER_RATIO = 1.4
+"""Maximum median ratio of a gripper's finger lengths; above it, the joint order is wrong."""
+REORDERED_RATIO = 0.75
+"""If another order shortens the bones to less than this fraction, it is the joints' order."""
 
 
 def check_action(action: Action, *, state: SceneState, fps: int, continued: bool = False) -> None:
-    """Raise `InputError` for too fast a camera, joints in another order, a scene out of sight.
+    """Raise `InputError` for a camera that is too fast, a wrong joint order, or an unseen scene.
 
-    The first camera must see the scene; of an action that is `continued` the last one, too, which
-    is the first of the next action.
+    The first camera must see the scene. If the action is `continued`, so must the last camera: it
+    is the first one of the next action.
     """
     _check_speed(action.cameras, fps)
     check_order(action)
@@ -67,25 +67,25 @@ def _check_speed(cameras: Cameras, fps: int) -> None:
 
 
 def check_order(action: Action) -> None:
-    """Raise `InputError` if the joints of the hands are plausible only in another order."""
+    """Raise `InputError` if the hands' joints are plausible only in another order."""
     hands = action.joints_m[np.isfinite(action.joints_m).all(axis=(2, 3))]
     if not len(hands):
         return
     if action.kind == "robot":
         sides = np.linalg.norm(hands[:, 1:] - hands[:, :1], axis=-1)
         ratio = np.median(sides.max(axis=1) / np.maximum(sides.min(axis=1), 1e-9))
-        if ratio > UNEQUAL:
+        if ratio > MAX_FINGER_RATIO:
             raise InputError(
                 f"the fingers of a gripper differ in length by a factor of {ratio:.3g} "
-                f"(median), more than {UNEQUAL:g}: its joints must be in the order wrist, thumb "
-                "tip, index tip."
+                f"(median), more than {MAX_FINGER_RATIO:g}: its joints must be in the order wrist, "
+                "thumb tip, index tip."
             )
         return
-    if _is_hand(hands):  # whose bones a fist may have shorter in another order
+    if _is_hand(hands):  # in a fist, another order may give shorter bones
         return
     lengths = {name: _bone_length(hands[:, order]) for name, order in ORDERS.items()}
     name = min(lengths, key=lambda name: lengths[name])
-    if lengths[name] < SHORTER * _bone_length(hands):
+    if lengths[name] < REORDERED_RATIO * _bone_length(hands):
         raise InputError(
             f"the joints of the hands seem to be in the order {name}: the bones are "
             f"{lengths[name] / _bone_length(hands):.2f} times as long in it. The order must be "
@@ -106,10 +106,10 @@ def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
 
 
 def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
-    """Return True if bones are in proportion: palm bones alike, and by far the longest.
+    """Return True if the bones have a hand's proportions: similar palm bones, by far the longest.
 
-    Fingers but the thumb are looked at, by their medians; their last bones are shorter than the
-    first ones. It holds for any pose, however the fingers are bent.
+    Also, the last bones of a finger must be shorter than the first ones. All are medians over the
+    fingers except the thumb. The pose does not matter: it does not change bone lengths.
     """
     palm, first, _, last = np.median(_bones(hands)[:, 1:], axis=0).T
     alike = palm.min() > 0.75 * palm.mean() and palm.max() < 1.33 * palm.mean()
@@ -117,7 +117,7 @@ def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
 
 
 def _check_scene(state: SceneState, cameras: Cameras, frame: int) -> None:
-    """Raise `InputError` unless the camera of a frame sees points at distances of meters."""
+    """Raise `InputError` unless a frame's camera sees points at plausible distances in meters."""
     local = transform(invert(cameras.world_from_camera[frame]), state.points_m.astype(float))
     inside = pixels_of(cameras, local)[2]
     which = "last" if frame else "first"
@@ -168,7 +168,7 @@ def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -
 class PlacedAction(Action):
     """Action whose hidden hands are missing from `joints_m`, with the joints of all hands.
 
-    A model does not get a hand that is out of view. The true world still moves it.
+    A model is not given a hand that is out of view; the true world still moves it.
     """
 
     placed_m: Float[np.ndarray, "f n j 3"]
@@ -187,7 +187,7 @@ class PlacedAction(Action):
 
 
 def places_of(action: Action) -> Float[np.ndarray, "f n j 3"]:
-    """Return the joints of all hands, including hidden ones if the action knows them."""
+    """Return the joints of all hands, including hidden ones if the action has them."""
     return action.placed_m if isinstance(action, PlacedAction) else action.joints_m
 
 
@@ -201,7 +201,7 @@ def save_placed(folder: Path, name: str, action: Action) -> None:
     """Write an action to NAME.npz, and the joints of a `PlacedAction` to NAME_hands.npz."""
     save_action(folder / f"{name}.npz", action)
     if isinstance(action, PlacedAction):
-        with atomic_write(folder / f"{name}{PLACES}") as temporary:
+        with atomic_write(folder / f"{name}{HANDS_SUFFIX}") as temporary:
             np.savez(temporary, placed_m=np.ascontiguousarray(action.placed_m, float))
 
 
@@ -210,7 +210,7 @@ def load_placed(
 ) -> Action:
     """Read the files of `save_placed`; `size` is the height and width of the cameras."""
     action = load_action(folder / f"{name}.npz", kind=kind, size=size, prompt=prompt)
-    path = folder / f"{name}{PLACES}"
+    path = folder / f"{name}{HANDS_SUFFIX}"
     if not path.exists():
         return action
     return with_places(action, read_arrays(path, {"placed_m": "float64"})["placed_m"])
@@ -259,7 +259,7 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Return the arrays and the prompt of a .json file; a hand that is null has joints of NaN."""
+    """Return the arrays and the prompt of a .json file; null hands become joints of NaN."""
     written = read_json(path, limit=MAX_JSON_BYTES)
     if not isinstance(written, dict) or not written.keys() <= {*ARRAYS, "prompt"}:
         raise InputError(f"{path}: must be an object of {', '.join(ARRAYS)} and prompt.")
@@ -279,9 +279,9 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _fill_missing(frames: list[Any]) -> list[Any]:
-    """Return frames of hands with null replaced by as many NaN joints as the others have.
+    """Replace null hands by NaN joints, as many as the other hands have.
 
-    Where all are null, they are human hands.
+    If all hands are null, they count as human.
     """
     lists = [hands for hands in frames if isinstance(hands, list)]
     given = [hand for hands in lists for hand in hands if isinstance(hand, list)]

@@ -3,16 +3,16 @@
     episode.json            description: see below
     state/                  scene before the first clip (state/snapshot.py)
     clip_1/action.npz       world_from_camera `f 4 4`, intrinsics_px `3 3`, joints_m `f n j 3`
-    clip_1/ground_truth.npz frames, and where known depth_m, object_ids, motion_ids and motions
+    clip_1/ground_truth.npz frames, and depth_m, object_ids, motion_ids and motions if known
     clip_2/...              one folder per clip
-    first_frame.png         first frame of the first clip, if it is known
+    first_frame.png         first frame of the first clip, if known
 
     {"format": "egosim_jax.episode", "version": 1, "kind": "human", "fps": 16,
      "height": 480, "width": 832, "prompts": ["The left hand ..."], "target_ids": [14],
      "sha256": {"clip_1/action.npz": "9a...", ...}}
 
-The byte format is a zip archive of these files, not compressed. Cameras follow OpenCV (x right, y
-down, z forward), everything is in meters and in one world frame. A human hand has 21 joints: the
+The byte format is an uncompressed zip archive of these files. Cameras follow OpenCV (x right, y
+down, z forward); everything is in meters and in one world frame. A human hand has 21 joints: the
 wrist, then thumb, index, middle, ring and little finger from knuckle to tip; a gripper has three:
 the wrist and the tips of thumb and index. A missing hand has joints of NaN. Nothing is unpickled.
 """
@@ -54,7 +54,7 @@ from egosim_jax.types import Action, GroundTruth, InputError, SceneState, check_
 FORMAT, VERSION = "egosim_jax.episode", 1
 DESCRIPTION, FIRST_FRAME = "episode.json", "first_frame.png"
 MAX_CLIPS, MAX_BYTES = 1000, 1 << 32
-"""Most clips of an episode, and most bytes of one in the byte format."""
+"""Maximum number of clips of an episode, and maximum size of the byte format in bytes."""
 _NAMES = re.compile(r"episode\.json|first_frame\.png|state/(?:points\.npz|state\.json)"
                     r"|clip_[1-9]\d{0,3}/(?:action|ground_truth)\.npz")  # fmt: skip
 
@@ -71,17 +71,17 @@ class Episode:
     fps: int
     """Frame rate of cameras and hands, in frames per second."""
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None
-    """First frame of the first clip, without hands; None if it is not known."""
+    """First frame of the first clip, without hands; None if unknown."""
     ground_truth: tuple[GroundTruth, ...] = ()
-    """Ground truth of each clip; empty if it is not known."""
+    """Ground truth of each clip; empty if unknown."""
 
     def __post_init__(self) -> None:
-        """Check everything that would make a simulation meaningless; raise `InputError`."""
+        """Raise `InputError` for anything that would make a simulation meaningless."""
         if not self.actions:
             raise InputError("An episode must have at least one action.")
         if len(self.actions) > MAX_CLIPS:
-            raise InputError(f"{len(self.actions)} clips are more than {MAX_CLIPS}, the most.")
-        if type(self.fps) is not int:
+            raise InputError(f"An episode has at most {MAX_CLIPS} clips, not {len(self.actions)}.")
+        if type(self.fps) is not int:  # `isinstance` would accept True
             raise InputError(f"fps is {self.fps!r:.40}: it must be a whole number (int).")
         check_counts({"fps": self.fps})
         if len(self.ground_truth) not in (0, len(self.actions)):
@@ -104,7 +104,7 @@ class Episode:
             if ground_truth.frames.shape[:3] != shape:
                 raise InputError(
                     f"The ground truth of clip {number} is {ground_truth.frames.shape[:3]}: it "
-                    f"must be {shape}, as the action."
+                    f"must be {shape}, like the action."
                 )
 
     @property
@@ -114,7 +114,7 @@ class Episode:
         return len(cameras.world_from_camera), cameras.height, cameras.width
 
     def observations(self) -> dict[int, Observation] | None:
-        """Return the ground truth for perception, by the state's step; None where it is partial."""
+        """Return the ground truth for perception by step; None if any of it is missing."""
         steps = range(self.state.step, self.state.step + len(self.actions))
         found = {
             step: Observation(
@@ -126,13 +126,13 @@ class Episode:
             )
             for step, action, known in zip(steps, self.actions, self.ground_truth, strict=False)
         }
-        whole = (
+        needed = (
             getattr(o, n) for o in found.values() for n in ("depth_m", "object_ids", "motions")
         )
-        return found if found and all(value is not None for value in whole) else None
+        return found if found and all(value is not None for value in needed) else None
 
     def save(self, path: Path | str) -> None:
-        """Write a folder, or the byte format where the path ends in .zip.
+        """Write a folder, or the byte format if the path ends in .zip.
 
         Replaces a file in the byte format, an empty folder or an earlier episode; raises
         `InputError` for any other folder.
@@ -157,13 +157,14 @@ class Episode:
     def to_bytes(self) -> bytes:
         """Return the byte format; equal episodes have equal bytes.
 
-        Raises `InputError` if there are more bytes than are read.
+        Raises `InputError` if the archive is larger than `MAX_BYTES`.
         """
         data = io.BytesIO()
         with tempfile.TemporaryDirectory() as name, zipfile.ZipFile(data, "w") as archive:
             folder = Path(name)
             _write(folder, self)
             for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+                # A `ZipInfo` has a constant date: equal episodes have equal bytes.
                 entry = zipfile.ZipInfo(str(file.relative_to(folder)))
                 archive.writestr(entry, file.read_bytes())
         if data.tell() > MAX_BYTES:
@@ -242,19 +243,20 @@ def _write(folder: Path, episode: Episode) -> None:
 
 
 def _extract(archive: zipfile.ZipFile, folder: Path) -> None:
-    """Write the entries of the byte format to a folder; refuse any other entry."""
+    """Write the entries of the byte format to a folder; raise `InputError` for any other."""
     entries = archive.infolist()
     names = [entry.filename for entry in entries]
     if len(set(names)) != len(names) or len(names) > 2 * MAX_CLIPS + 4:
-        raise InputError("an archive of duplicate or too many entries.")
+        raise InputError("the archive has duplicate entries, or too many.")
     for entry in entries:
+        # Stored entries cannot expand, so `MAX_BYTES` bounds the files too.
         stored = (
             entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
         )
         if not _NAMES.fullmatch(entry.filename) or not stored:
             raise InputError(
                 f"entry {quote(entry.filename)} is compressed or not part of an episode: an "
-                "episode is an archive of stored files, as Episode.save writes."
+                "episode is an archive of stored files, as Episode.save writes it."
             )
         path = folder / entry.filename
         path.parent.mkdir(exist_ok=True)
@@ -346,7 +348,7 @@ def _read_ground_truth(path: Path, target_id: int | None) -> GroundTruth:
 
 @contextmanager
 def _named(name: str) -> Iterator[None]:
-    """Put a name before the message of an `InputError`."""
+    """Prefix the message of an `InputError` with a name."""
     try:
         yield
     except InputError as error:

@@ -1,9 +1,9 @@
-"""A journaled simulation: every phase is written to a folder, and an interrupted run resumes.
+"""Journaled simulation: every phase is saved to a folder, and an interrupted run resumes.
 
-folder/journal.jsonl            phases that are done (io/journal.py)
+folder/journal.jsonl            finished phases (io/journal.py)
 folder/clip_N/frames.npz        generated clip of step N
-folder/clip_N/perceived.npz     what was perceived in it
-folder/clip_N/state/            state after it
+folder/clip_N/perceived.npz     perception of the clip
+folder/clip_N/state/            state after the step
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class Rollout:
         """Run one step per action, each from the state after the previous one.
 
         The same call resumes an interrupted run. `first_frame` is the first frame of the first
-        clip; step N uses `seed + N`, which must be a valid seed, too. Raises `InputError` showing
+        clip. Step N uses `seed + N`, which must be a valid seed too. Raises `InputError` showing
         both values if the folder holds a run of another state, action, generator, renderer,
         perception or seed, and if another process writes to it.
         """
         check_seed(seed, name="seed")
-        if isinstance(actions, Sized):
+        if isinstance(actions, Sized):  # fail before the first clip, not after hours
             check_seed(seed + len(actions), name="seed + number of actions")
         with lock_folder(self.folder):
             journal = Journal(self.folder, outputs=OUTPUTS)
-            journal.require("run", self._made_of(state, seed, first_frame))
+            journal.require("run", self._inputs(state, seed, first_frame))
             for number, action in enumerate(actions, start=1):
                 check_seed(seed + number, name="seed + number of actions")
                 journal.require(f"{number} action", {"action": fingerprint(action)})
@@ -64,7 +64,7 @@ class Rollout:
                 yield step
                 state = step.state
 
-    def _made_of(
+    def _inputs(
         self, state: SceneState, seed: int, first_frame: UInt8[np.ndarray, "h w 3"] | None
     ) -> dict[str, str]:
         simulator = self.simulator
@@ -89,7 +89,7 @@ class Rollout:
     ) -> Step:
         """Run `Simulator.step` with each phase journaled."""
         simulator, folder = self.simulator, self.folder / f"clip_{number}"
-        view = simulator.render(state, action)
+        view = simulator.render(state, action)  # not journaled: it follows from state and action
         clip = journal.phase(
             f"{number} generate",
             folder / "frames.npz",

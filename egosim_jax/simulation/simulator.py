@@ -2,8 +2,8 @@
 
     state --render--> view --generate--> clip --perceive--> perceived --fuse--> state
 
-`Simulator.step` is pure; `rollout.Rollout` journals and resumes the same functions. Knows no jax:
-any callable that maps a view, an action, a first frame and a seed to frames can be the generator.
+`Simulator.step` is pure; `rollout.Rollout` journals and resumes the same functions. This module
+imports no jax: any callable from view, action, first frame and seed to frames can be the generator.
 Source: EgoSim, equations 1 and 2 and section 3.4.
 """
 
@@ -30,7 +30,7 @@ class VideoGenerator(Protocol):
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Generate the frames of a clip, as many and as large as the view's frames."""
+        """Generate the frames of a clip, of the view's number and size."""
         ...
 
 
@@ -41,7 +41,7 @@ class StreamedGenerator(VideoGenerator, Protocol):
     def stream(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
-        """Yield the frames of a clip in groups, in their order."""
+        """Yield the frames of a clip in order, in groups."""
         ...
 
 
@@ -64,11 +64,11 @@ class Simulator:
     generator: VideoGenerator
     """Generator of the clips."""
     perception: Perception | None
-    """Perception that reads the clips back into 3D; None leaves the state as it was."""
+    """Perception that reconstructs the clips in 3D; None keeps the state unchanged."""
     fps: int
     """Frame rate of the clips, in frames per second."""
     point_px: int = 2
-    """Size of the points in the view, in pixels; what the generator was trained with."""
+    """Point size in the view, in pixels; must be the size that the generator was trained with."""
     fusion: Fusion = field(default_factory=Fusion)
     """Settings of the fusion."""
     show: Callable[[UInt8[np.ndarray, "g h w 3"]], None] | None = None
@@ -76,7 +76,7 @@ class Simulator:
 
     @property
     def renderer(self) -> Renderer:
-        """Renderer of the view: the generator's, which draws its hands, or the NumPy reference."""
+        """Renderer of the view: the generator's own, or the NumPy reference."""
         return getattr(self.generator, "renderer", reference)
 
     def step(
@@ -89,7 +89,7 @@ class Simulator:
     ) -> Step:
         """Advance the world by one clip. The caller's state is not changed.
 
-        Without a first frame the generator gets the first frame of the view.
+        `first_frame` defaults to the first frame of the view.
         """
         view = self.render(state, action)
         clip = self.generate(view, action, seed=seed, first_frame=first_frame)
@@ -119,14 +119,14 @@ class Simulator:
         if frames.shape != view.frames.shape or frames.dtype != np.uint8:
             raise InputError(
                 f"The generator returned {frames.dtype} {frames.shape} for a view of uint8 "
-                f"{view.frames.shape}: it must return as many frames of the same size."
+                f"{view.frames.shape}: it must return the same number of frames, of the same size."
             )
         return Clip(frames=frames, fps=self.fps)
 
     def _frames(
         self, view: View, action: Action, image: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> np.ndarray:
-        """Return the generator's frames; show them, all at once if it does not stream."""
+        """Return the generator's frames and show them, in groups if the generator streams."""
         if self.show is None:
             return self.generator(view, action, image, seed)
         if not isinstance(self.generator, StreamedGenerator):

@@ -3,7 +3,7 @@
 state/           scene (state/snapshot.py)
 start.json       camera, row, prompt, seed, clips since the seed, kind and prompt of past actions
 first_frame.png  first frame without hands, if known
-past/1.npz ...   actions since the seed, which the true world executes again
+past/1.npz ...   actions since the seed; the true world executes them again
 past/1_hands.npz joints of all hands, if a hand of action 1 is out of view
 """
 
@@ -47,7 +47,7 @@ class Start:
     steps: int = 0
     """Number of clips since the seed."""
     row: Float[np.ndarray, " d"] | None = None
-    """Row of hands and camera (`interactive/env/action_spec.py`); None at rest."""
+    """Action row of hands and camera (`interactive/env/action_spec.py`); None at rest."""
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None
     """First frame of the next clip, without hands; None if unknown."""
     past: tuple[Action, ...] = ()
@@ -71,7 +71,7 @@ class Start:
     def after(
         self, state: SceneState, row: Float[np.ndarray, " d"], action: Action | None
     ) -> Start:
-        """Return the start after a clip; `past` gets the action, unless it is None."""
+        """Return the start after a clip; the action, unless None, is appended to `past`."""
         past = self.past if action is None else (*self.past, action)
         return replace(
             self, state=state, row=row, steps=self.steps + 1, first_frame=None, past=past
@@ -79,7 +79,7 @@ class Start:
 
     def save(self, folder: Path) -> None:
         """Write the folder atomically. Raises `InputError` for more than `MAX_CLIPS` actions."""
-        if len(self.past) > MAX_CLIPS:  # `load` refuses it
+        if len(self.past) > MAX_CLIPS:  # `load` would refuse it
             raise InputError(
                 f"The start has {len(self.past)} past actions: at most {MAX_CLIPS} can be loaded. "
                 "Save after fewer steps, or reset first."
@@ -118,7 +118,7 @@ class Start:
         size = written["height"], written["width"]
         if len(written["past"]) > MAX_CLIPS:
             raise InputError(
-                f"{quote_path(folder)}: it has more than {MAX_CLIPS} past actions. Restore it."
+                f"{quote_path(folder)} has more than {MAX_CLIPS} past actions. Restore it."
             )
         image = folder / FIRST_FRAME
         return cls(
@@ -142,7 +142,7 @@ class Start:
 
 
 def check_size(start: Start, video: VideoSpec) -> None:
-    """Raise `InputError` unless a start's camera has the frame size of the world."""
+    """Raise `InputError` unless the start's camera has the frame size of the world."""
     camera = start.camera
     if (camera.height, camera.width) != (video.height, video.width):
         raise InputError(

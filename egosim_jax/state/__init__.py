@@ -1,11 +1,11 @@
 """Operations on the scene state, in NumPy and Open3D: alignment, filter, fusion, storage.
 
-No module imports jax, and none reads a video: `perception` does that.
+No module imports jax or reads a video: `perception` does that.
 
     fuse        state and perceived clip to the next state
     tsdf        depth images to a surface
     filter      objects that the hands acted on
     align       reconstruction to world
-    depth       first state from one RGB-D image
+    depth       initial state from one RGB-D image
     snapshot    storage as a folder; `ply` for other programs
 """

@@ -1,4 +1,4 @@
-"""Alignment of a reconstruction with the world by its cameras.
+"""Alignment of a reconstruction to the world by its cameras.
 
 Alignments are 4 x 4 matrices `world_from_reconstruction`, rigid or with one scale, applied as
 p -> s R p + t. Source: EgoSim, section 3.3 (Sim(3) Umeyama alignment); the released
@@ -30,8 +30,8 @@ def align_cameras(
 ) -> Float[np.ndarray, "4 4"]:
     """Return `world_from_reconstruction` from cameras that are known in both.
 
-    Orientations need one camera (two for a scale), centers alone three that are not collinear. A
-    scale that coinciding centers leave undetermined is 1.
+    Orientations need one camera (two for a scale); centers alone need three non-collinear ones.
+    If the centers coincide and determine no scale, it is 1.
     """
     _check_finite(reconstruction_from_camera, world_from_camera)
     targets, centers = world_from_camera[:, :3, 3], reconstruction_from_camera[:, :3, 3]
@@ -46,6 +46,7 @@ def align_cameras(
         spread = np.square(rotated).sum()
         products = rotated * (targets - targets.mean(axis=0))
         scale = products.sum() / spread if spread > 1e-12 else 1.0
+        # Nearly coinciding centers give scales that are only noise.
         motion[:3, :3] *= scale if 0 < scale <= 100 else 1.0
     motion[:3, 3] = targets.mean(axis=0) - motion[:3, :3] @ centers.mean(axis=0)
     return motion

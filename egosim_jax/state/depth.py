@@ -1,4 +1,4 @@
-"""A first scene state from one RGB-D image."""
+"""Initial scene state from one RGB-D image."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.types import InputError, SceneState, check_counts
 
 DEPTH_M = (0.05, 50.0)
-"""Smallest and largest median depth in meters that is accepted."""
+"""Minimum and maximum median depth, in meters."""
 EDGE = 0.03
-"""Relative change of depth by interpolation beyond which a pixel keeps its own depth."""
+"""Maximum relative change of depth by interpolation; beyond it, a pixel keeps its own depth."""
 
 
 @no_type_check  # shapes and dtypes are checked with messages for users
@@ -32,9 +32,9 @@ def state_from_depth(
 
     Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Pixel centers
     are at integer coordinates. Without `object_ids` all points are background. Each pixel gives
-    `points_per_pixel` squared points, interpolated, so that a camera that comes that much nearer
-    sees no gaps between them. Raises `InputError` if shapes or dtypes differ, if no depth is known,
-    and if depth does not look like meters.
+    `points_per_pixel` squared points, interpolated: a camera that moves nearer by this factor sees
+    no gaps. Raises `InputError` if shapes or dtypes differ, if no depth is known, or if the depth
+    does not look like meters.
     """
     check_counts({"points_per_pixel": points_per_pixel})
     for name, value, rule, fits in (
@@ -56,7 +56,7 @@ def state_from_depth(
         if shape != (height, width):
             raise InputError(
                 f"{name} is {shape[1]}x{shape[0]} and depth_m is {width}x{height} pixels: they "
-                "must be of the same image. Resize one of them."
+                "must have the same size. Resize one of them."
             )
     known = np.isfinite(depth_m) & (depth_m > 0)
     if not known.any():
@@ -100,8 +100,8 @@ def _split(
 ]:
     """Return an RGB-D image with each pixel split into `times` x `times`.
 
-    Inverse depth, which is affine on planes, is interpolated between known pixels; across an edge,
-    where that would make points between two surfaces, a pixel keeps its own.
+    Inverse depth, which is affine on planes, is interpolated between known pixels. At an edge that
+    would make points between two surfaces, so a pixel there keeps its own depth.
     """
     import cv2
 

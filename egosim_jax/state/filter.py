@@ -1,13 +1,13 @@
 """Interaction filter: which objects the hands acted on, and in which frames.
 
 1. Semantic: names identify hands and arms, and held objects.
-2. Spatial: the box around an object overlaps that around a hand, IoU > 0.15.
+2. Spatial: the boxes of an object and a hand overlap, IoU > 0.15.
 3. Depth: the median depths of object and hand differ by less than 0.15 m.
-4. Temporal: an object is interacted with in all frames between its first and its last interaction;
-   one that is invisible in all frames after the last has disappeared.
+4. Temporal: an object is interacted with in all frames between its first and its last interaction.
+   It has disappeared if it is invisible in all frames after the last.
 
-Source: EgoSim, section 3.3 (interaction-aware filtering) and the released `processors.py`, in which
-stages 3 and 4 are never reached.
+Source: EgoSim, section 3.3 (interaction-aware filtering) and the released `processors.py`, which
+never reaches stages 3 and 4.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 MIN_BOX_IOU = 0.15
-"""Smallest IoU of the boxes of an object and a hand that interact."""
+"""Minimum IoU of the boxes of an object and a hand that interact."""
 MAX_DEPTH_GAP_M = 0.15
-"""Largest difference of the median depths of an object and a hand that interact, in meters."""
+"""Maximum difference of the median depths of an object and a hand that interact, in meters."""
 MIN_ABSENT_FRAMES = 2
 """An object has disappeared if it is invisible for this many frames after its last interaction."""
 _HANDS, _HELD = re.compile(r"\b(hand|hands|arm|arms|person)\b"), re.compile(r"\bin hands?\b")
@@ -45,7 +45,7 @@ def interacted_frames(
     depth_m: Float32[np.ndarray, "f h w"],
     names: Mapping[int, str],
 ) -> InteractedFrames:
-    """Return the frames in which hands acted on each object; only objects with at least one."""
+    """Return the frames in which hands acted on each object; objects without any are absent."""
     found: InteractedFrames = {}
     for number in sorted(set(np.unique(object_ids).tolist()) & set(names)):
         if number > 0 and not is_hand(names[number]):

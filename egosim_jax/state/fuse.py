@@ -4,13 +4,13 @@
    tracked object in its own coordinates, so that all frames contribute wherever the object was.
 2. Points of the state that belong to a tracked object move with it.
 3. Free space is carved: a point of the state is removed if the last frames that could have observed
-   it see through it. (The original does not, and a moved object leaves ghost points.)
+   it see through it. (The original does not carve: moved objects leave ghost points.)
 4. New points replace points of the state within 5 mm, and take the color of the nearest one of the
-   same object: a surface that was observed once is not repainted from a generated clip, whose
-   colors drift from clip to clip. (The original repaints.)
+   same object. Generated colors drift from clip to clip, so an observed surface is not repainted.
+   (The original repaints.)
 
-The update is idempotent, clips of different places commute, and the points have a canonical order,
-so that equal states are equal arrays.
+The update is idempotent, and clips of different places commute. The points have a canonical order,
+so equal states are equal arrays.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ REPLACE_M = 0.005
 FREE_SPACE_MARGIN_M = 0.02
 """A frame sees through a point if the surface is this far behind it, in meters."""
 VOTE_LIMIT = 2
-"""Bound of a point's votes: -1 per frame that sees through it, +1 per frame that observes it."""
+"""Limit of a point's votes: -1 per frame that sees through it, +1 per frame that observes it."""
 OUTLIER_NEIGHBORS = 20
 """Neighbors whose mean distance decides whether a point is an outlier."""
 OUTLIER_DEVIATIONS = 2.0
@@ -53,7 +53,7 @@ class _Points:
 
 
 def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = None) -> SceneState:
-    """Return the state after a clip; without any known depth its points stay."""
+    """Return the state after a clip; a clip without known depth keeps the points."""
     disappeared = disappeared_objects(perceived.object_ids, dict(perceived.interacted_frames))
     disappeared -= set(perceived.world_from_object)
     valid = valid_depth_mask(perceived.depth_m)
@@ -76,7 +76,7 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
 def reconstruct(
     perceived: Perceived, valid: Bool[np.ndarray, "f h w"], disappeared: set[int], fusion: Fusion
 ) -> _Points:
-    """Return surfaces of background and objects, except disappeared ones, at the clip's end."""
+    """Return the surfaces of background and objects at the clip's end, without disappeared ones."""
     usable = valid & ~dilate(perceived.object_ids < 0, HAND_MARGIN)
     pieces = []
     for number in sorted(set(np.unique(perceived.object_ids).tolist()) - disappeared):
@@ -106,7 +106,7 @@ def reconstruct(
 
 
 def dilate(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, "f h w"]:
-    """Return masks dilated by a border, given as a fraction of the width, of at least a pixel."""
+    """Return masks dilated by a border: a fraction of the image width, at least one pixel."""
     import cv2
 
     border = max(1, round(border * mask.shape[2]))
@@ -121,11 +121,12 @@ def _last_visible_frame(seen: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f 
 
 
 def apply_motion(state: SceneState, perceived: Perceived, disappeared: set[int]) -> _Points:
-    """Return the state's points with tracked objects at their end, without disappeared ones."""
+    """Return the state's points at the clip's end, without disappeared objects."""
     points = state.points_m.copy()
     for number, path in perceived.world_from_object.items():
         before = state.world_from_object.get(number, np.eye(4))
         own = state.object_ids == number
+        # An object that stays keeps its exact coordinates: rounding would break idempotence.
         if own.any() and not np.array_equal(before, path[-1]):
             moved = transform(path[-1] @ invert(before), points[own].astype(np.float64))
             points[own] = moved.astype(np.float32)
@@ -141,7 +142,7 @@ def apply_motion(state: SceneState, perceived: Perceived, disappeared: set[int])
 def carve_free_space(
     old: _Points, perceived: Perceived, valid: Bool[np.ndarray, "f h w"]
 ) -> _Points:
-    """Return the points without those that the last frames with a view of them see through."""
+    """Remove the points that the last frames with a view of them see through."""
     votes = np.zeros(len(old.points_m), int)
     observed = np.zeros(len(votes), bool)
     depth = np.where(valid, perceived.depth_m, np.nan)
@@ -190,7 +191,7 @@ def _remove_outliers(new: _Points) -> _Points:
 def _has_neighbor(
     points_m: Float32[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], radius_m: float
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points have one of the others within a radius in meters."""
+    """Return which points have a neighbor among the others, within a radius in meters."""
     import open3d as o3d
 
     if not len(points_m) or not len(others_m):

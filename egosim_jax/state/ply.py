@@ -1,4 +1,4 @@
-"""PLY files of points, whose header is checked against the file size before anything is built.
+"""PLY files of points; the header is checked against the file size before arrays are allocated.
 
 A text header names elements, their number and their properties; the values follow, as text or
 binary of either byte order. Points are the element `vertex`; elements after it, such as faces, are
@@ -19,15 +19,15 @@ from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
 from egosim_jax.types import InputError
 
 MAX_HEADER = 1 << 16
-"""Largest header in bytes."""
+"""Maximum size of a header in bytes."""
 MAX_BYTES = 1 << 29
-"""Largest binary file in bytes."""
+"""Maximum size of a binary file in bytes."""
 MAX_TEXT = 1 << 27
-"""Largest text file in bytes."""
+"""Maximum size of a text file in bytes."""
 MAX_POINTS = 1 << 24
-"""Largest number of points."""
+"""Maximum number of points."""
 MAX_PROPERTIES = 256
-"""Largest number of properties of all elements."""
+"""Maximum number of properties of all elements."""
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
           "float": "f4", "double": "f8"}  # fmt: skip
 _TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
@@ -89,7 +89,7 @@ def has_triangles(path: Path) -> bool:
 def read_triangles(path: Path) -> np.ndarray:
     """Return the triangles of a binary PLY file, `t 3`: vertex indices of the element `face`.
 
-    Raises `InputError` without triangles, with other polygons, or with further face properties.
+    Raises `InputError` if it has no triangles, other polygons, or further face properties.
     """
     name = quote_path(path)
     points = read_points(path)
@@ -152,6 +152,7 @@ def _header(file: io.BufferedReader) -> tuple[str, list[_Element]]:
             case ["comment" | "obj_info", *_]:
                 pass
             case ["element", name, count] if count.isascii() and count.isdigit():
+                # 20 digits exceed every limit; `int` is slow for thousands.
                 elements.append(_Element(name, int(count[:20])))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1].fields.append((name, _TYPES[kind]))

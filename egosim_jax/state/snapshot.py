@@ -76,8 +76,8 @@ def _load(folder: Path) -> SceneState:
     check_version(written["version"], VERSION, source=DESCRIPTION)
     if sha256(folder / POINTS) != written.get("sha256"):
         raise InputError(
-            f"{folder / POINTS} is damaged: it is not what {DESCRIPTION} was written for "
-            "(SHA-256). Use another copy."
+            f"{folder / POINTS} is damaged: its SHA-256 is not the one in {DESCRIPTION}. "
+            "Use another copy."
         )
     arrays = read_arrays(folder / POINTS, _DTYPES)
     try:

@@ -1,8 +1,9 @@
 """TSDF fusion: depth images fused into a truncated signed distance field on a sparse voxel grid.
 
-Every voxel near a surface stores the weighted mean of its signed distances to it along the rays
-that observed it, clipped at the truncation; the surface is the zero level set. Source: EgoSim,
-section 3.3 and its implementation details: voxels of 3 mm, truncation 5 cm, depths up to 3 m.
+Every voxel near a surface stores the weighted mean of its signed distances to the surface, along
+the rays that observed it, clipped at the truncation. The surface is the zero level set. Source:
+EgoSim, section 3.3 and its implementation details: voxels of 3 mm, truncation 5 cm, depths up to
+3 m.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from egosim_jax.geometry import pixel_rays, transform
 from egosim_jax.types import Cameras, InputError
 
 DEPTH_WINDOW_PX = 5
-"""Window of pixels around a depth in which depths are compared."""
+"""Size in pixels of the window in which depths are compared."""
 MAX_DEPTH_STEP = 0.1
-"""Largest difference of depths in the window, as a fraction of the depth, of a reliable depth."""
+"""Maximum difference of depths in the window of a reliable depth, as a fraction of that depth."""
 BLOCK_VOXELS = 16
 """Voxels along an edge of a block."""
 GRID_OFFSET_VOXELS = 0.37
 """Offset of the grid from the origin, in voxels.
 
-A surface exactly on voxel centers, as a table at height 0 would be, has distances of 0 without a
-change of sign, and would be lost."""
+A surface exactly on voxel centers, such as a table at height 0, has distances of 0 without a change
+of sign, and would be lost."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +38,9 @@ class Fusion:
     truncation_m: float = 0.05
     """Truncation distance in meters."""
     max_depth_m: float = 3.0
-    """Farther depths are ignored, in meters."""
+    """Maximum depth in meters; larger depths are ignored."""
     observations: int = 3
-    """Fewest frames that must observe a voxel; all of them if there are fewer."""
+    """Minimum number of frames that observe a voxel; all frames if there are fewer."""
 
     def __post_init__(self) -> None:
         """Check that the sizes are positive and the truncation spans voxels."""
@@ -52,7 +53,7 @@ class Fusion:
 
 
 def valid_depth_mask(depth_m: Float32[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Return the pixels whose depth is known and continuous: at depth edges it is mixed."""
+    """Return the pixels whose depth is known and continuous; at edges, depths of surfaces mix."""
     import cv2
 
     window = np.ones((DEPTH_WINDOW_PX, DEPTH_WINDOW_PX), np.uint8)

@@ -43,9 +43,9 @@ def tiny_model(**changes: Any) -> ModelConfig:
 
 
 def random_triplet(video: VideoSpec, seed: int = 0, *, observed: bool = False) -> Triplet:
-    """Return a triplet of noise, without a target, so that nothing has to be rendered.
+    """Return a triplet of noise, without a target and without rendering.
 
-    Its mask is noise too or, as DWM's models need it, says that everything was `observed`.
+    The mask is noise too, or everything is `observed`, as DWM's models need.
     """
     rng = np.random.default_rng(seed)
     frames = (video.frames, video.height, video.width)
@@ -74,9 +74,9 @@ def smooth_video(seed: int, frames: int, height: int, width: int) -> UInt8[np.nd
 def write_dataset(
     folder: Path, clips: int = 2, *, frames: int = 9, height: int = 32, width: int = 48
 ) -> Path:
-    """Write videos of clips and their metadata, as EgoSim's are laid out; return its path.
+    """Write videos of clips and their metadata in EgoSim's layout; return the metadata's path.
 
-    Every second clip is of the split `test`. The upper half of each mask is unobserved.
+    Every second clip is in the split `test`. The upper half of each mask is unobserved.
     """
     rows = []
     for index in range(clips):

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from egosim_jax.types.settings import InputError
 
 FOCAL_WIDTHS = (0.1, 20.0)
-"""Smallest and largest plausible focal length, in widths of the image."""
+"""Minimum and maximum plausible focal length, in image widths."""
 MAX_SKEW = 0.1
-"""Largest plausible skew of the pixels, in focal lengths."""
+"""Maximum plausible skew of the pixels, in focal lengths."""
 
 
 @no_type_check

@@ -1,4 +1,4 @@
-"""Data that flows round the loop: state, action, view, triplet, clip, perceived, ground truth."""
+"""Data of the simulation loop: state, action, view, triplet, clip, perceived, ground truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Kind = Literal["human", "robot"]
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class SceneState:
-    """State of the world: colored 3D points, with object instance and last observation of each."""
+    """State of the world: colored 3D points, each with its object instance and last observation."""
 
     points_m: Float32[np.ndarray, "n 3"]
     """Positions in the world, in meters."""
@@ -77,11 +77,11 @@ class SceneState:
 JOINTS: Mapping[Kind, int] = {"human": 21, "robot": 3}
 """Number of keypoints of a hand, by kind."""
 HAND_SIZE_M = (0.01, 1.0)
-"""Smallest and largest plausible extent of a hand, in meters."""
+"""Minimum and maximum plausible extent of a hand, in meters."""
 NEAR_IMAGE = 0.25
 """Margin around the image in which a joint counts as near the view, in widths and heights."""
 REACH_M = 3.0
-"""Largest distance in front of a camera at which a joint counts as near the view, in meters."""
+"""Maximum distance in front of a camera at which a joint counts as near the view, in meters."""
 
 
 def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[np.ndarray, "f n"]:
@@ -109,8 +109,8 @@ class Action:
     joints_m: Float[np.ndarray, "f n j 3"]
     """Joints of n hands in the world, in meters: 21 of a human hand, 3 of a gripper.
 
-    All joints of a hand are NaN in frames in which it is missing; without hands, give one hand that
-    is missing from all frames."""
+    All joints of a hand are NaN in frames where it is missing. For a clip without hands, give one
+    hand that is missing from all frames."""
     kind: Kind
     """Kind of hands."""
     prompt: str
@@ -119,8 +119,8 @@ class Action:
     def __post_init__(self) -> None:
         """Check kind, joint count, frame count, units and frame of reference.
 
-        Raises `InputError`, also where a hand is given and never comes near any camera's view:
-        then it is not in world coordinates.
+        Raises `InputError`, also if a hand never comes near any camera's view: then it is not in
+        world coordinates.
         """
         if self.kind not in JOINTS:
             raise InputError(
@@ -143,8 +143,8 @@ class Action:
         if broken.any():
             frame, hand = np.argwhere(broken)[0].tolist()
             raise InputError(
-                f"Hand {hand} of frame {frame} has joints that are not finite and others that are: "
-                "give all joints of a hand, or NaN for all where it is missing."
+                f"Hand {hand} of frame {frame} is only partly finite: give all joints of a hand, "
+                "or NaN for all where it is missing."
             )
         if given.any():
             self._check_size(joints, given)
@@ -245,9 +245,9 @@ class Perceived:
     names: Mapping[int, str]
     """Names of object instances, by id."""
     world_from_object: Mapping[int, Float[np.ndarray, "f 4 4"]]
-    """Poses of tracked objects; the first frame's is that in the state before."""
+    """Poses of tracked objects; the first frame has the pose of the state before."""
     interacted_frames: Mapping[int, Bool[np.ndarray, " f"]]
-    """Frames in which hands acted on each object; only objects with at least one."""
+    """Frames in which hands acted on each object; objects without any are absent."""
 
 
 @no_type_check
@@ -285,6 +285,6 @@ class GroundTruth:
         for number, motion in (self.motions or {}).items():
             if np.shape(motion) != (shape[0], 4, 4) or not is_rigid(np.asarray(motion)).all():
                 raise InputError(
-                    f"The ground-truth motion of object {number} is of shape {np.shape(motion)}: "
+                    f"The ground-truth motion of object {number} has shape {np.shape(motion)}: "
                     f"it must be one finite rigid transform per frame, ({shape[0]}, 4, 4)."
                 )

@@ -31,7 +31,7 @@ def check_seed(seed: int, *, name: str = "--seed") -> None:
 
 
 def check_counts(counts: Mapping[str, int | None]) -> None:
-    """Raise `InputError` at the first count below 1; by name, None if none was given."""
+    """Raise `InputError` at the first count below 1; counts are by name, None if not given."""
     for name, count in counts.items():
         if count is not None and count < 1:
             raise InputError(f"{name} must be at least 1, not {count}.")
@@ -70,7 +70,7 @@ class VideoGrid:
     def check_frames(
         self, frames: int, *, what: str = "a video", fix: str = "--num-frames"
     ) -> None:
-        """Raise `InputError` unless the codec can encode so many frames, 4k+1 for a stride of 4."""
+        """Raise `InputError` unless the codec can encode `frames`: 4k+1 for a stride of 4."""
         stride = self.temporal_stride
         if frames < 1 or (frames - 1) % stride:
             below = max(1, (frames - 1) // stride * stride + 1)
@@ -80,7 +80,7 @@ class VideoGrid:
             )
 
     def check_size(self, size: int, *, name: str) -> None:
-        """Raise `InputError` unless a number of rows or columns is a multiple of a token's."""
+        """Raise `InputError` unless a number of rows or columns divides into tokens."""
         unit = self.spatial_stride * self.patch
         if size < unit or size % unit:
             raise InputError(

@@ -17,7 +17,7 @@ import jax
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.conditioning.video import to_model
+from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import Networks
 from egosim_jax.train.tasks.refining import Refining
 from egosim_jax.train.update import Batch, Metrics

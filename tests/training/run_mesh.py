@@ -11,7 +11,7 @@ import numpy as np
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiTConfig

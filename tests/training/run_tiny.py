@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from egosim_jax import configs
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.io import weights
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.testing import tiny_model

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io import parts

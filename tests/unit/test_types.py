@@ -53,8 +53,8 @@ def infinite(joints):
         ({"joints_m": 1000 * action().joints_m}, "Joints must be in meters"),
         ({"joints_m": action().joints_m / 1000}, "Joints must be in meters"),
         ({"joints_m": action().joints_m + [0, -9, 0]}, "must be in world coordinates"),
-        ({"joints_m": joints(one_nan)}, "Hand 0 of frame 2 has joints that are not finite"),
-        ({"joints_m": joints(infinite)}, "Hand 0 of frame 2 has joints that are not finite"),
+        ({"joints_m": joints(one_nan)}, "Hand 0 of frame 2 is only partly finite"),
+        ({"joints_m": joints(infinite)}, "Hand 0 of frame 2 is only partly finite"),
         ({"prompt": None}, "The prompt must be text, not NoneType"),
     ],
 )

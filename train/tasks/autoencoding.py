@@ -23,7 +23,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
-from egosim_jax.conditioning.video import to_model
+from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.models import VideoCodecConfig
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError, VideoSpec

@@ -1,7 +1,7 @@
 """Training the denoiser on cached latents, with its small encoders if the model trains them.
 
 The loss is the diffusion objective (`diffusion/objective.py`) under a condition from which prior,
-mask, hands and text are dropped at random (`conditioning/dropout.py`). Latents may be drawn
+mask, hands and text are dropped at random (`conditioning/condition.py`). Latents may be drawn
 from their posteriors at each update (DWM; `conditioning/posterior.py`).
 """
 
@@ -17,7 +17,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning import Condition
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.conditioning.posterior import STD, draw
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float, Int, Key
 
-from egosim_jax.conditioning.video import to_model
+from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import Networks
 from egosim_jax.evaluation.metrics.lpips import Lpips
 from egosim_jax.train.tasks.autoencoding import Autoencoding

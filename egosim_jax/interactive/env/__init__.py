@@ -68,7 +68,7 @@ def load_backend(
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
     folder = configs.weights_of(config, None if weights is None else Path(weights))
-    generator = Streamer(Generator.load(model, folder, mesh=mesh), mesh)
+    generator = Streamer(Generator.load(model, folder, mesh=mesh))
     unit = parts("batch", mesh)
     batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
     for size in batcher.sizes if compile else ():

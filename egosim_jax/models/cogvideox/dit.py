@@ -202,7 +202,7 @@ class CogVideoXDiT(nnx.Module):
         )
 
     def modulators(self, time: Float[Array, "b e"], context: CogVideoXContext) -> Any:
-        """Return what the modulations of the blocks see."""
+        """Return the input of the blocks' modulations."""
         return time
 
     def __call__(

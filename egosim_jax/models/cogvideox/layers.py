@@ -194,7 +194,7 @@ class Block(nnx.Module):
     ) -> Float[Array, "b n d"]:
         """Update the residual stream; sums are taken in float32 and kept in x's dtype.
 
-        `time` is what the modulations see, the time embedding `b e`.
+        `time` is the input of the modulations, the time embedding `b e`.
         """
         for modulation, layer in (
             (self.modulation_a, lambda y: self.attn(y, rotation)),

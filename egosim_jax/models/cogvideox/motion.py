@@ -1,11 +1,11 @@
 """CogVideoX's transformer with hand poses in its modulation, the ablation "AdaLN" of DWM.
 
 The poses of the hands, a vector for each pixel frame, are embedded and change shift, scale and gate
-of every block, for the tokens of each latent frame by themselves (`frame`) or for all alike, by
-their mean (`global`). The addition is 0 before training. The tokens of the text take the mean.
+of every block. Video tokens use the poses of their latent frame (`frame`), or the mean of all poses
+(`global`); text tokens use the mean. The addition is 0 before training.
 
-The released class for single frames averages them too, and starts its embedding at 0, so that it
-never learns; here only the last layer starts at 0. (Kim et al. 2026, table 3.)
+The released class for single frames averages them too, and initializes its embedding with 0, so it
+never learns. Here only the last layer starts at 0. (Kim et al. 2026, table 3.)
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class MotionDiTConfig(CogVideoXDiTConfig):
         return MotionDiT(self, rngs=rngs)
 
     def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
-        """Count a forward pass of one sample, with the poses of `image` pixel frames.
+        """Return the FLOPs of a forward pass of one sample, with poses of `image` pixel frames.
 
         To CogVideoX's, with P poses of width p, F latent frames, a time embedding of width e and L
         blocks of width d, they add

@@ -84,7 +84,7 @@ class CogVideoXVAEConfig:
             )
 
     def check_frames(self, frames: int) -> None:
-        """Raise `InputError` unless a video of so many frames divides into chunks."""
+        """Raise `InputError` unless the number of frames divides into chunks."""
         unit = CHUNK * self.temporal_stride
         if frames % unit != 1:
             below = max(1, (frames - 1) // unit * unit + 1)
@@ -267,8 +267,8 @@ class CogVideoXVAE(nnx.Module):
     ) -> tuple[Float[Array, "b f2 h2 w2 z"], Float[Array, "b f2 h2 w2 z"]]:
         """Return mean and log variance of the latents, not scaled, in float32.
 
-        Raises `InputError` unless the video is of floats (in [-1, 1]) and has 8k+1 frames of a
-        size in multiples of 8.
+        Raises `InputError` unless the video has floats (in [-1, 1]) and 8k+1 frames with a height
+        and width in multiples of 8.
         """
         self._check(video)
         size = CHUNK * self.config.temporal_stride
@@ -294,7 +294,7 @@ class CogVideoXVAE(nnx.Module):
         return jnp.clip(self.decode_whole(latents), -1.0, 1.0)
 
     def decode_whole(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
-        """Return the video of latents not scaled, not clipped, for training; chunked too."""
+        """Return the video of unscaled latents, not clipped, for training; also in chunks."""
         video = _by_chunk(self.decoder, latents, first=CHUNK + 1, size=CHUNK)
         return video.astype(jnp.float32)
 
@@ -307,12 +307,12 @@ class CogVideoXVAE(nnx.Module):
         return latents / self.config.scale
 
     def standardize(self, mean: Float[Any, " z"], std: Float[Any, " z"]) -> None:
-        """Fold a measured deviation of the latents into the layers that write and read them.
+        """Fold a measured deviation of the latents into the layers before and after them.
 
         `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
         returns. Afterwards the latents of `encode` have a mean square of 1 in each channel, and
         encoding then decoding gives the same video as before. Their mean stays: the decoder's first
-        convolution pads with zeros, so that no bias could replace it.
+        convolution pads with zeros, so no bias could replace it.
         """
         size = self.config.scale * jnp.sqrt(jnp.square(mean) + jnp.square(std))
         out, shift = self.encoder.conv_out, jnp.concatenate([0 * size, -2 * jnp.log(size)])

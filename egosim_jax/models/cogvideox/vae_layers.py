@@ -45,7 +45,7 @@ class GroupNorm(nnx.Module):
 
 
 def _group_mean(y: Float[Array, "b f h w g c"]) -> Float[Array, "b 1 1 1 g 1"]:
-    """Return the means of groups, of rows first: one long sum in float32 loses digits on CPUs."""
+    """Return the means of groups; rows first, as one long sum in float32 loses digits on CPUs."""
     rows = jax.lax.optimization_barrier(y.mean((3, 5), keepdims=True))  # else XLA joins the sums
     return rows.mean((1, 2), keepdims=True)
 

@@ -5,8 +5,8 @@ channels (EgoSim) are split into patches of 1 x 2 x 2 cells, one token each, whi
 blocks of `layers` and become the velocity of the noisy latents.
 
 Everything that does not depend on the step is computed once by `prepare`: the patch embedding is
-linear, so that the condition's contribution is separate; keys and values of the cross-attentions
-depend on text and image only. `denoise` is what a solver calls at each step.
+linear, so the condition's contribution is separate; keys and values of the cross-attentions depend
+on text and image only. A solver calls `denoise` at each step.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class WanDiTConfig(WanDiTSizes):
         return WanDiT(self, rngs=rngs)
 
     def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
-        """Count a forward pass of one sample, of so many latent cells, text and image tokens.
+        """Return the FLOPs of a forward pass of one sample, by its latent cells and tokens.
 
         With N tokens of width d, an MLP of width f, T text and I image tokens and L blocks, it has
 

@@ -229,8 +229,8 @@ class WanVAE(nnx.Module):
     def encode(self, video: Float[Array, "b f h w 3"]) -> Float[Array, "b f2 h2 w2 z"]:
         """Return normalized mean latents, float32; frames are coded in groups of 1, 4, 4, ...
 
-        Raises `InputError` unless the video is of floats (in [-1, 1]) and has 4k+1
-        frames of a size in multiples of 8.
+        Raises `InputError` unless the video has floats (in [-1, 1]) and 4k+1 frames with a height
+        and width in multiples of 8.
         """
         self._check(video)
         first, cache = self.encoder(video[:, :1], None)
@@ -283,7 +283,7 @@ class WanVAE(nnx.Module):
 
         `mean` and `std` are statistics, over a data set, of the posterior means that `moments`
         returns. Afterwards the means have mean 0 and deviation 1, the log variances shrink by 2 log
-        std, and decoding what is encoded gives the same video as before.
+        std, and a decoded encoding is the same video as before.
         """
         encode, decode = self.to_moments, self.from_latents
         encode_bias, decode_bias = cast(nnx.Param, encode.bias), cast(nnx.Param, decode.bias)

@@ -1,6 +1,6 @@
 """Layers of the causal video VAE, each called as `layer(x, cache) -> (y, new cache)`.
 
-A layer's *cache* is what it remembers of the frames before. None marks the start of the video,
+A layer's *cache* holds what it needs of earlier frames. None marks the start of the video,
 where the three stateful layers follow these rules (x_t = 0 for t < 0):
 
     causal convolution     y_t = sum_k W_k x_(t-K+1+k), k < K

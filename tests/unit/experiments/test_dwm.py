@@ -117,7 +117,7 @@ def test_a_wider_model_starts_as_its_base(tmp_path):
     ("bad", "message"),
     [
         ({"only": ("fulll",)}, "no model fulll to compare"),
-        ({"strength": 75.0}, r"strength 75\.0: that must be above 0 and at most 1"),
+        ({"strength": 75.0}, r"strength 75\.0: it must be above 0 and at most 1"),
         ({"text_dropout": 1.5}, r"must be in \[0, 1\], not 1\.5"),
     ],
 )

@@ -33,7 +33,7 @@ def clip():
 
 
 def latents(clip, part, noise=None, model=MODEL, seeds=SEEDS):
-    """Return the latents of a part of the condition, by which a clip is generated."""
+    """Return the latents of a part of the condition, as generation encodes it."""
     model = replace(model, encoding_noise=noise)
     generator = Generator(model, shown.networks(model, part))
     return np.asarray(generator.latents([clip] * len(seeds), seeds))

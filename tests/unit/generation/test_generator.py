@@ -139,7 +139,7 @@ def test_latents_that_are_not_finite_name_their_clips(networks, triplets):
     broken.dit.head.linear.bias[...] = jnp.full_like(broken.dit.head.linear.bias[...], jnp.nan)
     with pytest.raises(NonFiniteError, match="tabletop_human_0_0") as found:
         Generator(CONFIG, broken).generate(triplets[:2], [0, 0])
-    assert found.value.places == (0, 1)
+    assert found.value.bad == (0, 1)
 
 
 def test_a_weights_folder_comes_back_bit_for_bit(networks, tmp_path: Path):

@@ -26,7 +26,7 @@ def test_a_streamed_clip_is_the_generated_one_in_groups_of_its_latent_frames():
     head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)
     mesh = make_mesh(MeshConfig(data=1, fsdp=1), jax.devices()[:1])
     generator = Generator(config, networks, mesh)
-    streamer = Streamer(generator, mesh)
+    streamer = Streamer(generator)
     streamer.compile()
     spec = ActionSpec()
     start = tabletop_start(0, spec, VIDEO)

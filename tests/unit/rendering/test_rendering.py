@@ -249,7 +249,7 @@ def test_both_renderers_give_the_same_view(scene):
 @pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_first_frame_without_points_is_refused(renderer):
     state = make_state(np.float32([[0, -5, 0]]), np.zeros((1, 3), np.uint8))
-    with pytest.raises(InputError, match=r"None of the 1 points of the scene is seen"):
+    with pytest.raises(InputError, match=r"None of the 1 points of the scene is visible"):
         renderer.render(state, make_cameras(), point_px=2)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.io.digest import fingerprint
-from egosim_jax.simulation.actions import ORDERS, SHORTER, _bone_length
+from egosim_jax.simulation.actions import ORDERS, REORDERED_RATIO, _bone_length
 from egosim_jax.simulation.episode import Episode, _read_ground_truth
 from egosim_jax.state.snapshot import save
 from egosim_jax.types import InputError, VideoSpec
@@ -86,7 +86,7 @@ def test_a_fist_is_not_taken_for_a_hand_in_another_order(hands):
     across = np.arange(-2, 3)[:, None, None] * [0.003, 0, 0]
     fist = np.concatenate([np.zeros((1, 3)), (finger + across).reshape(20, 3)])
     lengths = [_bone_length(fist[None, order]) for order in ORDERS.values()]
-    assert min(lengths) < SHORTER * _bone_length(fist[None])
+    assert min(lengths) < REORDERED_RATIO * _bone_length(fist[None])
     with_joints(hands, lambda a: a.joints_m[:, :, :1] + fist)
 
 

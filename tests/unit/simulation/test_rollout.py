@@ -75,7 +75,7 @@ def test_each_clip_starts_from_the_state_that_the_last_one_left(tmp_path):
 def test_a_state_that_no_camera_looks_at_is_refused(tmp_path):
     state = clips()[0].state
     behind = replace(state, points_m=state.points_m + np.float32([0, -50, 0]))
-    with pytest.raises(InputError, match=r"None of the .* points of the scene is seen"):
+    with pytest.raises(InputError, match=r"None of the .* points of the scene is visible"):
         list(Rollout(simulator(), tmp_path).run(behind, [to_action(clips()[0])], seed=0))
     assert not any(tmp_path.rglob("*.npz"))
 
@@ -257,7 +257,7 @@ def test_a_changed_file_of_a_finished_phase_is_named(tmp_path):
     "bad", [lambda *a: np.zeros((4, 48, 80, 3), np.uint8), lambda *a: np.zeros((5, 48, 80, 3))]
 )
 def test_a_generator_that_returns_other_frames_is_refused(tmp_path, bad):
-    with pytest.raises(InputError, match="must return as many frames of the same size"):
+    with pytest.raises(InputError, match="must return the same number of frames, of the same size"):
         run(tmp_path, generator=bad)
 
 

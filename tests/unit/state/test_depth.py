@@ -55,7 +55,7 @@ def test_split_pixels_lie_on_the_same_plane_and_leave_no_gaps_nearby():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda image, depth: (image[:-1], depth), "must be of the same image"),
+        (lambda image, depth: (image[:-1], depth), "must have the same size"),
         (lambda image, depth: (image, 1000 * depth), "Convert depth_m to meters"),
         (lambda image, depth: (image, np.zeros_like(depth)), "no positive finite value"),
     ],
@@ -72,7 +72,7 @@ def test_an_image_or_depth_that_makes_no_sense_is_refused(change, message):
         (np.zeros((4, 6, 3), np.uint8), np.ones((1, 4, 6)), r"depth_m is float64 \(1, 4, 6\)"),
         (np.zeros((4, 6, 3), np.float32), np.ones((4, 6)), "image is float32"),
         (np.zeros((4, 6), np.uint8), np.ones((4, 6)), r"image is uint8 \(4, 6\)"),
-        (np.zeros((8, 6, 3), np.uint8), np.ones((4, 6)), "must be of the same image"),
+        (np.zeros((8, 6, 3), np.uint8), np.ones((4, 6)), "must have the same size"),
     ],
 )
 def test_images_and_depth_of_other_shapes_or_dtypes_are_refused(image, depth_m, message):

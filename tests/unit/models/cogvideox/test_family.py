@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.conditioning.dropout import ConditionDropout
+from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.conditioning.layout import DWM
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion import Guidance

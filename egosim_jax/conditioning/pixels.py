@@ -1,12 +1,18 @@
-"""Preprocessing of the first frame for the CLIP image encoder.
+"""Pixel ranges: between uint8 RGB and [-1, 1], and the first frame for the CLIP image encoder.
 
-Wan 2.1 takes an image in [-1, 1], resizes it to the encoder's square, maps it to [0, 1] and
-normalizes it with CLIP's statistics:
+    to the model     x = p / 127.5 - 1
+    from the model   p = floor((x + 1) / 2 * 255), x clipped to [-1, 1]
+
+The EgoSim release truncates rather than rounds: p = 255 takes x = 1 exactly. Of the 256 levels, 63
+return one lower in NumPy, where float32 left x slightly too small.
+
+For CLIP, Wan 2.1 takes an image in [-1, 1], resizes it to the encoder's square, maps it to [0, 1]
+and normalizes it with CLIP's statistics:
 
     pixels = (x / 2 + 1/2 - mean) / std
 
-The EgoSim release hands over an image in [0, 1] instead, so that its encoder saw only the upper
-half of the range, in training too; `image_range="unit"` reproduces that, "signed" is Wan's.
+The EgoSim release passes an image in [0, 1] instead, in training too, so its encoder saw only the
+upper half of the range. `image_range="unit"` reproduces that; "signed" is Wan's.
 
 The resize is bicubic without antialiasing, on a grid of cells (not of corners), as torch's
 `interpolate`. Output cell i is centered on s = (i + 1/2) n_in / n_out - 1/2 and weighs the four
@@ -18,8 +24,9 @@ cells around s, at distances d, by Keys' kernel (1981) with a = -3/4, the edge c
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -28,6 +35,18 @@ MEAN = np.array([0.48145466, 0.4578275, 0.40821073], np.float32)
 STD = np.array([0.26862954, 0.26130258, 0.27577711], np.float32)
 """CLIP's standard deviation of RGB in [0, 1]."""
 KEYS_A = -0.75
+
+Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
+
+
+def to_model(frames: Numbers) -> Numbers:
+    """Convert RGB in uint8, of any shape, to float32 in [-1, 1]."""
+    return frames.astype(np.float32) / 127.5 - 1
+
+
+def to_uint8(video: Numbers) -> Numbers:
+    """Convert RGB in [-1, 1], of any shape, to uint8, clipped."""
+    return ((video.clip(-1, 1) + 1) / 2 * 255).astype(np.uint8)
 
 
 def clip_pixels(
