@@ -12,12 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
-from egosim_jax.convert.outputs import apart, write_file, write_sharded
-from egosim_jax.convert.pipeline import pipeline_files
 from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch, widening_of
-from egosim_jax.convert.stream import Weight, in_memory, in_rows
-from egosim_jax.convert.tables import table_of
-from egosim_jax.convert.tokenizer import tokenizer_files
+from egosim_jax.convert.source import tokenizer_files
+from egosim_jax.convert.stream import (
+    Weight,
+    apart,
+    in_memory,
+    in_rows,
+    write_file,
+    write_sharded,
+)
+from egosim_jax.convert.tables import pipeline_files, table_of
 from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.bounded import quote_path
@@ -39,9 +44,9 @@ Dtype = Literal["float32", "bfloat16", "float16"]
 
 @dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """List the networks of a checkpoint file or folder and the configs that each fits.
+    """List the networks of a checkpoint file or folder, and the configs that each network fits.
 
-    Only headers are read.
+    Reads only headers.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -104,13 +109,13 @@ class Weights:
     dtype: Dtype | None = None
     """Dtype to store floating weights in; by default each keeps its own."""
     widen: WidenMode | None = None
-    """Conversion from a base model of fewer input channels; the kernels of the others are 0.
+    """Convert a base model with fewer input channels; the kernels of the new ones are 0.
 
-    `polarity` re-expresses the base's mask (Wan: 1 = keep) in the model's; `copy` takes both masks
-    as equal."""
+    `polarity` converts the base's mask (Wan: 1 = keep) to the model's; `copy` assumes that both
+    are equal."""
 
     def run(self, *, keep_logs: bool = False) -> int:
-        """Detect the networks, check them, write; with the logs kept, only incomplete ones."""
+        """Detect, check and write the networks; with `keep_logs`, only incomplete ones."""
         from egosim_jax import configs
 
         config = configs.get(self.config)
@@ -157,9 +162,9 @@ class Weights:
 class ToTorch:
     """Write a weights folder as safetensors that PyTorch projects load.
 
-    `wan` is the layout of the Wan and EgoSim releases; `diffusers` has a folder per network, with
-    the configs that `from_pretrained` reads, except for the tokenizer, which the caller passes.
-    Networks above 5 GB are written as several files with an index.
+    `wan` is the layout of the Wan and EgoSim releases. `diffusers` has a folder per network, with
+    the configs that `from_pretrained` reads; the caller passes the tokenizer. A network above 5 GB
+    becomes several files with an index.
     """
 
     weights: Annotated[Path, tyro.conf.Positional]
@@ -176,7 +181,7 @@ class ToTorch:
     """Dtype to store floating weights in; by default each keeps its own."""
 
     def run(self) -> int:
-        """Check the weights, convert them, write."""
+        """Check, convert and write the weights."""
         from egosim_jax import configs
         from egosim_jax.io.mapped import read_safetensors
 
@@ -210,32 +215,27 @@ class Lora:
     """
 
     source: Annotated[Path, tyro.conf.Positional]
-    """LoRA file, or folder of one with PEFT's config or with weights in full (DWM's)."""
+    """LoRA file, or its folder with PEFT's config or with full weights (DWM)."""
     config: str
-    """Name of the model that it is for."""
+    """Name of the LoRA's model."""
     out: Path
-    """File to write or, with --merge, weights folder, whose other networks are symlinks."""
+    """File to write; with --merge, a weights folder whose other networks are symlinks."""
     merge: Path | None = None
-    """Weights folder to merge it into."""
+    """Weights folder to merge the LoRA into."""
     scale: float = 1.0
     """Strength of the LoRA in a merge."""
     base: Path | None = None
-    """Weights folder that it was trained on, whose hash is written to the file's header."""
+    """Weights folder that the LoRA was trained on; the file's header gets its hash."""
     layout: Literal["dwm"] | None = None
-    """Layout to write instead of one file: `dwm`, a folder as DWM publishes.
+    """Layout instead of one file; `dwm` writes a folder like DWM's checkpoints.
 
-    A LoRA in the names of PEFT or, on Wan, of VideoX-Fun, and next to it the patch projection."""
+    It has a LoRA in the names of PEFT or, on Wan, of VideoX-Fun, and the patch projection."""
 
     def run(self) -> int:
-        """Read the LoRA, check it, write."""
+        """Read, check and write the LoRA."""
         from egosim_jax import configs
-        from egosim_jax.convert.lora import (
-            base_of,
-            check_base,
-            exported,
-            exported_metadata,
-            read_lora,
-        )
+        from egosim_jax.convert.lora import base_of, check_base, read_lora
+        from egosim_jax.convert.lora_export import exported, exported_metadata
         from egosim_jax.convert.plan import merged
         from egosim_jax.io.mapped import read_safetensors
         from egosim_jax.models.lora import BASE, check_scale
@@ -277,8 +277,8 @@ class Lora:
         origin: Sequence[Path],
         trained_on: Mapping[str, str],
     ) -> int:
-        """Write the folder of a checkpoint of DWM."""
-        from egosim_jax.convert.dwm_checkpoint import checkpoint
+        """Write a folder in the layout of DWM's checkpoints."""
+        from egosim_jax.convert.lora_export import checkpoint
         from egosim_jax.io.mapped import read_safetensors
 
         if self.merge is not None:
@@ -300,9 +300,9 @@ class Lora:
 class Verify:
     """Compare a weights folder with the checkpoint that it was converted from.
 
-    Every value must equal the source's, bit for bit, after the change of layout and dtype, and
-    match its checksums. If torch, diffusers and transformers are installed, one forward of each
-    network is also compared.
+    Every value must equal the source's bit for bit, after the change of layout and dtype, and match
+    its checksum. With torch, diffusers and transformers installed, it also compares one forward of
+    each network.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -312,7 +312,7 @@ class Verify:
     config: str
     """Name of the model."""
     widen: WidenMode | None = None
-    """Option that the base model was converted with."""
+    """Value of --widen in the conversion."""
 
     def run(self) -> int:
         """Compare the weights; return 1 if any differs."""
@@ -368,7 +368,7 @@ class Verify:
 def _widening(
     found: DetectedNetwork, config: ModelConfig, mode: WidenMode | None
 ) -> Widening | None:
-    """Return the widening of a denoiser, if one is asked for."""
+    """Return the widening of a denoiser, or None for other networks and without a mode."""
     return widening_of(config, mode) if mode and found.network == "dit" else None
 
 
@@ -381,7 +381,7 @@ def _hash(folder: Path) -> str:
 
 
 def _same(weight: Weight, tensor: Tensor) -> bool:
-    """Return True if the tensor has exactly the pieces, cast to its dtype."""
+    """Return True if the tensor equals the pieces, cast to its dtype, bit for bit."""
     import numpy as np
 
     parts = tensor.array().reshape(len(weight.pieces), -1)

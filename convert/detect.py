@@ -1,8 +1,8 @@
-"""Detect which networks a foreign checkpoint holds, and in which naming.
+"""Detection of the networks in a foreign checkpoint, and of their namings.
 
-A network is detected by the signature key of a naming; what precedes that key is the prefix of all
-its keys. Folders are searched as they are downloaded: EgoSim's and Wan's releases with their files
-side by side, diffusers' with a folder per network, and the tokenizer in a separate folder.
+The signature key of a naming identifies a network; the text before it is the prefix of all its
+keys. Folders are searched as downloaded: EgoSim's and Wan's releases have all files side by side,
+diffusers' have a folder per network, and the tokenizer has a separate folder.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig
 
 T5 = "spiece.model"
-"""File of T5's tokenizers alone; Wan's releases also have that of CLIP's text encoder."""
+"""File of T5's tokenizers only: Wan's releases also have the tokenizer of CLIP's text encoder."""
 TOKENIZER = ("tokenizer.json", T5)
-"""Files that mark the folder of a tokenizer."""
+"""Files that identify the folder of a tokenizer."""
 BASE_LAYER, LORA = ".base_layer.", ".lora_"
-"""Parts of the names of an adapted layer's tensors by PEFT: of its weights, and of the LoRA."""
-DEEPEST = 2
-"""Levels of subfolders that are searched."""
+"""PEFT's infixes in tensor names of an adapted layer: of its weights, and of the LoRA."""
+MAX_DEPTH = 2
+"""Levels of subfolders to search."""
 MAX_NETWORKS = 16
-"""Networks in a checkpoint."""
+"""Maximum number of networks in a checkpoint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class DetectedNetwork:
 
     @property
     def tensors(self) -> Mapping[str, Tensor]:
-        """Tensors of the network by name, without the prefix and what PEFT adds to it."""
+        """Tensors of the network by name, without the prefix and PEFT's additions."""
         cut = len(self.prefix)
         skipped = set(self.low_rank)
         return {
@@ -61,7 +61,7 @@ class DetectedNetwork:
 
     @property
     def low_rank(self) -> list[str]:
-        """Names of the low-rank tensors of PEFT's adapted layers, which are not of the network."""
+        """Names of PEFT's low-rank tensors, which are not weights of the network."""
         names = self.source.tensors.keys()
         layers = {name.partition(BASE_LAYER)[0] for name in names if BASE_LAYER in name}
         return [name for name in names if LORA in name and name.partition(LORA)[0] in layers]
@@ -74,14 +74,14 @@ class Folder:
     path: Path
     """File or folder that was searched."""
     found: tuple[DetectedNetwork, ...]
-    """Networks that the checkpoint folder holds."""
+    """Networks in the file or folder."""
     unknown: tuple[Source, ...]
     """Checkpoints without a known network."""
     tokenizer: Path | None
-    """Folder of the tokenizer, if any; of several T5's, else the nearest."""
+    """Folder of the tokenizer, if any: the nearest of T5, else the nearest."""
 
     def network(self, name: str) -> DetectedNetwork:
-        """Return the only checkpoint of a network. Raises `InputError` for none or several."""
+        """Return the only checkpoint of a network. Raises `InputError` for 0 or several."""
         here = [found for found in self.found if found.network == name]
         if len(here) != 1:
             names = ", ".join(found.source.name for found in here) or "none"
@@ -95,7 +95,7 @@ class Folder:
 def detect(path: Path, config: ModelConfig | None = None) -> Folder:
     """Search a file or folder for networks. Raises `InputError` if it holds no checkpoint.
 
-    The tables are those of all registered models, after those of `config`, which take precedence.
+    The tables of `config` take precedence over the tables of the registered models.
     """
     tables = known_tables(config)
     found, unknown, tokenizers = [], [], []
@@ -123,7 +123,7 @@ def known_tables(config: ModelConfig | None = None) -> list[tuple[str, Table]]:
 
 
 def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[DetectedNetwork]:
-    """Return the networks of a checkpoint; a ComfyUI file may hold several under prefixes."""
+    """Return the networks of a checkpoint; a ComfyUI file can hold several, each with a prefix."""
     found: dict[tuple[str, str], DetectedNetwork] = {}
     for network, table in tables:
         for naming, names in table.namings.items():
@@ -145,7 +145,7 @@ def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[Det
 def _folders(path: Path) -> list[Path]:
     """Return the path and its visible subfolders, nearest first."""
     found, layer = [path], [path]
-    for _ in range(DEEPEST if path.is_dir() else 0):
+    for _ in range(MAX_DEPTH if path.is_dir() else 0):
         layer = sorted(
             inner
             for outer in layer

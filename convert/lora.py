@@ -1,36 +1,34 @@
-"""Read LoRA files in every common naming, and write one that ComfyUI and diffusers both load.
+"""Reading of LoRA files in every common naming.
 
-A file names a layer of the denoiser in one of its table's namings, behind a prefix
-(`diffusion_model.`, `transformer.`, `base_model.model.`, `lora_unet_`), with dots or, in kohya's
-files, underscores, and then the role of the tensor: `lora_A` or `lora_down`, `lora_B` or `lora_up`,
-`alpha`, or a full difference of a weight, bias or modulation: `diff`, `diff_b`, `diff_m`. Without
-an alpha it is the rank, unless PEFT's `adapter_config.json` or the file's header has one. Files are
-written in the naming that has a `lora_prefix`, with an alpha for each layer, and rank, alpha and
-the hash of the base weights in the header.
+A tensor's name has a prefix (`diffusion_model.`, `transformer.`, `base_model.model.`,
+`lora_unet_`), a layer of the denoiser in one of its table's namings, with dots or, in kohya's
+files, underscores, and the role of the tensor: `lora_A` or `lora_down`, `lora_B` or `lora_up`,
+`alpha`, or a full difference of a weight, bias or modulation: `diff`, `diff_b`, `diff_m`. The
+default alpha is in PEFT's `adapter_config.json` or in the file's header, else it is the rank.
 
-A folder may also have weights that were trained in full, in a file `non_lora_weights`: DWM's, whose
-patch projection replaces that of its base.
+A folder can also have full weights in a file `non_lora_weights`, like DWM's, whose patch projection
+replaces the base's. `lora_export` writes LoRA files.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ml_dtypes
 import numpy as np
 from einops import EinopsError
 
-from egosim_jax.convert.lora_settings import Settings, finite, settings_of
 from egosim_jax.convert.rules import Rule, shape_only
 from egosim_jax.convert.source import PTH, Source, sources
 from egosim_jax.convert.tables import table_of, weight_shapes
-from egosim_jax.io.bounded import listing, quote_path, quote_text
+from egosim_jax.io.bounded import listing, parse_json, quote, quote_path, quote_text, read_json
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
 from egosim_jax.models.lora import (
     BASE,
@@ -53,34 +51,36 @@ PREFIXES = (
     "base_model.model.", "diffusion_model.", "model.", "transformer.", "pipe.dit.", "dit.",
     "lora_unet_", "lora_transformer_", "_",
 )  # fmt: skip
-"""Prefixes of layer names that LoRA files of other projects have, in any naming."""
+"""Prefixes of layer names in LoRA files of other projects, in any naming."""
 TEXT_PREFIXES = ("lora_te", "text_encoder.", "text_encoders.")
-"""Prefixes of the layers of a text encoder, which are skipped."""
+"""Prefixes of a text encoder's layers, which are skipped."""
 LOW_RANK = {
     "lora_A": "down", "lora_down": "down", "lora_B": "up", "lora_up": "up", "alpha": "alpha",
 }  # fmt: skip
 """Role of a low-rank tensor by the suffix of its name."""
 FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
-"""Weight that a full difference is added to by the suffix of its name."""
+"""Kind of weight of a full difference by the suffix of its name."""
 IN_FULL = "non_lora_weights"
-"""Stem of the file, next to a LoRA, of weights that replace those of the base."""
+"""Stem of the file next to a LoRA whose weights replace the base's."""
 ENDS = (".safetensors", *PTH)
-"""Suffixes of files of weights."""
+"""Extensions of weight files."""
+ADAPTER, ADAPTER_ENTRY = "adapter_config.json", "lora_adapter_metadata"
+"""PEFT's settings: the file next to the weights, and diffusers' entry in a header."""
 HALF = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
-"""Dtypes that a LoRA is kept in; others are read as float32."""
+"""Dtypes that a LoRA keeps; all others are read as float32."""
 SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
 
 
 @dataclass(frozen=True)
 class Location:
-    """Weight or, of stacked blocks, one layer of it."""
+    """A weight, or one layer of a stacked weight."""
 
     target: str
     """Path of the weight."""
     layer: int | None
-    """Index of the block; None for weights that are not stacked."""
+    """Index of the block; None for a weight that is not stacked."""
     rule: Rule = field(compare=False)
-    """Conversion rule of the naming that it was found in."""
+    """Conversion rule of the naming that matched."""
 
     @property
     def path(self) -> str:
@@ -94,11 +94,11 @@ class Location:
 def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
     """Return the changes of a LoRA by path; files in our format have the same paths.
 
-    `path` is a file, or a folder of one with PEFT's config or weights in full. Missing blocks are
-    0, and ranks lower than the highest of a stack are padded with 0. Tensors of half precision keep
-    their dtype where nothing is computed; all others are float32. Layers of a text encoder are
-    skipped with a message. Raises `InputError` listing every tensor that is not of the network or
-    does not fit, and every value that is not finite.
+    `path` is a file, or its folder with PEFT's config or full weights. Missing blocks are 0; lower
+    ranks in a stack are padded with 0 to the highest. Half-precision tensors keep their dtype if
+    nothing is computed; all others are float32. Layers of a text encoder are skipped with a
+    message. Raises `InputError` listing every tensor that is not of the network or does not fit,
+    and every value that is not finite.
     """
     source, in_full = _found(path)
     want = weight_shapes(config)
@@ -138,20 +138,20 @@ def check_base(path: Path, known: Collection[str]) -> None:
 
 
 def base_of(path: Path) -> str | None:
-    """Return the hash of the base weights in the header of a LoRA's file or folder, if any."""
+    """Return the hash of the base weights in the header of a LoRA file or folder, or None."""
     return metadata_of(_found(path)[0].files[0]).get(BASE)
 
 
 def _found(path: Path) -> tuple[Source, Source | None]:
-    """Return the LoRA of a file or folder, and the weights in full next to it, if any.
+    """Return the LoRA of a file or folder, and the full weights next to it, if any.
 
-    Raises `InputError` for a file which is only a part of such a folder.
+    Raises `InputError` for a file that is only a part of such a folder.
     """
     parts = [] if path.is_dir() else [path.with_name(f"{IN_FULL}{end}") for end in ENDS]
     if part := next(filter(Path.exists, parts), None):
         raise InputError(
-            f"{quote_path(path)} is only a part of a LoRA: it must be read together with the "
-            f"weights in full next to it, {part.name}. Give the folder that holds these two files, "
+            f"{quote_path(path)} is only a part of a LoRA: the full weights next to it, "
+            f"{part.name}, must be read with it. Give the folder that holds these two files, "
             f"{quote_path(path.parent)}."
         )
     found = list(sources(path))
@@ -168,7 +168,7 @@ def _found(path: Path) -> tuple[Source, Source | None]:
 def _values(
     source: Source, config: NetworkConfig, want: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Change]:
-    """Return the weights in full of a file by path."""
+    """Return the full weights of a file by path."""
     known = _locations(config, PREFIXES)
     changes: dict[str, Change] = {}
     problems = []
@@ -194,7 +194,7 @@ def _translated(
     want: Mapping[str, tuple[int, ...]],
     settings: Settings,
 ) -> dict[str, Change]:
-    """Convert a file in a foreign naming; shapes are checked before values are read."""
+    """Convert a file in a foreign naming; check all shapes before reading values."""
     namings = table_of(config).namings.values()
     prefixes = (*PREFIXES, *(naming.lora_prefix for naming in namings if naming.lora_prefix))
     known = _locations(config, prefixes)
@@ -237,8 +237,10 @@ def _translated(
         if have != shape:
             problems.append(f"{location}: has shape {have}; expected {shape}")
     if problems:
-        what = f"{len(problems)} tensors of {source.name} are not of a LoRA of this network"
-        raise InputError(f"{what}: {listing(problems)}.")
+        raise InputError(
+            f"{len(problems)} tensors of {source.name} are not of a LoRA of this network: "
+            f"{listing(problems)}."
+        )
     changes: dict[str, Change] = {}
     for path in dict.fromkeys(location.path for location in pairs):
         shape = want[f"{path}.kernel"]
@@ -254,7 +256,7 @@ def _translated(
 
 
 class Pair(NamedTuple):
-    """Low-rank tensors of a layer, not read yet, and the factor of their product."""
+    """Low-rank tensors of a layer, not yet read, and the factor of their product."""
 
     down: Tensor
     """Down projection `[r, in]`."""
@@ -288,7 +290,7 @@ def _pair(
 
 
 def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delta:
-    """Stack the low-rank tensors of all layers, the scale multiplied into the second."""
+    """Stack the low-rank tensors of all layers; `up` includes the scale."""
     pairs = layers.values()
     rank = max(pair.down.shape[0] for pair in pairs)
     *stacked, wide, out = kernel
@@ -304,53 +306,14 @@ def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delt
 
 
 def _dtype(tensors: Sequence[Tensor]) -> np.dtype:
-    """Return the dtype of half precision that tensors share, else float32."""
+    """Return the half-precision dtype of all tensors if they share one, else float32."""
     dtypes = {tensor.dtype for tensor in tensors}
     shared = next(iter(dtypes))
     return shared if len(dtypes) == 1 and shared in HALF else np.dtype(np.float32)
 
 
-def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, np.ndarray]:
-    """Return the tensors of a LoRA file to write; alpha is the rank, as the scale is in `up`.
-
-    Raises `InputError` if no naming of the network's table is one of LoRA files.
-    """
-    namings = table_of(config).namings.values()
-    naming = next((naming for naming in namings if naming.lora_prefix is not None), None)
-    if naming is None:
-        raise InputError(f"{config.table} has no naming of LoRA files.")
-    if values := [path for path, change in changes.items() if isinstance(change, Value)]:
-        raise InputError(
-            f"{listing(values)} replace weights of the base, which a LoRA file cannot: merge them "
-            "into it. (--merge)"
-        )
-    tensors, prefix = {}, naming.lora_prefix
-    suffixes = {kind: suffix for suffix, kind in FULL.items()}
-    known = locations_by_name(config, naming.rules(config))
-    for key, location in known.items():
-        name, _, kind = key.rpartition(".")
-        layer = ... if location.layer is None else location.layer
-        delta, full = changes.get(location.path), changes.get(location.target)
-        if isinstance(delta, Delta) and location.rule.transform == "linear":
-            down, up = delta.down[layer], delta.up[layer]
-            tensors[f"{prefix}{name}.lora_A.weight"] = np.ascontiguousarray(down.T)
-            tensors[f"{prefix}{name}.lora_B.weight"] = np.ascontiguousarray(up.T)
-            tensors[f"{prefix}{name}.alpha"] = np.array(down.shape[-1], np.float32)
-        if isinstance(full, np.ndarray) and full[layer].any():
-            values = location.rule.to_torch(full[layer])
-            tensors[f"{prefix}{name}.{suffixes[kind]}"] = np.ascontiguousarray(values)
-    return tensors
-
-
-def exported_metadata(changes: Mapping[str, Change]) -> dict[str, str]:
-    """Return the header metadata of a LoRA file to write."""
-    ranks = {change.down.shape[-1] for change in changes.values() if isinstance(change, Delta)}
-    rank = str(max(ranks, default=0))
-    return {"format": "pt"} | ({"rank": rank, "alpha": rank} if ranks else {})
-
-
 def _locations(config: NetworkConfig, prefixes: Sequence[str]) -> dict[str, Location]:
-    """Return the weights by their plain names in all namings; earlier ones take precedence."""
+    """Return the weights by their plain names in all namings; earlier namings take precedence."""
     known: dict[str, Location] = {}
     for naming in table_of(config).namings.values():
         named = locations_by_name(config, naming.rules(config))
@@ -373,3 +336,67 @@ def _plain(name: str, prefixes: Sequence[str]) -> str:
     while prefix := next((p for p in prefixes if name.startswith(p)), None):
         name = name.removeprefix(prefix)
     return name.replace(".", "_")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Settings of all layers of a LoRA."""
+
+    alpha: float | None = None
+    """Alpha of layers without one; None: the rank."""
+    rank_stabilized: bool = False
+    """True for a scale of alpha / sqrt(r), as in rsLoRA, instead of alpha / r."""
+
+    def scale(self, alpha: float | None, rank: int) -> float:
+        """Return the factor of a low-rank product."""
+        alpha = self.alpha if alpha is None else alpha
+        if alpha is None:
+            return 1.0
+        return alpha / (math.sqrt(rank) if self.rank_stabilized else rank)
+
+
+def settings_of(path: Path, metadata: Mapping[str, str]) -> Settings:
+    """Read the settings from the adapter's config or from the header."""
+    adapter = (path if path.is_dir() else path.parent) / ADAPTER
+    if os.path.lexists(adapter):
+        return _peft(read_json(adapter), source=quote_path(adapter))
+    if ADAPTER_ENTRY in metadata:
+        source = f"{ADAPTER_ENTRY} of {quote_path(path)}"
+        adapted = parse_json(metadata[ADAPTER_ENTRY].encode(), source=source)
+        return _peft(
+            {name.removeprefix("transformer."): value for name, value in adapted.items()}
+            if isinstance(adapted, dict)
+            else adapted,
+            source=source,
+        )
+    alpha = metadata.get("alpha", metadata.get("ss_network_alpha", "None"))
+    if alpha in ("None", ""):
+        return Settings()
+    return Settings(alpha=finite(alpha, f"The alpha of {quote_path(path)}"))
+
+
+def _peft(adapter: Any, *, source: str) -> Settings:
+    match adapter:
+        case {"lora_alpha": alpha}:
+            pass
+        case _:
+            raise InputError(f"{source} has no lora_alpha, which PEFT writes. Add it.")
+    if adapter.get("alpha_pattern"):
+        raise InputError(
+            f"{source} has an alpha_pattern, which is not supported: set one lora_alpha."
+        )
+    return Settings(
+        alpha=finite(alpha, f"lora_alpha of {source}"),
+        rank_stabilized=adapter.get("use_rslora") is True,
+    )
+
+
+def finite(value: Any, name: str) -> float:
+    """Return a value as a finite number. Raises `InputError` if it is not one."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{name} is {quote(value)}, which is not a finite number.")
+    return number

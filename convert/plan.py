@@ -1,4 +1,4 @@
-"""Plan a conversion weight by weight, from the headers of files alone."""
+"""Plan of a conversion, weight by weight, from headers alone; values are read when written."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def to_jax(
 ) -> list[Weight]:
     """Return the weights of a config's network, converted from a foreign checkpoint.
 
-    With a `widening` the checkpoint is one of the base model. Raises `WeightsError` listing all
+    With a `widening`, the checkpoint is a base model's. Raises `WeightsError` listing all
     mismatches.
     """
     network = network_config(config, found.network)
@@ -62,10 +62,10 @@ def to_torch(
     dtype: str | None = None,
     source: str = "the weights",
 ) -> list[Weight]:
-    """Return the foreign tensors of a naming, converted from the weights of a network's config.
+    """Return the foreign tensors of a naming, converted from the weights of a network.
 
-    Raises `WeightsError` if the weights are of another network, and `InputError` for a naming that
-    its table does not have.
+    Raises `WeightsError` if the weights do not fit the network's config, and `InputError` if its
+    table lacks the naming.
     """
     if problems := mismatches(tensors, weight_shapes(config)):
         raise WeightsError(problems, source=source)
@@ -97,9 +97,9 @@ def merged(
     *,
     scale: float,
 ) -> list[Weight]:
-    """Return the weights of a denoiser with a LoRA merged into them, in their own dtypes.
+    """Return the weights of a denoiser with a LoRA merged into them; dtypes do not change.
 
-    Raises `InputError` if the weights or the LoRA are of another network.
+    Raises `InputError` if the weights or the LoRA do not fit the network.
     """
     from egosim_jax.models import lora
 
@@ -120,7 +120,7 @@ def merged(
         if isinstance(full, np.ndarray):
             added.append(full[at].astype(np.float32))
         elif isinstance(full, lora.Value):
-            if scale == 1:
+            if scale == 1:  # exactly the value: adding a difference would round
                 return full.array[at]
             added.append(full.array[at].astype(np.float32) - weight.astype(np.float32))
         return weight.astype(np.float32) + scale * sum(added) if added else weight
@@ -137,7 +137,7 @@ def merged(
 
 
 def widening_of(config: ModelConfig, mode: WidenMode) -> Widening:
-    """Return the widening from a model's base. Raises `InputError` if it has no narrower one."""
+    """Return the widening from a model's base. Raises `InputError` without a narrower base."""
     table = table_of(config.dit)
     base = table.base
     if base is None:
@@ -163,7 +163,7 @@ def fits(found: DetectedNetwork, config: ModelConfig) -> bool:
 
 
 def network_config(config: ModelConfig, network: str) -> Any:
-    """Return the config of a model's network. Raises `InputError` if it has none of that name."""
+    """Return the config of a model's network. Raises `InputError` for an unknown name."""
     networks = {str(name): found for name, found in config.networks.items()}
     if network not in networks:
         raise InputError(
@@ -175,19 +175,19 @@ def network_config(config: ModelConfig, network: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class _Part:
-    """Contribution of one rule to a foreign tensor."""
+    """Part of a foreign tensor that one rule contributes."""
 
     rule: Rule
     tensor: Tensor
     layer: int | None
 
     def array(self) -> np.ndarray:
-        """Return the values of the converted tensor."""
+        """Return the values of the part."""
         weight = self.tensor.array()
         return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
 
     def shape(self) -> np.ndarray:
-        """Return an array of the same shape that takes no memory."""
+        """Return an array of the part's shape that takes no memory."""
         weight = shape_only(self.tensor)
         return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
 

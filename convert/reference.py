@@ -1,8 +1,8 @@
-"""Compare one forward of a converted network with PyTorch's, which reads the checkpoint itself.
+"""Comparison of one forward of a converted network with PyTorch's on the original checkpoint.
 
-The PyTorch networks are those of diffusers and transformers. Where a naming has no independent
-renaming to theirs (`Naming.to_reference`), our own rules rename the tensors, so that the forward
-checks sizes and arithmetic but not names.
+The PyTorch networks are from diffusers and transformers. If a naming has no independent renaming to
+their names (`Naming.to_reference`), our own rules rename the tensors. Then the comparison checks
+sizes and arithmetic but not names.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from egosim_jax.models import NetworkConfig
 
 TOLERANCE = 1e-4
-"""Highest relative L2 error in float32 of two layers, or of a whole autoencoder."""
+"""Maximum relative L2 error in float32 of two layers, or of a complete autoencoder."""
 MODULES = ("torch", "diffusers", "transformers")
-"""Libraries that a comparison needs; the extra `test` installs them."""
+"""Libraries of a comparison; the extra `test` installs them."""
 
 
 def possible() -> bool:
-    """Return True if all libraries that a comparison needs are installed."""
+    """Return True if all libraries of a comparison are installed."""
     return all(find_spec(name) for name in MODULES)
 
 
@@ -72,10 +72,10 @@ class Checkpoint:
         self.readers, self.cast = readers, cast
 
     def load(self, module: Any, *, prefix: str = "", unused: str | None = None) -> Any:
-        """Fill a PyTorch module, whose parameters have a `prefix` that the checkpoint has not.
+        """Fill a PyTorch module; its parameter names have a `prefix` that the checkpoint lacks.
 
-        Parameters with `unused` in their name may be missing. Raises `InputError` listing every
-        other one that the checkpoint lacks.
+        Parameters with `unused` in their name may be missing. Raises `InputError` listing all other
+        missing parameters.
         """
         import torch
 
@@ -94,7 +94,7 @@ class Checkpoint:
 
 
 def _cut(array: np.ndarray, shape: tuple[int, ...], cast: np.dtype | None = None) -> np.ndarray:
-    """Return the leading part of an array of a shape, in float32."""
+    """Return the leading part of an array, of the given shape, in float32."""
     if array.ndim != len(shape) or any(n < m for n, m in zip(array.shape, shape, strict=True)):
         raise InputError(f"The checkpoint has {array.shape} where PyTorch needs {shape}.")
     part = array[tuple(map(slice, shape))]

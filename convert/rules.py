@@ -1,8 +1,7 @@
 """Rules that map the tensors of a foreign checkpoint to weights and back.
 
-A conversion table is a list of `Rule`s, each with a pattern of a foreign name, the path of the
-weight that it fills, and the transform between the two. The same rules serve both directions, and
-all mismatches are reported in one list.
+Each `Rule` of a conversion table has a pattern of a foreign name, the path of a weight, and the
+transform between the two. The same rules serve both directions. One error lists all mismatches.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from egosim_jax.io.weights import WeightsError, mismatches
 class Rule:
     """Correspondence between one foreign tensor, or one per layer, and one weight.
 
-    `*` in `source` stands for the layer index of a stacked block; such a rule stacks all layers
+    A `*` in `source` matches the layer index of a stacked block; such a rule stacks all layers
     along the leading axis of `target`. `transform` is a key of `TRANSFORMS` or an einops pattern.
-    `part` (i, n) takes the i-th of n equal parts of the source's first axis: n rules share a fused
+    `part` (i, n) is the i-th of n equal parts of the source's first axis: n rules share a fused
     projection.
     """
 
@@ -53,11 +52,11 @@ class Rule:
         return TRANSFORMS.get(self.transform) or _layout(self.transform)
 
 
-def linear_rules(theirs: str, ours: str) -> list[Rule]:
-    """Return the rules of a linear layer with a bias."""
+def linear_rules(theirs: str, ours: str, part: tuple[int, int] = (0, 1)) -> list[Rule]:
+    """Return the rules of a linear layer with a bias, or of one part of a fused layer."""
     return [
-        Rule(f"{theirs}.weight", f"{ours}.kernel", "linear"),
-        Rule(f"{theirs}.bias", f"{ours}.bias"),
+        Rule(f"{theirs}.weight", f"{ours}.kernel", "linear", part),
+        Rule(f"{theirs}.bias", f"{ours}.bias", part=part),
     ]
 
 
@@ -68,14 +67,14 @@ def norm_rules(theirs: str, ours: str) -> list[Rule]:
 
 @dataclass(frozen=True)
 class Transform:
-    """Change of axis layout between a foreign tensor and a weight, with its inverse."""
+    """Change of axis layout from a foreign tensor to a weight, and its inverse."""
 
     to_jax: Callable[[np.ndarray], np.ndarray]
     to_torch: Callable[[np.ndarray], np.ndarray]
 
 
 def _layout(pattern: str) -> Transform:
-    """Return the transform of an einops pattern without composed axes, foreign to JAX."""
+    """Return the transform of an einops pattern, foreign to JAX, without composed axes."""
     left, right = pattern.split("->")
     return Transform(
         lambda x: rearrange(x, pattern),
@@ -94,7 +93,7 @@ TRANSFORMS: dict[str, Transform] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Leaf:
-    """Weight and the foreign tensors that fill it."""
+    """A weight and the foreign tensors that fill it."""
 
     rule: Rule
     names: tuple[str, ...]
@@ -115,10 +114,10 @@ def assign(
 ) -> dict[str, Leaf]:
     """Match foreign tensors to weights by name, shape and dtype, without reading values.
 
-    Tensors that match a pattern of `ignore` (`*` matches anything) are skipped. Raises
-    `WeightsError` listing every other tensor that no rule reads or whose shape does not fit its
-    rule, every rule without a tensor, every missing layer, layers that differ in shape or dtype
-    and, given the shapes `want` of the weights by path, every weight of another shape.
+    Skips tensors that match a pattern of `ignore` (`*` matches anything). Raises `WeightsError`
+    listing every other tensor without a rule or with a wrong shape, every rule without a tensor,
+    every missing layer, layers that differ in shape or dtype and, if `want` has the shapes of the
+    weights by path, every weight of another shape.
     """
     found: dict[Rule, dict[int, str]] = {}
     shapes: dict[Rule, set[tuple[tuple[int, ...], np.dtype]]] = {}
@@ -157,6 +156,7 @@ def assign(
             names = tuple(layers[i] for i in range(len(layers)))
             leaves[rule.target] = Leaf(rule=rule, names=names, shape=stacked, dtype=dtype)
     if want is not None:
+        # A target without a leaf is in `problems` already: do not also report it as missing.
         known = {rule.target for rule in rules if rule.target not in leaves}
         problems += mismatches(leaves, {p: s for p, s in want.items() if p not in known})
     if problems:
@@ -165,7 +165,7 @@ def assign(
 
 
 def shape_only(tensor: Any) -> np.ndarray:
-    """Return an array of the tensor's shape that takes no memory."""
+    """Return an array of the tensor's shape that takes no memory (strides of 0)."""
     return np.broadcast_to(np.zeros((), np.uint8), tuple(tensor.shape))
 
 

@@ -1,7 +1,7 @@
-"""Open foreign checkpoints: their tensors by name, memory-mapped and not yet read.
+"""Foreign checkpoints: tensors by name, memory-mapped, and the files of a tokenizer.
 
-A checkpoint is one file, safetensors or `.pth`, or several, with an index that maps each tensor to
-its file. Only headers are read until the values of a tensor are accessed.
+A checkpoint is one file (safetensors or `.pth`), or several with an index that maps each tensor to
+its file. Only headers are read until a caller accesses the values of a tensor.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from egosim_jax.io.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import quote, quote_path, read_bytes, read_json
 from egosim_jax.io.mapped import Tensor, read_safetensors
 from egosim_jax.io.untrusted.pth import read_pth
 from egosim_jax.types import InputError
@@ -21,6 +21,11 @@ from egosim_jax.types import InputError
 INDEX = ".safetensors.index.json"
 SHARD = re.compile(r"(.+)-[0-9]{5}-of-([0-9]{5})")
 PTH = (".pth", ".pt", ".bin")
+TOKENIZER_FILES = (
+    "tokenizer.json", "spiece.model", "tokenizer_config.json", "special_tokens_map.json",
+)  # fmt: skip
+MAX_TOKENIZER = 64 << 20
+"""Maximum size of a tokenizer file in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,15 +33,15 @@ class Source:
     """Checkpoint of one or several files."""
 
     name: str
-    """Name of the file, or common part of the files' names."""
+    """File name, or the common part of several."""
     files: tuple[Path, ...]
-    """Files that have the tensors."""
+    """Files of the tensors."""
     tensors: Mapping[str, Tensor]
     """Tensors of the checkpoint by name."""
 
     @property
     def bytes(self) -> int:
-        """Size of all tensors."""
+        """Size of all tensors in bytes."""
         return sum(math.prod(t.shape) * t.dtype.itemsize for t in self.tensors.values())
 
 
@@ -44,8 +49,7 @@ def sources(path: Path) -> Iterator[Source]:
     """Yield the checkpoints of a file or folder; subfolders are not searched.
 
     Files of one index, or numbered `NAME-00001-of-00003`, are one checkpoint. Raises `InputError`
-    if a file is damaged, a numbered one is missing, or two files of a checkpoint have the same
-    tensor.
+    if a file is damaged or missing, or if two files of a checkpoint have the same tensor.
     """
     if not path.is_dir():
         yield _joined(quote_path(path.name), [path])
@@ -77,7 +81,7 @@ def sources(path: Path) -> Iterator[Source]:
 
 
 def _indexed(index: Path) -> dict[str, str]:
-    """Return the existing file, next to the index, of each tensor."""
+    """Return the file name of each tensor; every file exists next to the index."""
     match read_json(index):
         case {"weight_map": dict(weight_map)} if weight_map:
             pass
@@ -107,3 +111,16 @@ def _joined(name: str, files: Sequence[Path]) -> Source:
             )
         tensors |= found
     return Source(name=name, files=tuple(files), tensors=tensors)
+
+
+def tokenizer_files(folder: Path, *, within: Path) -> dict[str, bytes]:
+    """Read the files of a tokenizer. Raises `InputError` for symlinks, which may point anywhere."""
+    files = [folder / name for name in TOKENIZER_FILES if os.path.lexists(folder / name)]
+    inner = [path for path in (folder, *folder.parents) if within in path.parents]
+    for path in (*inner, *files):
+        if path.is_symlink():
+            raise InputError(
+                f"{quote_path(path)} is a symlink; a tokenizer must not have symlinks. Copy the "
+                "checkpoint folder with `cp -rL` if you trust the targets of its links."
+            )
+    return {file.name: read_bytes(file, limit=MAX_TOKENIZER) for file in files}

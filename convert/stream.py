@@ -1,9 +1,9 @@
-"""Write safetensors piece by piece: in bounded memory, resumable after an interruption.
+"""Writing of safetensors piece by piece: in bounded memory, resumable after an interruption.
 
-A weight consists of pieces, such as the layers of a stack, whose offsets in the file are known in
-advance; they are read, converted and written a few at a time. A log next to the growing file has
-the hash of each piece that is written; the file gets its name when all are. The same hashes are
-the checksums in its header.
+A weight consists of pieces, such as the layers of a stack. Their offsets in the file are known in
+advance; a few at a time are read, converted and written. A log next to the growing file has the
+hash of each written piece. The file gets its name when it is complete. The same hashes are the
+checksums in its header.
 """
 
 from __future__ import annotations
@@ -21,32 +21,38 @@ from pathlib import Path
 
 import numpy as np
 
+from egosim_jax.convert.source import INDEX
 from egosim_jax.io.atomic import LOG, PART, sync
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.mapped import BLANK, CODES, TensorInfo, digest, header
+from egosim_jax.io.run import write_json
+from egosim_jax.runtime.progress import track_bytes
 from egosim_jax.types import InputError
 
 WORKERS, AHEAD = 2, 3
-"""Threads that prepare pieces, and pieces in memory at most."""
+"""Number of threads that prepare pieces, and maximum number of pieces in memory."""
+MAX_FILE_BYTES = 5_000_000_000
+"""Maximum size of a file in bytes; a larger network becomes several files."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weight:
-    """Array to write, with functions that compute its pieces."""
+    """An array to write, with functions that compute its pieces."""
 
     name: str
     shape: tuple[int, ...]
     dtype: np.dtype
     pieces: tuple[Callable[[], np.ndarray], ...]
-    """Equal parts along the first axis, or one of the whole; each is cast to `dtype`."""
+    """Functions of equal parts along the first axis, or of the full array; cast to `dtype`."""
 
     @property
     def bytes(self) -> int:
-        """Size in the file."""
+        """Size in the file in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 def in_memory(arrays: Mapping[str, np.ndarray]) -> list[Weight]:
-    """Return weights of one piece each, of arrays by their names."""
+    """Return named arrays as weights of one piece each."""
     return [
         Weight(name=name, shape=array.shape, dtype=array.dtype, pieces=(lambda a=array: a,))
         for name, array in arrays.items()
@@ -61,12 +67,12 @@ def write(
     metadata: Mapping[str, str],
     keep_log: bool = False,
 ) -> Iterator[int]:
-    """Write the weights to `target`; yield the bytes of each piece when it is written.
+    """Write the weights to `target`; yield the size of each piece when it is written.
 
-    `origin` are the files that the pieces are read from: an incomplete file is resumed only if they
-    have not changed. With `keep_log` the log of a complete file is kept, by which the same call
-    recognizes the file and does not write it again. `metadata` goes into the header, which is
-    sealed if the format is ours. If a piece turns out to be damaged, nothing is left behind.
+    The pieces are read from the files `origin`; an incomplete file is resumed only if they have not
+    changed. With `keep_log`, the log of a complete file stays, so the same call recognizes the file
+    and does not write it again. `metadata` goes into the header, which is sealed if the format is
+    ours. If a piece is damaged, no file remains.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # Wide dtypes first, so that every weight is aligned to its item size.
@@ -111,7 +117,7 @@ def write(
 def _complete(
     target: Path, log: Path, plan: str, header_of: Callable[[Sequence[str]], bytes], pieces: int
 ) -> bool:
-    """Return True if a file has the header of the logged pieces, all of which are of the plan."""
+    """Return True if a file has the header of the logged pieces, and the log is of the plan."""
     if not (target.is_file() and log.is_file()):
         return False
     logged, *checksums = log.read_text().split("\n")[:-1]
@@ -123,7 +129,7 @@ def _complete(
 
 
 def _open(path: Path) -> FileIO:
-    """Open a file to read and write, created if missing; symlinks are not followed."""
+    """Open a file to read and write; create it if missing; do not follow symlinks."""
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     return FileIO(os.open(path, flags, 0o666), "r+")
 
@@ -136,7 +142,7 @@ def _header(weights: Sequence[Weight], metadata: Mapping[str, str], pieces: Sequ
 
 
 def _fingerprint(header: bytes, origin: Sequence[Path]) -> str:
-    """Return a hash of what is written and of the files that it is read from."""
+    """Return a hash of the header and of path, size and time of the source files."""
     files = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in origin]
     return hashlib.sha256(header + repr(files).encode("utf-8", "surrogateescape")).hexdigest()
 
@@ -144,9 +150,9 @@ def _fingerprint(header: bytes, origin: Sequence[Path]) -> str:
 def _resume(
     file: FileIO, journal: FileIO, plan: str, *, start: int, sizes: Sequence[int]
 ) -> list[str]:
-    """Return the hashes of the valid pieces that an incomplete file of the same plan has.
+    """Return the hashes of the valid leading pieces of an incomplete file of the same plan.
 
-    After a crash of the machine the log may list pieces that never reached the disk.
+    After a crash of the machine, the log may list pieces that never reached the disk.
     """
     lines = journal.read((1 + len(sizes)) * (len(BLANK) + 1)).split(b"\n")
     valid: list[str] = []
@@ -162,7 +168,7 @@ def _resume(
 
 
 def _put(pieces: Iterable, file: int) -> Iterator[str]:
-    """Write the pieces at their offsets, a few in parallel; yield the hash of each in order."""
+    """Write the pieces at their offsets, a few in parallel; yield their hashes in order."""
     with ThreadPoolExecutor(WORKERS) as pool:
         waiting: list[Future[str]] = []
         for offset, piece in pieces:
@@ -195,9 +201,54 @@ def in_rows(x: np.ndarray) -> np.ndarray:
 
 
 def stored_as(kind: np.dtype, dtype: str | None) -> np.dtype:
-    """Return the dtype to store a weight of dtype `kind` as; only floating ones are cast."""
+    """Return the stored dtype of a weight of dtype `kind`; only floating dtypes are cast."""
     floating = np.issubdtype(kind, np.floating) or kind.name.startswith(("bfloat", "float8"))
     target = kind if dtype is None or not floating else np.dtype(dtype)
     if target not in CODES.values():
         raise InputError(f"safetensors cannot store {target}. Choose another dtype. (--dtype)")
     return target
+
+
+def apart(out: Path, source: Path) -> None:
+    """Raise `InputError` if the output is the input or inside it."""
+    here, there = (Path(os.path.realpath(path)) for path in (out, source))
+    if there in (here, *here.parents):
+        raise InputError(
+            f"{quote_path(out)} is {quote_path(source)} or inside it, which is the input: choose a "
+            "separate output path. (--out)"
+        )
+
+
+def write_file(
+    target: Path,
+    weights: Sequence[Weight],
+    *,
+    origin: Sequence[Path],
+    metadata: Mapping[str, str],
+    keep_log: bool = False,
+) -> None:
+    """Write a file of weights with progress; print its path."""
+    total = sum(weight.bytes for weight in weights)
+    pieces = write(target, weights, origin=origin, metadata=metadata, keep_log=keep_log)
+    for _ in track_bytes(pieces, f"writing {target.name}", total=total):
+        pass
+    print(quote_path(target))
+
+
+def write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Path]) -> None:
+    """Write one file; above 5 GB, several files and an index."""
+    shards: list[list[Weight]] = [[]]
+    for weight in weights:
+        if shards[-1] and sum(w.bytes for w in shards[-1]) + weight.bytes > MAX_FILE_BYTES:
+            shards.append([])
+        shards[-1].append(weight)
+    weight_map = {}
+    for number, shard in enumerate(shards, start=1):
+        end = f"-{number:05d}-of-{len(shards):05d}" if len(shards) > 1 else ""
+        target = stem.with_name(f"{stem.name}{end}.safetensors")
+        write_file(target, shard, origin=origin, metadata={"format": "pt"})
+        weight_map |= {weight.name: target.name for weight in shard}
+    if len(shards) > 1:
+        total = sum(weight.bytes for weight in weights)
+        index = {"metadata": {"total_size": total}, "weight_map": weight_map}
+        write_json(stem.with_name(f"{stem.name}{INDEX}"), index)

@@ -1,8 +1,8 @@
-"""Widen the input layer of a base model to the channels of another model.
+"""Widening of a base model's input layer to the channels of another model.
 
-Kernel rows of input parts that the base model does not have are 0, so that these do not count until
-they are trained. Where the two models encode the mask differently, the base's mask is an affine
-function of the model's, m_base = shift + scale m, which the kernel and bias of the layer absorb.
+Kernel rows of new input parts are 0: these inputs have no effect until they are trained. If the two
+models encode the mask differently, the base's mask is an affine function of the model's,
+m_base = shift + scale m. The kernel and bias of the layer absorb it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from egosim_jax.conditioning.layout import ChannelLayout
 
 WidenMode = Literal["copy", "polarity"]
-"""Encoding of the base model's mask: the same as the model's, or that of the base's layout."""
+"""Encoding of the base model's mask: `copy`, the model's; `polarity`, the base layout's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Widening:
     layout: ChannelLayout
     """Input channels of the model."""
     input_layer: str
-    """Path of the layer that reads the channels, the first axis of its kernel."""
+    """Path of the layer that reads the channels, along the first axis of its kernel."""
 
     @property
     def rows(self) -> np.ndarray:
@@ -49,7 +49,7 @@ class Widening:
         return self.base.mask_scale, -ratio
 
     def narrow(self, latents: np.ndarray) -> np.ndarray:
-        """Return the base's input, channels last, for the model's."""
+        """Return the base's input for an input of the model, channels last."""
         shift, scale = self.mask
         found = latents[..., self.rows]
         at = self.base.slice("mask")

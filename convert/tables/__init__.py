@@ -1,19 +1,26 @@
 """Conversion tables: the names of a network's weights in checkpoints of other projects.
 
-A network's config names the module of its table (`config.table`), in this package or elsewhere,
-whose `TABLE` declares the namings that checkpoints of the network come in, how each is detected
-and written, and the PyTorch implementation that a conversion is verified against.
+A network's config names the module of its table (`config.table`), in this package or elsewhere.
+The module's `TABLE` declares the namings of the network in checkpoints, the detection and file of
+each naming, and the PyTorch implementation that verifies a conversion.
+
+    Table, table_of           conversions of one kind of network
+    Naming, CheckpointNaming  names of one project
+    Reference, Comparison     PyTorch's network, and one forward of both
+    weight_shapes             shapes of a network's weights
+    pipeline_files            configs of a diffusers pipeline
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from einops import rearrange
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.types import InputError
@@ -28,7 +35,7 @@ if TYPE_CHECKING:
 Reader = Callable[[], np.ndarray]
 """Function that reads the values of one tensor."""
 SHORT_LAYERS, SHORT_VOCAB = 2, 512
-"""Layers and rows of the token table in a reference forward."""
+"""Number of layers, and of rows of the token table, in a reference forward."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,22 +45,22 @@ class Naming:
     rules: Callable[[Any], list[Rule]]
     """Conversion rules for a network's config."""
     signature: str
-    """Key that every checkpoint in this naming has and no other network's."""
+    """Key that every checkpoint in this naming has, and no other network."""
     layout: str
-    """Layout of checkpoint folders that uses this naming, as `--layout` calls it."""
+    """Layout of checkpoint folders with this naming: a value of `--layout`."""
     stem: str
     """File name without its extension."""
     folder: str = ""
-    """Folder of the file in that layout; empty if files of all networks are side by side."""
+    """Folder of the file in the layout; empty if all files are side by side."""
     lora_prefix: str | None = None
-    """Prefix of layer names in LoRA files, for the naming that LoRAs are written in."""
+    """Prefix of layer names in LoRA files; only one naming has it, and LoRAs are written in it."""
     to_reference: Callable[[Mapping[str, Reader], Any], Mapping[str, Reader] | None] | None = None
-    """Renaming to the reference's names that does not use the rules; None where it has none."""
+    """Renaming to the reference's names that does not use the rules; None: no such renaming."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Converted network and the checkpoint that a PyTorch module is loaded from."""
+    """A converted network, and the checkpoint for its PyTorch counterpart."""
 
     network: Any
     """Converted network in float32, of the short config."""
@@ -62,7 +69,7 @@ class Comparison:
     load: Callable[..., Any]
     """Fill a PyTorch module from the checkpoint; see `reference.Checkpoint.load`."""
     widening: Widening | None
-    """Change of the input channels in the conversion, if any."""
+    """Change of the input channels in the conversion, or None."""
 
     def output(self, *inputs: Any, call: Callable[..., Any] | None = None) -> np.ndarray:
         """Return the output of the network, or of `call(network, *inputs)`."""
@@ -81,7 +88,7 @@ class Reference:
     naming: str
     """Naming of its parameters."""
     library: str
-    """Library that has the class."""
+    """Library of the class."""
     kind: str
     """Name of the class."""
     arguments: Callable[[Any], dict[str, Any]]
@@ -103,7 +110,7 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckpointNaming:
-    """Names of the low-rank tensors in the checkpoints of a training that only keeps a LoRA."""
+    """Names of the low-rank tensors in DWM's checkpoints, which have only a LoRA."""
 
     naming: str
     """Naming of the network's layers."""
@@ -118,7 +125,7 @@ class CheckpointNaming:
     up: str = "lora_B.weight"
     """Suffix of the up projection."""
     alpha: bool = False
-    """Write alpha, which is the rank, for each layer."""
+    """True: write alpha, the rank, for each layer."""
 
     def tensors(self, layer: str, down: np.ndarray, up: np.ndarray) -> dict[str, np.ndarray]:
         """Return the tensors of a layer by name, for projections `[in, r]` and `[r, out]`."""
@@ -130,7 +137,7 @@ class CheckpointNaming:
         if not self.alpha:
             return found
         rank = down.shape[-1]
-        alpha = np.array(rank, down.dtype)  # as the trainer casts it with the others
+        alpha = np.array(rank, down.dtype)  # DWM's trainer also casts it
         exact = alpha if float(alpha) == rank else np.array(rank, np.float32)
         return {**found, f"{name}.alpha": exact}
 
@@ -140,21 +147,21 @@ class Table:
     """Conversions of one kind of network from and to other projects' checkpoints."""
 
     namings: Mapping[str, Naming]
-    """Namings that checkpoints come in."""
+    """Namings of checkpoints."""
     ignored: Callable[[Any], list[str]] = lambda config: []
-    """Patterns of keys, in any naming, that the network does not use, for its config."""
+    """Patterns of unused keys, in any naming, for a network's config."""
     reference: Reference | None = None
-    """Implementation that conversions are verified against."""
+    """PyTorch implementation that verifies conversions."""
     base: ChannelLayout | None = None
-    """Input channels of the base models that `--widen` converts from."""
+    """Input channels of the base models for `--widen`."""
     input_layer: str = "patch"
-    """Path of the layer that reads the input channels, the first axis of its kernel."""
+    """Path of the layer that reads the input channels, along the first axis of its kernel."""
     checkpoint: CheckpointNaming | None = None
     """Names of the low-rank tensors in checkpoints of DWM; None for networks without."""
     check: Callable[[Mapping[str, Tensor]], None] = lambda tensors: None
-    """Raises `InputError` for the tensors of a relative that cannot be converted."""
+    """Raise `InputError` for tensors of a similar network that cannot be converted."""
     pipeline: Callable[[ModelConfig], dict[str, dict[str, Any]]] | None = None
-    """JSON files by path of a diffusers pipeline around this denoiser, without its networks."""
+    """JSON files, by path, of a diffusers pipeline around this denoiser, without its networks."""
 
     def rules(self, naming: str, config: Any) -> list[Rule]:
         """Return the rules of a naming. Raises `InputError` if the table does not have it."""
@@ -165,12 +172,28 @@ class Table:
         return self.namings[naming].rules(config)
 
     def naming_in(self, layout: str) -> str:
-        """Return the naming that a layout uses. Raises `InputError` if there is none."""
+        """Return the naming of a layout. Raises `InputError` for an unknown layout."""
         for name, naming in self.namings.items():
             if naming.layout == layout:
                 return name
         known = ", ".join(naming.layout for naming in self.namings.values())
         raise InputError(f"The network has no layout {layout}. Available: {known}. (--layout)")
+
+
+def vae_outputs(
+    comparison: Comparison, module: Any, *, frames: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reconstructions of a small random video by a network and an unloaded module."""
+    import torch
+
+    module = comparison.load(module)
+    video = np.random.default_rng(0).uniform(-1, 1, (1, frames, 32, 32, 3)).astype(np.float32)
+    have = comparison.output(video, call=lambda vae, x: vae.decode(vae.encode(x)))
+    with torch.no_grad():
+        theirs = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
+        (posterior,) = module.encode(theirs, return_dict=False)
+        (decoded,) = module.decode(posterior.mode(), return_dict=False)
+    return have, rearrange(decoded.clamp(-1, 1).numpy(), "b c f h w -> b f h w c")
 
 
 def table_of(config: NetworkConfig) -> Table:
@@ -179,15 +202,38 @@ def table_of(config: NetworkConfig) -> Table:
 
 
 def tables_of(models: Iterable[ModelConfig]) -> list[tuple[str, Table]]:
-    """Return each network name of the models with its table, without repetition."""
+    """Return each pair of network name and table of the models once."""
     pairs = ((n, table_of(network)) for model in models for n, network in model.networks.items())
     return list(dict.fromkeys(pairs))
 
 
-@cache  # building the module takes most of a second
+@cache  # building the module takes almost a second
 def weight_shapes(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
     """Return the shape of every weight of a config's network by its path."""
     from egosim_jax.io.weights import flat_shapes
     from egosim_jax.models import abstract
 
     return flat_shapes(abstract(config))
+
+
+def pipeline_files(config: ModelConfig, written: Collection[str]) -> Mapping[str, Any]:
+    """Return the JSON files of a diffusers pipeline by path, with the networks in `written`.
+
+    Empty if the denoiser's table has no pipeline.
+    """
+    describe = table_of(config.dit).pipeline
+    if describe is None:
+        return {}
+    files = describe(config)
+    for name, network in config.networks.items():
+        table = table_of(network)
+        if table.reference is None:
+            continue
+        reference = table.reference
+        folder = table.namings[reference.naming].folder
+        present = name in written
+        entry = [reference.library, reference.kind] if present else [None, None]
+        files["model_index.json"][folder] = entry
+        if present:
+            files[f"{folder}/config.json"] = reference.config_json(network)
+    return files

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from einops import rearrange
 
-from egosim_jax.convert.rules import Rule
+from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
 from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 
@@ -24,13 +24,17 @@ def wan(config: CLIPVisionConfig) -> list[Rule]:
         Rule("visual.patch_embedding.weight", "patch_embed.kernel", "conv2d"),
         Rule("visual.cls_embedding", "class_token", "1 1 d -> d"),
         Rule("visual.pos_embedding", "positions", "1 n d -> n d"),
-        *_norm("visual.pre_norm", "norm"),
-        *_norm(f"{block}.norm1", "blocks.norm1"),
-        *(rule for i in range(3) for rule in _linear(fused, f"blocks.attn.{'qkv'[i]}", (i, 3))),
-        *_linear(f"{block}.attn.proj", "blocks.attn.o"),
-        *_norm(f"{block}.norm2", "blocks.norm2"),
-        *_linear(f"{block}.mlp.0", "blocks.up"),
-        *_linear(f"{block}.mlp.2", "blocks.down"),
+        *norm_rules("visual.pre_norm", "norm"),
+        *norm_rules(f"{block}.norm1", "blocks.norm1"),
+        *(
+            rule
+            for i in range(3)
+            for rule in linear_rules(fused, f"blocks.attn.{'qkv'[i]}", (i, 3))
+        ),
+        *linear_rules(f"{block}.attn.proj", "blocks.attn.o"),
+        *norm_rules(f"{block}.norm2", "blocks.norm2"),
+        *linear_rules(f"{block}.mlp.0", "blocks.up"),
+        *linear_rules(f"{block}.mlp.2", "blocks.down"),
     ]
 
 
@@ -45,21 +49,21 @@ def transformers(config: CLIPVisionConfig) -> list[Rule]:
         Rule("embeddings.patch_embedding.weight", "patch_embed.kernel", "conv2d"),
         Rule("embeddings.class_embedding", "class_token"),
         Rule("embeddings.position_embedding.weight", "positions"),
-        *_norm("pre_layrnorm", "norm"),
-        *_norm(f"{block}.layer_norm1", "blocks.norm1"),
+        *norm_rules("pre_layrnorm", "norm"),
+        *norm_rules(f"{block}.layer_norm1", "blocks.norm1"),
         *(
             rule
             for theirs, ours in projections.items()
-            for rule in _linear(f"{block}.self_attn.{theirs}", f"blocks.attn.{ours}")
+            for rule in linear_rules(f"{block}.self_attn.{theirs}", f"blocks.attn.{ours}")
         ),
-        *_norm(f"{block}.layer_norm2", "blocks.norm2"),
-        *_linear(f"{block}.mlp.fc1", "blocks.up"),
-        *_linear(f"{block}.mlp.fc2", "blocks.down"),
+        *norm_rules(f"{block}.layer_norm2", "blocks.norm2"),
+        *linear_rules(f"{block}.mlp.fc1", "blocks.up"),
+        *linear_rules(f"{block}.mlp.fc2", "blocks.down"),
     ]
 
 
 def ignored(config: CLIPVisionConfig) -> list[str]:
-    """Return the keys of CLIP's text half, of its projections and of the last, unused blocks."""
+    """Return the keys of CLIP's text encoder, its projections and the last, unused blocks."""
     unused = range(config.blocks, config.layers)
     return [
         "log_scale",
@@ -92,7 +96,7 @@ def arguments(config: CLIPVisionConfig) -> dict[str, Any]:
 
 
 def shorten(config: CLIPVisionConfig) -> CLIPVisionConfig:
-    """Return a float32 config with fewer blocks, all of which are used."""
+    """Return a float32 config with fewer blocks, and none unused."""
     layers = min(SHORT_LAYERS, config.blocks)
     return replace(config, dtype="float32", layers=layers, skip_last=0)
 
@@ -115,20 +119,6 @@ def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
         theirs = torch.from_numpy(rearrange(pixels, "b h w c -> b c h w").copy())
         states = module(theirs, output_hidden_states=True)
     return have, states.hidden_states[-1].numpy()
-
-
-def _linear(source: str, target: str, part: tuple[int, int] = (0, 1)) -> list[Rule]:
-    return [
-        Rule(f"{source}.weight", f"{target}.kernel", "linear", part),
-        Rule(f"{source}.bias", f"{target}.bias", part=part),
-    ]
-
-
-def _norm(source: str, target: str) -> list[Rule]:
-    return [
-        Rule(f"{source}.weight", f"{target}.scale"),
-        Rule(f"{source}.bias", f"{target}.bias"),
-    ]
 
 
 TABLE = Table(

@@ -67,9 +67,9 @@ def check(tensors: Mapping[str, Tensor]) -> None:
     if name in tensors and len(tensors[name].shape) == 2:
         raise InputError(
             "This transformer is of CogVideoX 1.5, which cannot be converted: a token must have "
-            f"one latent frame, and its {name} of shape {tensors[name].shape} reads two (so that "
-            "the 13 latents of 49 frames, an odd number, would not fit either). Take version 1.1, "
-            "as DWM's release does: CogVideoX-Fun-V1.1-5b-InP."
+            f"one latent frame, and its {name} of shape {tensors[name].shape} reads two (the 13 "
+            "latents of 49 frames, an odd number, would not fit either). Take version 1.1, like "
+            "DWM's release: CogVideoX-Fun-V1.1-5b-InP."
         )
 
 

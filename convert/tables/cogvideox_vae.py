@@ -6,10 +6,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from einops import rearrange
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.convert.tables import Comparison, Naming, Reference, Table, weight_shapes
+from egosim_jax.convert.tables import (
+    Comparison,
+    Naming,
+    Reference,
+    Table,
+    vae_outputs,
+    weight_shapes,
+)
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
 
 LEAVES = {"kernel": "weight", "bias": "bias", "scale": "weight"}
@@ -57,17 +63,10 @@ def shorten(config: CogVideoXVAEConfig) -> CogVideoXVAEConfig:
 
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Return both reconstructions of a small random video."""
-    import torch
     from diffusers import AutoencoderKLCogVideoX
 
-    module = comparison.load(AutoencoderKLCogVideoX(**arguments(comparison.config)))
-    video = np.random.default_rng(0).uniform(-1, 1, (1, 9, 32, 32, 3)).astype(np.float32)
-    have = comparison.output(video, call=lambda vae, x: vae.decode(vae.encode(x)))
-    with torch.no_grad():
-        theirs = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
-        (posterior,) = module.encode(theirs, return_dict=False)
-        (decoded,) = module.decode(posterior.mode(), return_dict=False)
-    return have, rearrange(decoded.clamp(-1, 1).numpy(), "b c f h w -> b f h w c")
+    module = AutoencoderKLCogVideoX(**arguments(comparison.config))
+    return vae_outputs(comparison, module, frames=9)
 
 
 def _name(path: str, config: CogVideoXVAEConfig) -> str:

@@ -1,4 +1,4 @@
-"""Conversion table of DWM's transformer on Wan: Wan's, with the names of VideoX-Fun's LoRAs."""
+"""Conversion table of DWM's transformer on Wan: Wan's table, with VideoX-Fun's LoRA names."""
 
 from __future__ import annotations
 

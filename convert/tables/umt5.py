@@ -53,7 +53,7 @@ def transformers(config: T5Sizes) -> list[Rule]:
 
 
 def ignored(config: T5Sizes) -> list[str]:
-    """Return the second name of the token table, which the rules read as `shared.weight`."""
+    """Return the duplicate of the token table, which the rules read as `shared.weight`."""
     return ["encoder.embed_tokens.weight"]
 
 

@@ -5,7 +5,7 @@ EgoSim and Wan 2.1 Fun InP have the official names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 PATCH_KERNEL = "o c 1 i j -> c i j o"
 MODULATION = "1 k d -> k d"
 TEXT_TOKENS, IMAGE_TOKENS = 512, 257
-"""Tokens that diffusers' transformer takes, by which it separates text from image."""
+"""Numbers of tokens that diffusers' transformer expects: it splits text from image by them."""
 SCHEDULER = "FlowMatchEulerDiscreteScheduler"
 """Class of the scheduler in diffusers."""
 
@@ -54,23 +54,13 @@ def wan(config: WanDiTConfig) -> list[Rule]:
         Rule("head.modulation", "head.modulation", MODULATION),
         *linear_rules("head.head", "head.linear"),
     ]
+    projections = {name: name for name in "qkvo"}
     for attention in ("self_attn", "cross_attn"):
-        theirs, ours = f"blocks.*.{attention}", f"blocks.{attention}"
-        for name in "qkvo":
-            rules += linear_rules(f"{theirs}.{name}", f"{ours}.{name}")
-        for name in ("norm_q", "norm_k"):
-            rules.append(Rule(f"{theirs}.{name}.weight", f"{ours}.{name}.scale"))
+        rules += _attention(f"blocks.*.{attention}", f"blocks.{attention}", projections)
     if config.image_dim is not None:
-        theirs, ours = "blocks.*.cross_attn", "blocks.cross_attn.image"
-        rules += [
-            *norm_rules("img_emb.proj.0", "image.norm_in"),
-            *linear_rules("img_emb.proj.1", "image.mlp.up"),
-            *linear_rules("img_emb.proj.3", "image.mlp.down"),
-            *norm_rules("img_emb.proj.4", "image.norm_out"),
-            *linear_rules(f"{theirs}.k_img", f"{ours}.k"),
-            *linear_rules(f"{theirs}.v_img", f"{ours}.v"),
-            Rule(f"{theirs}.norm_k_img.weight", f"{ours}.norm_k.scale"),
-        ]
+        names = ("img_emb.proj.0", "img_emb.proj.1", "img_emb.proj.3", "img_emb.proj.4")
+        keys = ("k_img", "v_img", "norm_k_img")
+        rules += _image(names, "blocks.*.cross_attn", keys)
     return rules
 
 
@@ -92,27 +82,40 @@ def diffusers(config: WanDiTConfig) -> list[Rule]:
         Rule("scale_shift_table", "head.modulation", MODULATION),
         *linear_rules("proj_out", "head.linear"),
     ]
-    for theirs, ours in (
-        ("blocks.*.attn1", "blocks.self_attn"),
-        ("blocks.*.attn2", "blocks.cross_attn"),
-    ):
-        for name in "qkv":
-            rules += linear_rules(f"{theirs}.to_{name}", f"{ours}.{name}")
-        rules += linear_rules(f"{theirs}.to_out.0", f"{ours}.o")
-        for name in ("norm_q", "norm_k"):
-            rules.append(Rule(f"{theirs}.{name}.weight", f"{ours}.{name}.scale"))
+    projections = {"to_q": "q", "to_k": "k", "to_v": "v", "to_out.0": "o"}
+    rules += _attention("blocks.*.attn1", "blocks.self_attn", projections)
+    rules += _attention("blocks.*.attn2", "blocks.cross_attn", projections)
     if config.image_dim is not None:
-        theirs, ours = "blocks.*.attn2", "blocks.cross_attn.image"
-        rules += [
-            *norm_rules(f"{embedder}.image_embedder.norm1", "image.norm_in"),
-            *linear_rules(f"{embedder}.image_embedder.ff.net.0.proj", "image.mlp.up"),
-            *linear_rules(f"{embedder}.image_embedder.ff.net.2", "image.mlp.down"),
-            *norm_rules(f"{embedder}.image_embedder.norm2", "image.norm_out"),
-            *linear_rules(f"{theirs}.add_k_proj", f"{ours}.k"),
-            *linear_rules(f"{theirs}.add_v_proj", f"{ours}.v"),
-            Rule(f"{theirs}.norm_added_k.weight", f"{ours}.norm_k.scale"),
-        ]
+        layers = ("norm1", "ff.net.0.proj", "ff.net.2", "norm2")
+        names = tuple(f"{embedder}.image_embedder.{layer}" for layer in layers)
+        rules += _image(names, "blocks.*.attn2", ("add_k_proj", "add_v_proj", "norm_added_k"))
     return rules
+
+
+def _attention(theirs: str, ours: str, projections: Mapping[str, str]) -> list[Rule]:
+    """Return the rules of an attention layer, whose queries and keys have RMS norms."""
+    rules = [
+        rule
+        for name, own in projections.items()
+        for rule in linear_rules(f"{theirs}.{name}", f"{ours}.{own}")
+    ]
+    norms = ("norm_q", "norm_k")
+    return rules + [Rule(f"{theirs}.{name}.weight", f"{ours}.{name}.scale") for name in norms]
+
+
+def _image(embedder: Sequence[str], attention: str, keys: Sequence[str]) -> list[Rule]:
+    """Return the rules of the image embedder's layers, and of its keys and values."""
+    (norm_in, up, down, norm_out), (k, v, norm_k) = embedder, keys
+    ours = "blocks.cross_attn.image"
+    return [
+        *norm_rules(norm_in, "image.norm_in"),
+        *linear_rules(up, "image.mlp.up"),
+        *linear_rules(down, "image.mlp.down"),
+        *norm_rules(norm_out, "image.norm_out"),
+        *linear_rules(f"{attention}.{k}", f"{ours}.k"),
+        *linear_rules(f"{attention}.{v}", f"{ours}.v"),
+        Rule(f"{attention}.{norm_k}.weight", f"{ours}.norm_k.scale"),
+    ]
 
 
 def arguments(config: WanDiTConfig) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Conversion table of the video VAE: Wan 2.1's official file and diffusers' `AutoencoderKLWan`.
 
-Both follow our module tree, so that a rule is our path with its words replaced.
+Both follow our module tree: the foreign name is our path with some words replaced.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from einops import rearrange
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import (
@@ -19,6 +18,7 @@ from egosim_jax.convert.tables import (
     Reader,
     Reference,
     Table,
+    vae_outputs,
     weight_shapes,
 )
 from egosim_jax.models.wan.vae import WanVAEConfig
@@ -94,21 +94,14 @@ def shorten(config: WanVAEConfig) -> WanVAEConfig:
 
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Return both reconstructions of a small random video."""
-    import torch
     from diffusers import AutoencoderKLWan
 
-    module = comparison.load(AutoencoderKLWan(**arguments(comparison.config)))
-    video = np.random.default_rng(0).uniform(-1, 1, (1, 5, 32, 32, 3)).astype(np.float32)
-    have = comparison.output(video, call=lambda vae, x: vae.decode(vae.encode(x)))
-    with torch.no_grad():
-        theirs = torch.from_numpy(rearrange(video, "b f h w c -> b c f h w").copy())
-        (posterior,) = module.encode(theirs, return_dict=False)
-        (decoded,) = module.decode(posterior.mode(), return_dict=False)
-    return have, rearrange(decoded.numpy(), "b c f h w -> b f h w c")
+    module = AutoencoderKLWan(**arguments(comparison.config))
+    return vae_outputs(comparison, module, frames=5)
 
 
 def to_diffusers(arrays: Mapping[str, Reader], config: WanVAEConfig) -> Mapping[str, Reader] | None:
-    """Rename official tensors by diffusers' own table, which is for the released size only."""
+    """Rename official tensors by diffusers' own table; None for sizes other than the released."""
     from diffusers.loaders import single_file_utils
 
     if config.res_blocks != RELEASED_RES_BLOCKS:

@@ -10,7 +10,8 @@ from safetensors.numpy import save_file
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
-from egosim_jax.convert.lora import exported, exported_metadata, read_lora
+from egosim_jax.convert.lora import read_lora
+from egosim_jax.convert.lora_export import exported, exported_metadata
 from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.lora import Delta
 

@@ -1,4 +1,4 @@
-"""Small checkpoints and LoRAs, and commands whose error is one line."""
+"""Small checkpoints and LoRAs, and commands that must fail with a one-line error."""
 
 from functools import cache
 

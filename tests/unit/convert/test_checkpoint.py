@@ -12,8 +12,8 @@ from safetensors.flax import save_file
 from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
 from egosim_jax.convert.__main__ import main
-from egosim_jax.convert.dwm_checkpoint import checkpoint
 from egosim_jax.convert.lora import check_base, read_lora
+from egosim_jax.convert.lora_export import checkpoint
 from egosim_jax.convert.plan import merged
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io.mapped import read_metadata, read_safetensors
@@ -49,7 +49,7 @@ def wan_layers(dim=48, ffn=96, text=64, image=32, freq=256, layers=LAYERS, out=6
 
 
 def released(family, folder, dtype="float32"):
-    """The two files as DWM's trainings write them; return their tensors by stem."""
+    """Write the two files of a training of DWM; return their tensors by stem."""
     rng = np.random.default_rng(0)
     draw = lambda *shape: rng.normal(size=shape).astype(jnp.dtype(dtype))  # noqa: E731
     low = {}
@@ -156,7 +156,7 @@ def test_the_command_writes_the_folder(dtype, tiny, tmp_path):
 
 
 def test_a_transformer_that_was_saved_with_its_lora_is_read_without_it(tiny, tmp_path, capsys):
-    """As in the folder that a training of DWM ends with: PEFT renames the adapted layers."""
+    """As in the final folder of a training of DWM: PEFT renames the adapted layers."""
     rng = np.random.default_rng(0)
     ours = {n: rng.normal(size=s).astype(np.float32) for n, s in weight_shapes(COGVIDEOX).items()}
     theirs = translate_back(ours, table_of(COGVIDEOX).rules("diffusers", COGVIDEOX))
@@ -192,7 +192,7 @@ def test_a_transformer_that_was_saved_with_its_lora_is_read_without_it(tiny, tmp
     ],
 )
 def test_a_full_size_checkpoint_has_the_layers_of_the_release(name, modules, weights, patch):
-    """Its low-rank tensors of rank 1, of which rank 64 has 64 times as many weights."""
+    """Its low-rank tensors have rank 1; rank 64 has 64 times as many weights."""
     config = configs.get(name).dit
     shapes = weight_shapes(config)
     changes = {}

@@ -1,4 +1,4 @@
-"""`egosim-convert`: checkpoints as they are released, to weights folders."""
+"""`egosim-convert`: released checkpoints to weights folders."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ from safetensors.torch import save_file
 from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
 from egosim_jax.configs.model import Networks
-from egosim_jax.convert import commands, outputs
+from egosim_jax.convert import commands, stream
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of, wan_dit
@@ -74,7 +74,7 @@ def egosim(folder):
 
 
 def sharded(folder, tensors, stem, shards=3):
-    """Sharded with an index, as the Wan releases are."""
+    """Sharded with an index, like the Wan releases."""
     names = sorted(tensors)
     places = {
         name: f"{stem}-{1 + number % shards:05d}-of-{shards:05d}.safetensors"
@@ -200,7 +200,7 @@ def test_a_network_or_tokenizer_that_is_asked_for_must_be_there(tmp_path, capsys
 def test_the_base_of_dwm_is_converted_without_the_network_that_it_lacks(
     tmp_path, monkeypatch, capsys
 ):
-    """By the command of docs/dwm.md, of a folder as Wan2.1-Fun-V1.1-14B-InP is released."""
+    """By the command of docs/dwm.md, from a folder like the release Wan2.1-Fun-V1.1-14B-InP."""
     dwm, get = configs.get("dwm_wan_14b"), configs.get
     fields = {f.name: getattr(CONFIG.dit, f.name) for f in dataclasses.fields(CONFIG.dit)}
     tiny = replace(dwm, dit=DWMWanDiTConfig(**fields), vae=CONFIG.vae, text=CONFIG.text)
@@ -326,7 +326,7 @@ def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
 
 @pytest.mark.parametrize("layout", ["wan", "diffusers"])
 def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, monkeypatch):
-    monkeypatch.setattr(outputs, "LARGEST", 200_000)  # bytes, so that there is more than one
+    monkeypatch.setattr(stream, "MAX_FILE_BYTES", 200_000)  # bytes, so that there is more than one
     assert convert(checkpoint, tmp_path / "ours") == 0
     assert back(tmp_path / "ours", tmp_path / "theirs", "--layout", layout) == 0
     for network in NETWORKS:

@@ -87,7 +87,7 @@ def leaves(config, network, naming):
 def test_names_and_shapes_are_those_of_the_released_files(
     config, network, naming, released, tensors, fingerprint
 ):
-    """The fingerprints by which DiffSynth-Studio knows the files: MD5 over names and shapes."""
+    """DiffSynth-Studio identifies files by these fingerprints: MD5 over names and shapes."""
     theirs = leaves(config, network, naming)
     assert len(theirs) == tensors
     shapes = {name: "_".join(map(str, shape)) for name, shape in theirs.items()}

@@ -1,4 +1,4 @@
-"""Files that others made badly, or on purpose: refused in one line, little time and memory."""
+"""Damaged or hostile files: refused in one line, with little time and memory."""
 
 import contextlib
 import json

@@ -96,9 +96,6 @@ def test_what_is_written_is_apart_from_what_is_read(tmp_path, capsys):
     assert [path.name for path in base.iterdir()] == ["dit.safetensors"]
 
 
-# What is written for others.
-
-
 def test_diffusers_and_transformers_load_what_is_written_for_them(tmp_path, monkeypatch):
     # What diffusers keeps in float32 it loads by accelerate alone; here everything is float32.
     monkeypatch.setattr(WanTransformer3DModel, "_keep_in_fp32_modules", None)

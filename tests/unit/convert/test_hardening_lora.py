@@ -1,4 +1,4 @@
-"""LoRAs that `egosim-convert` refuses, and settings of theirs that it honors."""
+"""LoRAs that `egosim-convert` refuses, and LoRA settings that it honors."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""LoRA files of every naming mean the same, and what is written loads elsewhere."""
+"""LoRA files of every naming give the same changes, and other projects load written files."""
 
 import json
 
@@ -58,7 +58,7 @@ def pairs():
 
 
 def written(form, pairs, folder):
-    """The same LoRA as others write it."""
+    """The same LoRA in the files of other projects."""
     tensors, path = {}, folder / "lora.safetensors"
     scale = ALPHA / RANK
     for name, (down, up) in pairs.items():
@@ -111,7 +111,7 @@ def test_every_naming_is_the_same_sum(form, pairs, tmp_path):
 
 
 def network():
-    """`debug` with weights that all count."""
+    """`debug` with weights that all have an effect."""
     made = WanDiT(CONFIG, rngs=nnx.Rngs(0))
     rng = np.random.default_rng(1)
     made.head.linear.kernel.set_value(

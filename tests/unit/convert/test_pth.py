@@ -40,7 +40,7 @@ def flattened(tree, name=""):
 
 
 def check(path: Path):
-    # torch's own careful reader knows protocol 2 alone; what is read here was written here.
+    # torch's weights-only reader knows only protocol 2; this test wrote the file itself.
     expected = flattened(torch.load(path, weights_only=False))
     found = read_pth(path)
     assert list(found) == list(expected)
@@ -257,7 +257,7 @@ def test_a_truncated_file_is_refused(tmp_path, kept):
 
 
 def test_entries_that_lie_on_each_other_are_refused(tmp_path):
-    """A directory that says of a small entry that it is large."""
+    """A directory that declares a small entry as large."""
     path = saved(tmp_path / "a.pth", {"w": tensor()})
     data = bytearray(path.read_bytes())
     directory = data.index(b"PK\x01\x02")

@@ -1,4 +1,4 @@
-"""Foreign checkpoints are opened in every form that is published, and damage is reported."""
+"""Foreign checkpoints open in every published form, and damage is reported."""
 
 import json
 import struct
@@ -127,7 +127,7 @@ def test_networks_are_detected_by_their_names_under_any_prefix(tmp_path):
 
 
 def test_of_two_tokenizers_that_of_t5_is_taken(tmp_path):
-    """Wan's releases also have that of CLIP's text encoder, one folder nearer."""
+    """Wan's releases also have the tokenizer of CLIP's text encoder, one folder nearer."""
     (t5 := tmp_path / "google" / "umt5-xxl").mkdir(parents=True)
     (clip := tmp_path / "xlm-roberta-large").mkdir()
     for folder in (t5, clip):
