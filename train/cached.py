@@ -1,8 +1,8 @@
-"""DWM's caches: latents shards of them, in place of encoding the videos, and the caches of videos.
+"""DWM's caches of encoded videos: conversion to latents shards, and their own writing.
 
-For shards, the first clip is encoded from its videos as well. So the caches are shown to be of the
-given VAE and text encoder, and what does not depend on the clip, as the embeddings of the empty
-prompt, is known.
+The first clip of the shards is also encoded from its videos. This checks that the caches are of
+the given VAE and text encoder. It also gives the arrays that are the same for all clips, such as
+the embeddings of the empty prompt.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ VIDEOS = ("target", "prior", "hands")
 
 
 def check_cached(config: ModelConfig) -> None:
-    """Raise `InputError` for a model that does not train on cached moments."""
+    """Raise `InputError` for a model that cannot train on cached moments."""
     if config.posterior != "sampled" or config.encoders == "joint":
         raise InputError(
             f"{config.name} does not train on cached moments: it must draw latents from them and "
-            "have frozen encoders, as dwm_cogvideox_5b. Encode the videos. (egosim data encode)"
+            "have frozen encoders, like dwm_cogvideox_5b. Encode the videos. (egosim data encode)"
         )
 
 
 def shard_caches(
     config: ModelConfig, folder: Path, clips: Sequence[ClipFiles], *, out: Path
 ) -> Iterator[str]:
-    """Write the latents shards of clips from their caches; yield the id of each.
+    """Write the latents shards of clips from their caches; yield the id of each clip.
 
     `folder` holds the weights. Raises `InputError` for a model that does not draw latents, and for
-    caches of another shape or of other weights.
+    caches of another shape or other weights.
     """
     check_cached(config)
     networks = Networks.load(config, folder, only=config.cached_networks)
@@ -84,10 +84,11 @@ def shard_caches(
 
 
 def _arrays(files: ClipFiles, first: Mapping[str, np.ndarray], codec: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of a clip: those of the caches, and the others of the first clip."""
+    """Return the arrays of a clip from its caches; arrays without a cache are the first clip's."""
     arrays = dict(first)
     for name in VIDEOS:
         mean, logvar = read_moments(_cache(files, name), first[name].shape)
+        # Normalization is affine: the deviation is the distance of two normalized points.
         above = mean + np.exp(logvar / 2)
         center, upper = (np.asarray(codec.normalize(jnp.asarray(x))) for x in (mean, above))
         deviation = upper - center
@@ -98,15 +99,15 @@ def _arrays(files: ClipFiles, first: Mapping[str, np.ndarray], codec: Any) -> di
 
 def _cache(files: ClipFiles, array: str) -> Path:
     if files.target is None:
-        raise InputError(f"{files.row}: it has no recorded video, next to which its caches are.")
+        raise InputError(f"{files.row}: no recorded video. Its caches must be next to the video.")
     return cache_of(files.target, array)
 
 
 def write_caches(config: ModelConfig, folder: Path, clips: Sequence[ClipFiles]) -> Iterator[str]:
-    """Write the caches of clips next to their recorded videos; yield the id of each.
+    """Write the caches of clips next to their recorded videos; yield the id of each clip.
 
     `folder` holds the weights. Raises `InputError` for a model that does not draw latents, and for
-    clips that do not have its length.
+    clips of another length.
     """
     check_cached(config)
     networks = Networks.load(config, folder, only=config.cached_networks)
@@ -123,7 +124,7 @@ def write_caches(config: ModelConfig, folder: Path, clips: Sequence[ClipFiles]) 
 
 
 def _moments(encoders: Networks, videos: jax.Array, ids: jax.Array, mask: jax.Array) -> Any:
-    """Return means and log variances of the latents of each video, and embeddings of a prompt."""
+    """Return means and log variances of the latents of each video, and prompt embeddings."""
     codec: Any = encoders.vae
     means, logvars = jax.lax.map(lambda video: codec.moments(to_model(video)), videos)
     return means, logvars, encoders.text(ids, mask)

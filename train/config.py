@@ -1,6 +1,6 @@
-"""Settings of a training: hyper-parameters and optimizer.
+"""Hyper-parameters of a training, and its optax optimizer.
 
-The optimizer is optax's: a learning-rate schedule, gradient clipping, and AdamW or Muon.
+The optimizer chains gradient clipping and AdamW or Muon under a learning-rate schedule.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from egosim_jax.train.metric_writers import EXTRAS, check_installed
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 WeightsDtype = Literal["float32", "bfloat16", "float16"]
-"""Dtypes of the weights that a training writes."""
+"""Dtype of written weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,29 +31,29 @@ class OptimizerConfig:
 
     `muon` orthogonalizes the updates of matrices and convolutions and uses Adam for the rest."""
     learning_rate: float = 1e-5
-    """Peak learning rate of the training."""
+    """Peak learning rate."""
     warmup_steps: int = 0
     """Updates of linear warm-up from zero."""
     schedule: Literal["constant", "cosine", "cosine_restarts"] = "constant"
-    """Learning rate after the warm-up: constant, or a cosine.
+    """Learning rate after the warm-up.
 
-    `cosine` falls to a twentieth of the peak, `cosine_restarts` to 0 in each of its `cycles`."""
+    `cosine` decays to a twentieth of the peak; `cosine_restarts` to 0 in each of its `cycles`."""
     cycles: int | None = None
     """Number of cycles of `cosine_restarts`; None: 1."""
     weight_decay: float = 0.0
-    """Decoupled weight decay, of matrices and kernels only."""
+    """Decoupled weight decay of matrices and kernels; biases and norms have none."""
     b1: float = 0.9
     """Adam's decay of the first moment."""
     b2: float = 0.999
     """Adam's decay of the second moment."""
     clip_grad_norm: float = 1.0
-    """Maximum global norm of the gradient, to which longer gradients are scaled."""
+    """Maximum global norm of the gradient; longer gradients are scaled down to it."""
     skip_grad_norm_factor: float | None = None
-    """Multiple of the running mean gradient norm above which an update is skipped; None: none."""
+    """Skip an update whose gradient norm exceeds this multiple of the running mean; None: never."""
     ema_decay: float | None = None
     """Decay of the moving average of the weights (EMA), for instance 0.9999; None: no EMA.
 
-    The EMA is what is validated and kept. It takes the memory of the weights."""
+    Validation uses the EMA, and it is written. It takes as much memory as the weights."""
 
     def __post_init__(self) -> None:
         """Check the range of each number."""
@@ -82,15 +82,15 @@ class TrainConfig:
     batch_size: int = 32
     """Examples per update, over all devices."""
     grad_accum_steps: int = 1
-    """Parts of a batch whose gradients are accumulated one after the other, to save memory."""
+    """Parts of a batch whose gradients are computed one after the other, to save memory."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    """Optimizer and learning rate."""
+    """Optimizer and learning-rate schedule."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """Shape of the device mesh."""
     seed: int = 0
-    """Seed of the initial weights, of the order of the data and of the noise."""
+    """Seed of the initial weights, the data order and the noise."""
     log_every: int = 10
-    """Updates between lines of the log."""
+    """Updates between log lines."""
     save_every: int = 500
     """Updates between checkpoints."""
     validate_every: int = 500
@@ -102,22 +102,22 @@ class TrainConfig:
     keep_every: int | None = None
     """Also keep the checkpoints whose step is a multiple of this."""
     fallback: bool = False
-    """If the newest checkpoint is damaged, resume from the one before it."""
+    """If the newest checkpoint is damaged, resume from the previous one."""
     workers: int = 0
     """Number of processes that load data; 0: threads of the training process.
 
-    It determines the order of the data, so a resumed run needs the same."""
+    It determines the data order, so a resumed run needs the same number."""
     hang_timeout_s: float = 300.0
-    """Seconds without a finished update, at least, after which a run exits with code 70.
+    """Minimum seconds without a finished update before a run exits with code 70.
 
-    It must also be ten times the usual time."""
+    The wait must also exceed ten times the median time of an update."""
     tensorboard: bool = False
     """Also write metrics for TensorBoard, to OUT/tensorboard."""
     wandb: str | None = None
-    """Project of Weights & Biases to log metrics to as well."""
+    """Weights & Biases project that also gets the metrics."""
 
     def __post_init__(self) -> None:
-        """Check that every count is positive and that the seed is in range."""
+        """Raise `InputError` unless every count is positive and the seed is in range."""
         counts = ("steps", "batch_size", "grad_accum_steps")
         every = ("log_every", "save_every", "validate_every", "sample_every", "keep_every")
         check_counts({name: getattr(self, name) for name in (*counts, *every, "keep")})
@@ -143,9 +143,9 @@ def resume_mutable(*names: str) -> tuple[str, ...]:
 
 
 def numerics_only(value: Any, path: str) -> Iterator[str]:
-    """Yield the dotted paths, below `path`, of fields that change only how values are computed.
+    """Yield the dotted paths, below `path`, of the fields that affect only numerics.
 
-    They may change on resume, too. A config class lists its own in a class variable
+    They may also change on resume. A config class lists such fields in its class variable
     `numerics_only`: dtype, rematerialization, kernel.
     """
     if is_dataclass(value):
@@ -161,21 +161,20 @@ def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
         return optax.warmup_cosine_decay_schedule(
             0.0 if warmup else peak, peak, warmup, max(steps, warmup + 1), end_value=peak / 20
         )
+    after = optax.constant_schedule(peak)
     if config.schedule == "cosine_restarts":
         rest, cycles = max(steps - warmup, 1), config.cycles or 1
 
         def restarted(count: Any) -> Any:
-            """Return the rate at a number of updates after the warm-up."""
+            """Return the learning rate `count` updates after the warm-up."""
             share = jnp.minimum(count / rest, 1.0)
+            # Modulo 1 would restart at the peak after the last update, which must end at 0.
             angle = jnp.where(share < 1, cycles * share % 1.0, 1.0)
             return peak * 0.5 * (1 + jnp.cos(jnp.pi * angle))
 
-        return optax.schedules.join_schedules(
-            [optax.linear_schedule(0.0 if warmup else peak, peak, warmup), restarted], [warmup]
-        )
-    return optax.schedules.join_schedules(
-        [optax.linear_schedule(0.0 if warmup else peak, peak, warmup), lambda _: peak], [warmup]
-    )
+        after = restarted
+    ramp = optax.linear_schedule(0.0 if warmup else peak, peak, warmup)
+    return optax.schedules.join_schedules([ramp, after], [warmup])
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
@@ -187,7 +186,7 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
             weight_decay=config.weight_decay,
             adam_b1=config.b1,
             adam_b2=config.b2,
-            consistent_rms=0.2,  # the size of an AdamW update, so that one rate serves both
+            consistent_rms=0.2,  # as large as an AdamW update: both share one learning rate
             muon_weight_dimension_numbers=_matrices,
         )
     else:
@@ -206,8 +205,8 @@ def _matrices(params: Any) -> Any:
 
 
 def _dimensions(leaf: nnx.Variable) -> MuonDimensionNumbers | None:
-    """Return the input and output axes of a kernel `[layers?, ..., in, out]`; None for the rest."""
-    if isinstance(leaf.get_value(), optax.MaskedNode):  # optax asks again for its own part
+    """Return the input and output axes of a kernel `[layers?, ..., in, out]`, else None."""
+    if isinstance(leaf.get_value(), optax.MaskedNode):  # optax masks the other group's leaves
         return None
     axes = leaf.get_metadata().get("axes", ())
     stacked = axes[:1] == ("layers",)

@@ -1,15 +1,14 @@
-"""Encoding of clips, done once, so that updates read latents and embeddings instead of videos.
+"""Encoding of clips to shards of latents and embeddings, which training reads instead of videos.
 
-Every window of a clip is a separate record, since the causal VAE encodes a window's first frame
-alone. The windows are split into parts of equal size. A part is written atomically as one shard in
-its folder, OUT/parts/00000, ...; process p of n writes parts p, p + n, ... and skips those that
-exist. When all parts exist, the first process renames their shards into OUT and writes the
-manifest. Its provenance names the config, the source's fingerprint and the hashes of the networks
-that made the arrays.
+Every window of a clip is a separate record, because the causal VAE encodes a window's first frame
+alone. The windows are split into parts of equal size. Each part is one shard, written atomically to
+its folder OUT/parts/00000, ...; process p of n writes the missing ones of parts p, p + n, ... When
+all parts exist, the first process renames their shards into OUT and writes the manifest. Its
+provenance has the config, the source's fingerprint and the hashes of the encoders.
 
-A clip that cannot be read is skipped, with all its windows. OUT/parts/00000.json lists the windows
-of a part and those that were skipped, since which windows there are depends on what can be read; a
-part of other windows is written again. The provenance has the record numbers of skipped clips.
+An unreadable clip is skipped with all its windows; the provenance has its record number. The
+windows depend on the readable clips, so OUT/parts/00000.json lists the windows of a part. A part
+whose list differs is written again.
 """
 
 from __future__ import annotations
@@ -50,18 +49,17 @@ from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
 from egosim_jax.sharding import check_batch, shard_params
 from egosim_jax.train.distributed import stop_if_preempted
-from egosim_jax.train.encoded_parts import PartWindows, Window
-from egosim_jax.train.windows import Damaged, read_windows, windows
+from egosim_jax.train.encode_windows import Damaged, PartWindows, Window, read_windows, windows
 from egosim_jax.types import InputError, Triplet, check_counts
 
 logger = logging.getLogger(__name__)
 
 MAX_PARTS = 100_000
-"""Maximum number of shards, whose names have five digits."""
+"""Maximum number of shards: their names have five digits."""
 
 
 class Encoding:
-    """The encoding of clips to the arrays of latents records, on one device or on a mesh."""
+    """Encoder of clips to the arrays of latents records, on one device or on a mesh."""
 
     def __init__(self, config: ModelConfig, encoders: Networks, mesh: Mesh | None = None):
         self.config = config
@@ -72,7 +70,7 @@ class Encoding:
     def __call__(self, triplets: Sequence[Triplet]) -> list[dict[str, np.ndarray]]:
         """Return the arrays of each triplet's record.
 
-        With frozen encoders they hold embeddings; with joint ones, the encoders' inputs.
+        With frozen encoders the arrays are embeddings; with joint ones, the encoders' inputs.
         """
         packed = pack(triplets, self.config)
         encoded = self._encode({**packed, "target": targets_of(triplets)})
@@ -86,10 +84,11 @@ class Encoding:
 def _encode(
     encoders: Networks, batch: Batch, *, posterior: str | None = None
 ) -> dict[str, jax.Array]:
-    """Encode one video after the other: the VAE is compiled once and needs little memory.
+    """Encode the videos of a batch, and its prompts and first frames if their encoders are frozen.
 
-    With the posterior `sampled` there are deviations too, so that a training can draw.
+    With the posterior `sampled` the arrays include standard deviations, so training can draw.
     """
+    # One video after the other (`lax.map`): the VAE is compiled once and needs little memory.
     videos = [name for name in ("target", "prior", "hands") if name in batch]
     stacked = jnp.stack([jnp.asarray(batch[name]) for name in videos])
     if posterior is None:
@@ -110,7 +109,7 @@ def _encode(
 
 
 def _kept(batch: Batch, config: ModelConfig) -> dict[str, Any]:
-    """Return the arrays of a batch that a record holds as they are."""
+    """Return the arrays of a batch that go unchanged into the records."""
     names = ["mask"]
     if config.encoders == "joint":
         names += ["ids", "ids_mask", "null_ids", "null_mask", "pixels"]
@@ -118,7 +117,7 @@ def _kept(batch: Batch, config: ModelConfig) -> dict[str, Any]:
 
 
 def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return the shapes of a batch of a model's latents records."""
+    """Return the shapes of a batch of latents records of a model."""
     packed, video = batch_shapes(batch, config), config.video
     target = jax.ShapeDtypeStruct((batch, video.frames, video.height, video.width, 3), np.uint8)
     graph, params = nnx.split(Networks.abstract(config, only=config.cached_networks))
@@ -133,7 +132,7 @@ def example_shapes(config: ModelConfig, batch: int) -> dict[str, jax.ShapeDtypeS
 
 
 def mask_of(config: ModelConfig) -> dict[str, Any]:
-    """Return packing and number of channels of a model's mask, as shards name them."""
+    """Return packing and number of channels of a model's mask, in the words of a manifest."""
     return {"packing": config.layout.mask_packing, "channels": config.layout.count("mask")}
 
 
@@ -152,16 +151,16 @@ def encode_shards(
     process_count: int | None = None,
     verb: str = "encoding",
 ) -> list[int]:
-    """Write the latents shards of every window of `source`, resuming an interrupted run.
+    """Write the latents shards of all windows of `source`, resuming an interrupted run.
 
-    Returns the record numbers of the clips that cannot be read, which are skipped.
+    Returns the record numbers of the skipped clips, which are unreadable.
 
-    `folder` holds the weights, of which `config.cached_networks` are read. Each batch is split over
-    `mesh`, which has devices of this process only. All processes call this with the same arguments
-    and share `out`, which is complete when they return. `decoding` is recorded in the manifest;
-    that of frames was chosen when they were packed. Raises `InputError` if `out` was started with
-    another config, source, stride or number of windows per shard, or with other encoders, and if
-    more clips cannot be read than a training tolerates.
+    Reads the networks `config.cached_networks` of the weights in `folder`. Splits each batch over
+    `mesh`, which has only devices of this process. All processes call this with the same arguments
+    and share `out`, which is complete when they return. The manifest records `decoding`; packed
+    frames already have one. Raises `InputError` if `out` was started with another config, source,
+    stride, number of windows per shard or other encoders, or if more clips are unreadable than a
+    training tolerates.
     """
     check_counts({"--stride": stride, "--batch-size": batch_size, "--shard-windows": shard_windows})
     if mesh is not None:
@@ -182,7 +181,7 @@ def encode_shards(
     _open(
         out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
     )
-    _wait_for_all("opened")  # early: the first collective must not come late
+    _wait_for_all("opened")  # now: a first collective after uneven work may time out
     if (out / MANIFEST).exists():
         shutil.rmtree(out / "parts", ignore_errors=True)
         return read_manifest(out).provenance.get("skipped", [])
@@ -242,9 +241,9 @@ def _open(out: Path, settings: Mapping[str, Any]) -> None:
     open_folder(out, settings)
 
 
-def _wait_for_all(what: str) -> None:
+def _wait_for_all(event: str) -> None:
     if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(f"encode {what}")
+        multihost_utils.sync_global_devices(f"encode {event}")
 
 
 def _write(
@@ -255,14 +254,14 @@ def _write(
     provenance: Mapping[str, Any],
     decoding: Decoding,
 ) -> Iterator[Window]:
-    """Write part after part, yielding each window once it is encoded or skipped."""
+    """Write part after part; yield each window when it is encoded or skipped."""
     jobs = [(part, batch) for part, todo in parts.items() for batch in batches(todo, batch_size)]
     damaged: set[int] = set()
     for part, group in groupby(
         read_windows(source, jobs, encode.config, decoding), key=itemgetter(0)
     ):
         skipped: list[Window] = []
-        shutil.rmtree(part, ignore_errors=True)  # of other windows
+        shutil.rmtree(part, ignore_errors=True)  # it had other windows
         with ExitStack() as stack:
             writer: ShardWriter | None = None
             for _, read in group:
@@ -286,6 +285,7 @@ def _write(
                         shard_bytes=2**62,
                     )
                 )
+                # Fill the batch up to its size: another shape would compile again.
                 fill = [clips[-1]] * (batch_size - len(clips))
                 examples = encode([triplet for _, _, triplet in (*clips, *fill)])
                 for (window, metadata, _), arrays in zip(clips, examples, strict=False):
@@ -295,11 +295,11 @@ def _write(
 
 
 def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> None:
-    """Raise `InputError` unless latents shards were encoded for a model, by the given weights.
+    """Raise `InputError` unless latents shards were encoded for a model with the given weights.
 
-    Compares config, video and the packing of the mask with the manifest in `shards`, and the hashes
-    of the encoders with those of the weights folder, in which only the VAE is required; without a
-    folder, hashes are not compared. Of a mixture, every part is checked.
+    Compares config, video and mask packing with the manifest in `shards`, and the hashes of the
+    encoders with the weights folder, which must have the VAE. Without a folder, hashes are not
+    compared. Checks every part of a mixture.
     """
     if (shards / MIXTURE).is_file():
         for part in read_mixture(shards):
@@ -313,12 +313,12 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
             "(egosim data encode)"
         )
     problems = [
-        f"{what}: the shards have {have}, this training has {want}"
-        for what, have, want in (
+        f"{name}: the shards have {found}, this training has {expected}"
+        for name, found, expected in (
             ("config", manifest.provenance.get("config"), config.name),
             ("video", manifest.spec, config.video),
         )
-        if have != want
+        if found != expected
     ]
     mask = manifest.provenance.get("mask", "no record of it")
     if "mask" in config.layout and mask != mask_of(config):
@@ -335,6 +335,6 @@ def check_encoders(shards: Path, config: ModelConfig, weights: Path | None) -> N
     if problems:
         raise InputError(
             f"{shards} was not encoded for this training: {listing(problems)}. Encode again with "
-            "these weights (egosim data encode), or use those that it was encoded with. "
+            "these weights (egosim data encode), or use the weights that encoded it. "
             "(--weights)"
         )

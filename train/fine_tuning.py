@@ -1,4 +1,4 @@
-"""Fine-tuning: a denoiser of given weights, trained on latents that `egosim data encode` wrote."""
+"""Fine-tuning of a denoiser on latents that `egosim data encode` wrote."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig
-from egosim_jax.train.recipe_base import Recipe
+from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
 
@@ -23,9 +23,8 @@ if TYPE_CHECKING:
 class FineTuning(Recipe):
     """Train a denoiser from given weights, all of it or a LoRA, on cached latents.
 
-    Writes OUT/weights, a complete weights folder, or OUT/lora.safetensors, with the log,
-    checkpoints and sample clips. The same command resumes an interrupted run, also on other
-    devices.
+    Writes OUT/weights, a complete weights folder, or OUT/lora.safetensors, and the log, checkpoints
+    and sample clips. The same command resumes an interrupted run, also on other devices.
     """
 
     help_groups: ClassVar[HelpGroups] = {
@@ -48,27 +47,27 @@ class FineTuning(Recipe):
     latents: Path | None = None
     """Folder of latents shards."""
     weights: Path | None = None
-    """Weights folder to start from, with the encoders that the latents were encoded by."""
+    """Weights folder to start from, with the encoders that made the latents."""
     validation: Path | None = None
-    """Folder of latents shards to validate on, and to generate sample clips of."""
+    """Folder of latents shards for validation and sample clips."""
     rank: int | None = None
-    """Rank of a LoRA, which is then trained instead of the weights."""
+    """Rank of a LoRA to train instead of the weights."""
     times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
     """Distribution and weighting of the noise levels."""
     max_difference: float | None = None
-    """Difference from the target above which an element's error counts as 0; None: none."""
+    """Ignore elements whose prediction is further than this from the target; None: ignore none."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
     navigation: float = 0.0
     """Rate of samples without hands whose target is the prior (DWM's regularizer)."""
     remat: str | None = None
-    """Rematerialization in the backward pass, if not the model's (`remat_levels`)."""
+    """Rematerialization in the backward pass (`remat_levels`); None: the model's."""
     attention: Kernel | None = None
-    """Attention kernel, if not the model's."""
+    """Attention kernel; None: the model's."""
     dtype: Literal["float32", "bfloat16"] | None = None
-    """Compute dtype, if not the model's; trained weights and moments are float32 in any case."""
+    """Compute dtype; None: the model's. Trained weights and moments are always float32."""
     samples: int = 2
-    """Validation clips to generate every `sample_every` updates."""
+    """Number of validation clips to generate every `sample_every` updates."""
 
     def stages(self) -> Mapping[str, Stage]:
         """Return the training of the denoiser."""
@@ -111,7 +110,7 @@ class FineTuning(Recipe):
     def model(self) -> ModelConfig:
         """Return the model's config with the options of this recipe.
 
-        Raises `InputError` for an option that the model's denoiser does not have.
+        Raises `InputError` for an option that the model's denoiser lacks.
         """
         from egosim_jax import configs
 
@@ -134,10 +133,10 @@ class FineTuning(Recipe):
 def write_trained(
     trained: Networks, out: Path, *, model: ModelConfig, start: Path, rank: int | None
 ) -> Path:
-    """Write OUT/lora.safetensors, if a LoRA of some rank was trained, or the complete OUT/weights.
+    """Write OUT/lora.safetensors if `rank` is given, else a complete OUT/weights.
 
-    `start` is the weights folder that the LoRA belongs to, or that has the networks that were not
-    trained. All processes of the training call it with the same arguments.
+    `start` is the weights folder that the training started from: the base of the LoRA, or the
+    source of untrained networks. All processes of the training call it with the same arguments.
     """
     import jax
 

@@ -1,13 +1,12 @@
-"""The training loop, read from top to bottom: `train`, then the `Run` whose actions it calls.
+"""The training loop, read from top to bottom: `train`, then the actions of `Run` that it calls.
 
-Resuming restores the state and the data iterator together, in this order: the data iterator is
-made as for a new run, the newest checkpoint is read straight into the shardings of the mesh, the
-iterator is set to the saved position, and the log is cut back to the restored step. A resumed run
-therefore repeats the losses of the run that was not interrupted bit for bit.
+To resume, a run makes the data iterator as a new run does, reads the newest checkpoint straight
+into the shardings of the mesh, sets the iterator to the saved position, and cuts the log back to
+the restored step. It then repeats the losses of an uninterrupted run bit for bit.
 
-The update is compiled before weights are read, so that a batch or a head count that the mesh does
-not divide is refused at once. The metrics of an update are read while the next one runs, so that
-the devices never wait for the host.
+The update is compiled before weights are read: the run refuses at once a batch size or a number of
+heads that the mesh does not divide. The host reads the metrics of an update while the next one
+runs, so the devices never wait for it.
 """
 
 from __future__ import annotations
@@ -55,11 +54,11 @@ def train(
 ) -> Any:
     """Train `task` on the shards in `data`, resuming the run in `out`, and return the networks.
 
-    `validation` is a folder of shards whose metrics are measured with fixed noise; `weights` a
-    folder to start from instead of random weights. OUT gets config.json, environment.json,
-    metrics.jsonl, times.json, checkpoints/ and samples/, and `run_folder`, OUT if not given, the
-    page index.html of this training and its other stages. All processes of a run call this with
-    the same arguments, and the first one writes.
+    `validation` is a folder of shards to validate on, with fixed noise. `weights` is a folder to
+    start from instead of random weights. OUT gets config.json, environment.json, metrics.jsonl,
+    times.json, checkpoints/ and samples/. `run_folder`, by default OUT, gets index.html, the page
+    of all stages of the run. All processes of a run call this with the same arguments; the first
+    one writes.
     """
     training.check_packages()
     digests = None if weights is None else hashes(weights)
@@ -94,7 +93,7 @@ def train(
 
 @dataclass(frozen=True)
 class Every:
-    """An action of the loop with its interval."""
+    """An action that the loop repeats at an interval."""
 
     steps: int
     """Updates between two calls."""
@@ -102,13 +101,13 @@ class Every:
     """Function of the number of finished updates and the state."""
 
     def __call__(self, step: int, state: TrainState, *, last: bool) -> None:
-        """Run the action if it is due, which it also is after the last update."""
+        """Run the action if it is due; after the last update it always is."""
         if last or step % self.steps == 0:
             self.action(step, state)
 
 
 class Run:
-    """A training in progress: its data, checkpoints and metrics, and the actions of its loop."""
+    """A training in progress: data, checkpoints, metrics, and the actions of its loop."""
 
     def __init__(
         self,
@@ -119,7 +118,7 @@ class Run:
         out: Path,
         stack: ExitStack,
     ):
-        """Open data and checkpoints, which `stack` closes. Call it under the training's mesh."""
+        """Open data and checkpoints, which `stack` closes. The training's mesh must be set."""
         self.task, self.training, self.programs, self.out = task, training, programs, out
         self.stack, self.sharding = stack, batch_sharding(jax.sharding.get_mesh())
         self.source, self.frozen, self.update = source, programs.frozen, programs.update
@@ -127,18 +126,20 @@ class Run:
         self.learning_rate = learning_rate(training.optimizer, training.steps)
         self.pending: list[Mapping[str, jax.Array]] = []
         self.writers: list[Writer] = []
-        self.batches = stack.enter_context(closing(self._batches(source)))
+        batches = make_batches(source, task, training, self.sharding)
+        self.batches = stack.enter_context(closing(batches))
         self.checkpoints = Checkpoints(
             out / "checkpoints", keep=training.keep, keep_every=training.keep_every
         )
         stack.callback(self.checkpoints.close)
 
     def compile(self) -> None:
-        """Compile the update, unless the run is at its end, and check the room for checkpoints."""
+        """Compile the update, unless no step remains, and check the disk space for checkpoints."""
         done, steps = max(self.checkpoints.steps, default=0), self.training.steps
         if done < steps:
-            with self.clock.phase("data"), closing(self._batches(self.source, peek=True)) as peek:
-                example = self._to_devices(next(peek))
+            first = make_batches(self.source, self.task, self.training, self.sharding, peek=True)
+            with self.clock.phase("data"), closing(first):
+                example = self._to_devices(next(first))
             self.clock.flops = self.task.flops(self.training.batch_size)
             with self.clock.phase("compile"):
                 self.update = self.update.lower(self.programs.state, self.frozen, example).compile()
@@ -160,21 +161,21 @@ class Run:
             return self.checkpoints.restore(state, self.batches, fallback=self.training.fallback)
 
     def open_log(self, step: int) -> None:
-        """Start metric writers and watchdog of a run that has finished `step` updates."""
+        """Start the metric writers and the watchdog of a run that has finished `step` updates."""
         self.writers = make_writers(self.training, self.out, step) if is_first() else []
         for writer in self.writers:
             self.stack.callback(writer.close)
         self.watchdog = self.stack.enter_context(closing(Watchdog(self.training.hang_timeout_s)))
 
     def loop(self, state: TrainState, hooks: list[Every]) -> TrainState:
-        """Update to the end, running the hooks; stop with a checkpoint on SIGTERM."""
+        """Update to the last step and run the hooks; on SIGTERM, save a checkpoint and stop."""
         self.clock.begin(int(state.step))
         for step in range(int(state.step) + 1, self.training.steps + 1):
             state = self.step(step, state)
             last = step == self.training.steps
             for hook in hooks:
                 hook(step, state, last=last)
-            preempted = is_preempted()
+            preempted = is_preempted()  # at every step: all processes must stop at the same one
             if step % self.training.save_every == 0 or last or preempted:
                 self.save(step, state, wait=last or preempted)
             if preempted and not last:
@@ -186,7 +187,7 @@ class Run:
         return state
 
     def step(self, step: int, state: TrainState) -> TrainState:
-        """Return the state after one more update, and check the one before."""
+        """Return the state after one more update, and check the previous one."""
         with self.clock.phase("data"):
             examples = next(self.batches)
         with self.clock.phase("step"):
@@ -197,7 +198,7 @@ class Run:
         return state
 
     def log(self, step: int, state: TrainState) -> None:
-        """Write the mean metrics since the last line, and the speed."""
+        """Write the mean metrics since the last log line, and the speed."""
         with self.clock.phase("step"):
             self.skips.check()
             metrics = mean_metrics(self.pending)
@@ -208,7 +209,7 @@ class Run:
         self.write(step, {**metrics, **self.clock.tick(step, self.training.steps)})
 
     def validate(self, shards: Path, step: int, state: TrainState) -> None:
-        """Write the validation metrics, means over the readable records of `shards`."""
+        """Write the validation metrics: means over the readable records of `shards`."""
         self.watchdog.rest()
         with self.clock.phase("validate"):
             source, params = open_shards(shards), state.eval_params
@@ -217,7 +218,7 @@ class Run:
                 self.programs.validate(params, self.frozen, self._to_devices(batch))
                 for batch in batches
             )
-        if (bad := len(source) - readable) > Loader.MAX_BAD:  # of all processes, who all stop
+        if (bad := len(source) - readable) > Loader.MAX_BAD:  # summed over all processes
             raise InputError(
                 f"{bad} of {len(source)} records of {shards} cannot be read: at most "
                 f"{Loader.MAX_BAD} may be damaged. Encode or pack them again. (--validation)"
@@ -231,7 +232,7 @@ class Run:
             samples.write(self.networks(state), self.out / "samples", step)
 
     def write_page(self, folder: Path, step: int, state: TrainState) -> None:
-        """Write times.json, and the page of the run folder."""
+        """Write times.json and the page of the run."""
         self.watchdog.rest()
         if is_first():
             write_json(self.out / TIMES, self.clock.by_phase())
@@ -240,7 +241,7 @@ class Run:
                 log0(f"curves, sample clips and settings: {page}")
 
     def save(self, step: int, state: TrainState, *, wait: bool) -> None:
-        """Write a checkpoint in the background, or wait until it is on disk."""
+        """Write a checkpoint in the background; with `wait`, return when it is on disk."""
         self.watchdog.rest()
         with self.clock.phase("save"):
             self.checkpoints.save(step, state, self.batches)
@@ -257,8 +258,9 @@ class Run:
         return nnx.merge(self.programs.graph, state.eval_params, self.frozen)
 
     def _load(self, weights: Path) -> nnx.State:
-        """Load the frozen weights; return those of a folder that are trained further."""
-        programs, start = self.programs, nnx.Not(LowRankParam)
+        """Load the frozen weights of a folder; return its weights that are trained further."""
+        programs = self.programs
+        start = nnx.Not(LowRankParam)  # no weights folder has the LoRA: it starts at random
         trained, _ = nnx.split_state(programs.state.params, start, ...)
         sharding, _ = nnx.split_state(programs.state_sharding.params, start, ...)
         placed = place(
@@ -271,18 +273,16 @@ class Run:
         return loaded
 
     def _initial_state(self, loaded: nnx.State | None) -> TrainState:
-        """Return the state before the first update, of weights that were loaded or are random."""
+        """Return the state before the first update; weights that were not loaded are random."""
         sharding, params = self.programs.state_sharding, self.programs.state.params
         if loaded is None or len(jax.tree.leaves(loaded)) < len(jax.tree.leaves(params)):
             create = partial(self.programs.create, loaded)
             return init_sharded(create, out_shardings=sharding)
+        # All weights were loaded: donate them, so that no second copy takes memory.
         create = partial(
             TrainState.create, config=self.training.optimizer, steps=self.training.steps
         )
         return jax.jit(create, out_shardings=sharding, donate_argnums=0)(loaded)
-
-    def _batches(self, source: ShardReader | Mixture, *, peek: bool = False) -> Loader:
-        return make_batches(source, self.task, self.training, self.sharding, peek=peek)
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
         return {
@@ -301,7 +301,7 @@ def make_batches(
 ) -> Loader:
     """Return an iterator over this process's shard of each batch, shuffled and endless.
 
-    `peek` is the same without worker processes.
+    With `peek` it starts no worker processes.
     """
     index, count = process_shard(sharding, training.batch_size)
     return make_loader(
@@ -318,7 +318,7 @@ def make_batches(
 def validation_batches(
     source: ShardReader | Mixture, task: Task, training: TrainConfig, sharding: Any
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Return this process's shard of each batch of one pass (`one_pass`), of all records."""
+    """Return this process's shard of each batch of one pass over all records."""
     devices = parts("batch", sharding.mesh)
     size = min(training.batch_size, -(-len(source) // devices) * devices)
     index, count = process_shard(sharding, size)
@@ -334,7 +334,7 @@ def validation_batches(
 def process_shard(sharding: Any, size: int) -> tuple[int, int]:
     """Return the index of this process's shard of a batch, and the number of shards.
 
-    Processes that share samples, along the context axis, hold the same shard.
+    Processes along the context axis share samples, so they have the same shard.
     """
     rows = {
         index[0].indices(size)[:2]
@@ -358,18 +358,18 @@ def make_writers(training: TrainConfig, out: Path, step: int) -> list[Writer]:
 
 
 def is_first() -> bool:
-    """Return whether this is the first process of the run, the one that writes."""
+    """Return True in the first process of the run, which writes."""
     return jax.process_index() == 0
 
 
 def log0(text: str) -> None:
-    """Print to stderr in the first process only."""
+    """Print to stderr, in the first process only."""
     if is_first():
         print(text, file=sys.stderr, flush=True)
 
 
 def memory_summary(program: Any) -> str:
-    """Describe the memory of a compiled program; empty if the compiler does not report it."""
+    """Return the memory of a compiled program as text; empty if the compiler reports none."""
     analysis = program.memory_analysis()
     if analysis is None:
         return ""
@@ -378,7 +378,7 @@ def memory_summary(program: Any) -> str:
 
 
 def startup_message(state: TrainState, training: TrainConfig, out: Path) -> str:
-    """Describe the start of a run: step, trained weights and devices."""
+    """Return the first log line of a run: step, number of trained weights, devices."""
     step = int(state.step)
     weights = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     verb = f"resuming at step {step}" if step else "starting"

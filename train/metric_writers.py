@@ -19,14 +19,14 @@ from egosim_jax.types import InputError
 
 @runtime_checkable
 class Writer(Protocol):
-    """The interface of a metric writer."""
+    """Interface of a metric writer."""
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Write the metrics of `step`, the number of finished updates."""
         ...
 
     def close(self) -> None:
-        """Flush and release what the writer holds."""
+        """Flush the metrics and release the writer's resources."""
         ...
 
 
@@ -45,7 +45,7 @@ class Console:
             self._live.start()
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Print the metrics; on a terminal only those of validations stay."""
+        """Print the metrics; on a terminal, only validation metrics remain as lines."""
         numbers = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         if self._live is None:
             print(f"step {step:>6}  {numbers}", file=sys.stderr, flush=True)
@@ -63,7 +63,7 @@ class Console:
 class JsonLines:
     """A file of one JSON object per line; a resumed run first drops the steps that it repeats.
 
-    A run that starts at step 0 repeats that one, too.
+    A run from step 0 also repeats step 0, so it drops all lines.
     """
 
     def __init__(self, path: Path, *, resume_after: int = 0):
@@ -81,11 +81,11 @@ class JsonLines:
         append_line(self.path, {"step": step, **values})
 
     def close(self) -> None:
-        """Do nothing: every line is on disk."""
+        """Do nothing: every line is already on disk."""
 
 
 class TensorBoard:
-    """Scalars for TensorBoard, by tensorboardX; a resumed run hides the steps that it repeats."""
+    """Scalars for TensorBoard, by tensorboardX; a resumed run purges the steps that it repeats."""
 
     def __init__(self, folder: Path, *, resume_after: int = 0):
         purge_step = resume_after + 1 if resume_after else 0
@@ -102,9 +102,9 @@ class TensorBoard:
 
 
 class WandB:
-    """A run of Weights & Biases, whose id in the run folder lets a resumed run continue it.
+    """A run of Weights & Biases; a resumed run continues it by the id in the run folder.
 
-    Server and login are configured by W&B's environment variables.
+    W&B's environment variables configure server and login.
     """
 
     def __init__(self, folder: Path, *, project: str, name: str):
@@ -127,7 +127,7 @@ class WandB:
 
 
 EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}
-"""Packages of the writers that need an extra, by the extra's name."""
+"""Package of each optional writer by the name of its extra."""
 
 
 def check_installed(extra: str) -> None:

@@ -49,7 +49,7 @@ PHASES: dict[Phase, str] = {
 
 
 class Clock:
-    """Wall-clock seconds of a run by phase, and the speed of its updates."""
+    """Wall-clock seconds of each phase of a run, and the speed of its updates."""
 
     def __init__(self, *, flops: float):
         """Start the clock; `flops` are the model FLOPs of an update, over all devices."""
@@ -73,10 +73,10 @@ class Clock:
         self._step, self._before = step, dict(self.seconds)
 
     def tick(self, step: int, steps: int) -> dict[str, float]:
-        """Return the speed over the interval that ends at `step` of `steps`, and start the next.
+        """Return the speed over the interval that ends at `step`, and start the next interval.
 
-        `step_time_s` includes the wait for data, whose share is `data_wait_frac`. TFLOP/s and MFU
-        are per device, and omitted where FLOPs or the device's peak are unknown.
+        `step_time_s` includes the wait for data, and `data_wait_frac` is its share. TFLOP/s and MFU
+        are per device; they are missing if the FLOPs or the device's peak are unknown.
         """
         count = max(1, step - self._step)
         waited, worked = (self.seconds[name] - self._before[name] for name in ("data", "step"))
@@ -91,15 +91,15 @@ class Clock:
             "peak_mem_gb": peak_memory() / 1e9,
             "eta_min": seconds * (steps - step) / 60,
         }
-        return {name: value for name, value in numbers.items() if value == value}
+        return {name: value for name, value in numbers.items() if value == value}  # not NaN
 
     def by_phase(self) -> dict[str, float]:
-        """Return the seconds of each phase by its title, and those of all else."""
+        """Return the seconds of each phase by its title, and the remaining seconds as `other`."""
         rows = {PHASES[name]: self.seconds[name] for name in PHASES if self.seconds[name]}
         return {**rows, "other": time.monotonic() - self._began - sum(rows.values())}
 
     def table(self) -> str:
-        """Return seconds and share of each phase, one per line."""
+        """Return a table of the seconds and the share of each phase."""
         rows = self.by_phase()
         total = sum(rows.values())
         return "\n".join(
@@ -122,12 +122,12 @@ HANG_FACTOR = 10
 
 
 class Watchdog:
-    """A thread that ends the process when updates stop coming.
+    """A thread that ends the process if no update finishes for too long.
 
-    Without a `beat` for `HANG_FACTOR` times the median interval, and for at least `timeout_s`
-    seconds, it prints the stacks of all threads and ends the process with exit code 70: a
-    supervisor can then start the run again, which resumes. It is idle until the first `beat`, since
-    compiling may take long, and between `rest` and the next one.
+    The limit is `HANG_FACTOR` times the median interval between beats, and at least `timeout_s`
+    seconds. Beyond it the watchdog prints the stacks of all threads and ends the process with exit
+    code 70; a supervisor can then restart the run, which resumes. It is idle before the first
+    `beat`, because compilation may take long, and between `rest` and the next `beat`.
     """
 
     def __init__(self, timeout_s: float):
@@ -145,11 +145,11 @@ class Watchdog:
         self._last = now
 
     def rest(self) -> None:
-        """Pause until the next beat."""
+        """Pause until the next `beat`."""
         self._last = None
 
     def close(self) -> None:
-        """End the thread of the monitor."""
+        """End the thread."""
         self._ended.set()
 
     def _watch(self) -> None:
@@ -166,13 +166,13 @@ class Watchdog:
                     file=sys.stderr,
                 )
                 faulthandler.dump_traceback(all_threads=True)
-                os._exit(ExitCode.HUNG)
+                os._exit(ExitCode.HUNG)  # not sys.exit: the main thread hangs and would not see it
 
 
 class SkipMonitor:
-    """Reports skipped updates with their records, once they are done.
+    """Reporter of skipped updates and their records.
 
-    An update is checked while the next one runs, so that the devices never wait for the host.
+    It checks an update while the next one runs, so the devices never wait for the host.
     """
 
     def __init__(self, source: ShardReader | Mixture):
@@ -180,12 +180,12 @@ class SkipMonitor:
         self._last: tuple[int, Mapping[str, jax.Array], np.ndarray] | None = None
 
     def watch(self, step: int, metrics: Mapping[str, jax.Array], records: np.ndarray) -> None:
-        """Check the update before, and note this one."""
+        """Check the previous update, and keep this one for the next check."""
         self.check()
         self._last = step, metrics, records
 
     def check(self) -> None:
-        """Name the records of the last update if it was skipped; stop the run after several."""
+        """Print the records of the last update if it was skipped; stop the run after several."""
         if self._last is None:
             return
         (step, metrics, records), self._last = self._last, None
@@ -201,28 +201,28 @@ class SkipMonitor:
         )
         if count >= MAX_CONSECUTIVE_SKIPS:
             raise CommandExit(
-                f"{count} updates in a row were skipped, so the run stops. The weights are those "
-                "before them: inspect the records above, or lower the learning rate.",
+                f"{count} updates in a row were skipped, so the run stops. They did not "
+                "change the weights: inspect the records above, or lower the learning rate.",
                 ExitCode.FAILED,
             )
 
 
 SHEET_FRAMES = 6
-"""Frames of a clip on the contact sheet."""
+"""Number of frames of a clip on the contact sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """Clips generated during training from the same noise each time, next to the ground truth."""
+    """Clips generated during training, always from the same noise, next to the ground truth."""
 
     model: ModelConfig
-    """Model that is trained."""
+    """Model in training."""
     latents: Path
-    """Folder of latents shards, usually those of the validation, whose first records are used."""
+    """Folder of latents shards, usually the validation's; the first records are used."""
     vae: Path
-    """Weights folder with the autoencoder of the latents."""
+    """Weights folder with the autoencoder that made the latents."""
     count: int = 2
-    """Number of clips that are generated."""
+    """Number of clips to generate."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` unless there is at least one clip."""
@@ -273,7 +273,7 @@ class Samples:
 
     @cached_property
     def _batch(self) -> dict[str, jax.Array]:
-        """Return the records, repeated to a batch that the devices can share."""
+        """Return the records, repeated until the devices divide the batch size."""
         found = [record.arrays for record in self._records]
         size = -(-len(found) // parts("batch")) * parts("batch")
         where = batch_sharding(jax.sharding.get_mesh())

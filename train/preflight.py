@@ -1,9 +1,9 @@
 """Preflight of a training: compile its update for a target machine, and report whether it fits.
 
-The compiled update is the one that training runs: the same function, mesh, shardings and donation.
-After the recipe's own setting come the others that take the same batch: as many clips at a time on
-a device, and as much kept for the backward pass, as fit its memory. If nothing fits, 2 devices
-share a clip, then 4, and so on.
+Training runs the same update: the same function, mesh, shardings and donation. After the recipe's
+own setting, the search compiles other settings of the same batch size: all numbers of clips on a
+device at a time and all rematerializations that fit its memory. If none fits, 2 devices share a
+clip, then 4, and so on.
 """
 
 from __future__ import annotations
@@ -27,15 +27,13 @@ from egosim_jax.train.update import Programs, Stage
 from egosim_jax.types import MeshConfig
 
 ANNOUNCEMENT = "looking for other settings that fit, which takes minutes; --no-search skips it"
-
-
 NO_REMAT = "none"
 """Rematerialization of a network whose config has none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """The part of a batch that is computed at a time, and the rematerialization."""
+    """The number of clips that are computed at a time, and the rematerialization."""
 
     clips: int
     """Clips on a device at a time; devices that share a clip count as one."""
@@ -46,7 +44,7 @@ class Setting:
 
 
 def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: bool) -> int:
-    """Print the reports of a recipe's stages on a target; return 1 if one does not fit."""
+    """Print the report of each stage of a recipe on a target; return 1 if one does not fit."""
     target, fit = find(name), True
     found: dict[str, dict[str, Any]] = {}
     for title, stage in stages.items():
@@ -55,7 +53,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
         found[title] = {"asked": plain(report)}
         if not as_json:
             print(f"{_heading(title, stage, target)}\n\n{text(report)}", flush=True)
-        # Settings are ordered by predicted speed.
+        # Settings are ordered by predicted speed, so a search needs the device's peak.
         known_speed = not math.isnan(target.device.flops)
         if search and isinstance(stage.task, Denoising) and known_speed:
             print(ANNOUNCEMENT, file=sys.stderr, flush=True)
@@ -71,7 +69,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
 
 
 def compile_step(stage: Stage, target: Target) -> Report | OutOfMemory:
-    """Compile an update for a target. Raises `InputError` if batch and mesh do not fit it."""
+    """Compile an update for a target. Raises `InputError` if the target does not fit the mesh."""
     task, training = stage
     mesh = make_mesh(training.mesh, target.devices)
     programs, placed = Programs.of(task, training, mesh), batch_sharding(mesh)
@@ -85,7 +83,7 @@ def compile_step(stage: Stage, target: Target) -> Report | OutOfMemory:
 
 
 def _others(stage: Stage, target: Target, asked: Report | OutOfMemory) -> dict[Setting, Report]:
-    """Return the settings that fit, best first, with as few devices per clip as possible."""
+    """Return the settings that fit, fastest first, with as few devices per clip as possible."""
     known = {_setting(stage, target): asked}
     for mesh in _meshes(stage, target):
         shared = stage._replace(training=replace(stage.training, mesh=mesh))
@@ -96,7 +94,7 @@ def _others(stage: Stage, target: Target, asked: Report | OutOfMemory) -> dict[S
 
 
 def _meshes(stage: Stage, target: Target) -> Iterator[MeshConfig]:
-    """Yield the mesh as it is, and then with more and more devices per clip."""
+    """Yield the given mesh, then meshes with 2, 4, ... times as many devices per clip."""
     task: Any = stage.task
     own = make_mesh(stage.training.mesh, target.devices).shape
     context = own["context"]
@@ -108,7 +106,7 @@ def _meshes(stage: Stage, target: Target) -> Iterator[MeshConfig]:
 def _fitting(
     stage: Stage, target: Target, known: Mapping[Setting, Report | OutOfMemory]
 ) -> dict[Setting, Report]:
-    """Return the settings of a mesh that fit."""
+    """Return the settings that fit on a mesh."""
     mesh = make_mesh(stage.training.mesh, target.devices)
     share, context = stage.training.batch_size // parts("batch", mesh), parts("tokens", mesh)
     counts = [clips for clips in range(1, share + 1) if share % clips == 0]
@@ -119,15 +117,15 @@ def _fitting(
     def tries() -> Iterator[None]:
         nonlocal levels
         for clips in counts:
-            for place, remat in enumerate(levels):
+            for index, remat in enumerate(levels):
                 setting = Setting(clips=clips, remat=remat, context=context)
                 report = known.get(setting)
                 if report is None:
                     report = compile_step(_with(stage, setting, share), target)
                 yield
                 if not isinstance(report, Report) or not report.fits:
-                    # What keeps more does not fit either, nor does it with more clips.
-                    levels = levels[:place]
+                    # Levels that keep more do not fit either, nor with more clips.
+                    levels = levels[:index]
                     break
                 fitting[setting] = report
 
@@ -138,7 +136,7 @@ def _fitting(
 
 
 def _order(report: Report) -> tuple[float, int]:
-    """Order by predicted work, then by memory; overlap is not modeled."""
+    """Return the sort key: predicted seconds without overlap, then peak memory."""
     return report.compute_s + report.memory_s + report.link_s, report.memory.peak
 
 

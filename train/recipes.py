@@ -1,4 +1,4 @@
-"""Named trainings: each is a value whose fields are the options of `egosim-train NAME`."""
+"""Named trainings: the fields of each value are the options of `egosim-train NAME`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from dataclasses import replace
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.fine_tuning import FineTuning
-from egosim_jax.train.from_scratch import FromClips, FromTabletop
-from egosim_jax.train.recipe_base import Recipe
-from egosim_jax.train.refining import RefineVAE
+from egosim_jax.train.from_scratch import FromClips
+from egosim_jax.train.from_tabletop import FromTabletop
+from egosim_jax.train.recipe import Recipe
+from egosim_jax.train.refine_vae import RefineVAE
 from egosim_jax.types import InputError
 
 _FULL = TrainConfig(
@@ -33,11 +34,11 @@ r"""EgoSim's main training: the whole 14B transformer, from Wan 2.1 Fun InP 14B 
         --out latents/train
     egosim-train egosim_14b --weights weights/base --latents latents/train --out runs/egosim_14b
 
-AdamW at 1e-5, 32 clips of 61 frames of 832 x 480 per update, 4000 updates, as in the paper (section
-4.1). Weights and moments take 197 GB, so 8 x H200 share them by FSDP: with gradients some 31 GiB
-each, some 70 GiB with what a clip keeps; `--remat projections` is 5 % faster and takes 124 GiB.
-4.3e20 model FLOPs: 38 hours at 40 % of the devices' peak; one H200 reached 45 % with 16 of the 40
-blocks (docs/gpu.md). Estimated, not measured.
+AdamW at 1e-5, batch size 32, clips of 61 frames of 832 x 480, 4000 updates, as in the paper
+(section 4.1). Weights and moments take 197 GB. 8 x H200 share them by FSDP: about 31 GiB each with
+gradients, about 70 GiB with the activations of a clip. `--remat projections` is 5 % faster and
+takes 124 GiB. 4.3e20 model FLOPs: 38 hours at 40 % of the devices' peak. Estimated, not measured;
+one H200 reached 45 % with 16 of the 40 blocks (docs/gpu.md).
 """
 
 EGOSIM_1_3B = FineTuning(config="egosim_1_3b", training=_FULL)
@@ -49,8 +50,8 @@ r"""EgoSim's conditioning on the 1.3B transformer, from Wan 2.1 Fun InP 1.3B wid
         --out latents/train
     egosim-train egosim_1_3b --weights weights/base --latents latents/train --out runs/egosim_1_3b
 
-Weights and moments of 1.6 billion parameters take 19 GB, so that one H200 is enough; eight share
-them. A tenth of the FLOPs of the 14B. Estimated, not measured.
+Weights and moments of 1.6 billion parameters take 19 GB: one H200 is enough, and eight share them.
+It needs a tenth of the FLOPs of the 14B. Estimated, not measured.
 """
 
 EGOSIM_14B_ROBOT = FineTuning(
@@ -70,8 +71,8 @@ r"""EgoSim's cross-embodiment training: from human hands to a robot's gripper.
     egosim-train egosim_14b_robot --weights weights/egosim_14b --latents latents/agibot \
         --out runs/robot
 
-200 updates of 32 clips after the main training, as in the paper (section 4.1); hardware and memory
-as in `egosim_14b`, two hours at 40 % of the peak. Estimated, not measured.
+200 updates of 32 clips after the main training, as in the paper (section 4.1). Hardware and memory
+as for `egosim_14b`; two hours at 40 % of the peak. Estimated, not measured.
 """
 
 EGOSIM_14B_FEWSHOT = FineTuning(
@@ -91,8 +92,8 @@ r"""EgoSim's adaptation to a new wearer or place, from a few dozen clips.
     egosim-train egosim_14b_fewshot --weights weights/egosim_14b --latents latents/mine \
         --out runs/mine
 
-50 updates of one clip per device, as in the paper (section 4.1), which had 30 clips. 8 x H200 with
-some 62 GiB each, a few minutes; on other numbers of devices set `--training.batch-size` to theirs.
+50 updates of one clip per device on 30 clips, as in the paper (section 4.1). 8 x H200 need about
+62 GiB each and a few minutes; with another number of devices, set `--training.batch-size` to it.
 Estimated, not measured.
 """
 
@@ -114,12 +115,11 @@ EGOSIM_14B_LORA = FineTuning(
     egosim-train egosim_14b_lora --weights weights/egosim_14b --latents latents/mine --out runs/lora
     egosim-convert lora runs/lora/lora.safetensors --config egosim_14b --out mine.safetensors
 
-The weights are frozen, in bfloat16: 33 GB; a LoRA of rank 64 has 337 million weights, which are
-float32 with their moments: 4 GB. With what the one clip keeps that an update of 8 takes at a
-time, 65 GiB: one H200 or H100, a minute per update. Estimated, not measured. The second command
-writes the names that ComfyUI and diffusers read.
+The frozen weights take 33 GB in bfloat16. A LoRA of rank 64 has 337 million weights; with their
+moments they take 4 GB in float32. With the activations of one clip per micro-batch, 65 GiB: one
+H200 or H100, a minute per update. Estimated, not measured. The second command writes the names
+that ComfyUI and diffusers read.
 """
-
 
 DWM_COGVIDEOX_5B = FineTuning(
     config="dwm_cogvideox_5b",
@@ -149,11 +149,12 @@ r"""DWM's training: a LoRA of CogVideoX-Fun V1.1 5B InP, widened from 33 to 49 c
         --out latents/train
     egosim-train dwm_cogvideox_5b --weights weights/base --latents latents/train --out runs/dwm
 
-AdamW (0.9, 0.95) at 1e-4 on queries, keys, values and outputs, of rank and alpha 64, and on the
-patch projection: 66.7 million float32 weights. 56 clips of 49 frames per update, 8000 updates, as
-the released checkpoint has (its config asks for 15 000); no condition is dropped. The latents are
-drawn at each update. One H100 takes 4 clips at a time, in 57 GiB of its 75 (`--preflight h100:1`);
-eight devices 7 each, with `--training.grad-accum-steps 7` one at a time.
+AdamW (0.9, 0.95) at 1e-4 trains a LoRA of rank and alpha 64 on queries, keys, values and outputs,
+and the patch projection: 66.7 million float32 weights. 56 clips of 49 frames per update, 8000
+updates, as in the released checkpoint (its config asks for 15 000); no condition dropout. The
+latents are drawn at each update. One H100 takes 4 clips at a time, in 57 GiB of its 75
+(`--preflight h100:1`). Eight devices take 7 each; with `--training.grad-accum-steps 7`, one at a
+time.
 """
 
 DWM_WAN_14B = replace(
@@ -173,10 +174,10 @@ r"""DWM's training on Wan 2.1 Fun V1.1 14B InP, widened from 36 to 52 channels.
     egosim-convert weights Wan2.1-Fun-V1.1-14B-InP --config dwm_wan_14b --widen polarity \
         --out weights/base
 
-and then as `dwm_cogvideox_5b`. A LoRA of rank and alpha 64 on all 488 linear layers, and the patch
-embedding; 5000 updates, as the released checkpoint has. As in its trainer, elements whose
-prediction is more than 50 away from its target do not count. One clip at a time takes 59 GiB of an
-H100 (`--preflight h100:1`).
+and then as `dwm_cogvideox_5b`. It trains a LoRA of rank and alpha 64 on all 488 linear layers, and
+the patch embedding; 5000 updates, as in the released checkpoint. Like its trainer, it ignores
+elements whose prediction is more than 50 away from the target. One clip at a time takes 59 GiB of
+an H100 (`--preflight h100:1`).
 """
 
 
@@ -186,27 +187,24 @@ def _muon(learning_rate: float, warmup_steps: int) -> OptimizerConfig:
     )
 
 
+_SMALL_VAE = TrainConfig(
+    steps=4000,
+    batch_size=2,
+    # Long warm-up: with a short one the first updates kill the channel that separates green from
+    # purple, for good.
+    optimizer=_muon(1e-3, 300),
+    log_every=25,
+    save_every=250,
+    validate_every=500,
+)
+_SMALL_DENOISER = replace(
+    _SMALL_VAE, steps=8000, batch_size=8, optimizer=_muon(2e-3, 200), sample_every=500
+)
+
 TABLETOP = FromTabletop(
     config="tabletop",
-    vae=TrainConfig(
-        steps=4000,
-        batch_size=2,
-        # With a short warm-up the first updates close the channel that separates green from purple,
-        # and it stays closed.
-        optimizer=_muon(1e-3, 300),
-        log_every=25,
-        save_every=250,
-        validate_every=500,
-    ),
-    denoiser=TrainConfig(
-        steps=8000,
-        batch_size=8,
-        optimizer=_muon(2e-3, 200),
-        log_every=25,
-        save_every=250,
-        validate_every=500,
-        sample_every=500,
-    ),
+    vae=_SMALL_VAE,
+    denoiser=_SMALL_DENOISER,
     dropout=ConditionDropout(prior=0.15, mask=0.15, hands=0.15, text=0.15),
     weights_dtype="float16",
 )
@@ -214,49 +212,28 @@ TABLETOP = FromTabletop(
 
     egosim-train tabletop --out runs/tabletop
 
-makes the clips, trains the VAE, encodes latents and trains the denoiser, on a CPU, in five hours on
-two cores. Every stage resumes: run the same command again after an interruption.
+makes the clips, trains the VAE, encodes latents and trains the denoiser, in five hours on two CPU
+cores. Every stage resumes: run the same command again after an interruption.
 """
 
 DWM_TABLETOP = FromTabletop(
     config="dwm_tabletop",
     twins=True,
-    vae=TrainConfig(
-        steps=3000,
-        batch_size=2,
-        optimizer=_muon(1e-3, 300),
-        log_every=25,
-        save_every=250,
-        validate_every=500,
-    ),
-    denoiser=TrainConfig(
-        steps=6000,
-        batch_size=8,
-        optimizer=_muon(2e-3, 200),
-        log_every=25,
-        save_every=250,
-        validate_every=500,
-        sample_every=500,
-    ),
+    vae=replace(_SMALL_VAE, steps=3000),
+    denoiser=replace(_SMALL_DENOISER, steps=6000),
     dropout=ConditionDropout(prior=0.05, hands=0.1, text=0.1),
 )
 """DWM in miniature: from scratch, on static twins of the tabletop world and meshes of its hands.
 
     egosim-train dwm_tabletop --out runs/dwm_tabletop
 
-on a CPU, as `tabletop`; every stage resumes. `egosim experiment dwm` adapts a base model instead.
+runs on a CPU, like `tabletop`; every stage resumes. `egosim experiment dwm` adapts a base model
+instead.
 """
 
 TABLETOP_VAE = RefineVAE(
     config="tabletop",
-    vae=TrainConfig(
-        steps=4000,
-        batch_size=2,
-        optimizer=_muon(5e-4, 100),
-        log_every=25,
-        save_every=100,
-        validate_every=500,
-    ),
+    vae=replace(_SMALL_VAE, optimizer=_muon(5e-4, 100), save_every=100),
 )
 r"""The VAE of `tabletop`, trained further with LPIPS in its loss.
 
@@ -270,29 +247,16 @@ The second command trains the denoiser further, on latents of the new VAE.
 REAL_TINY = FromClips(
     config="real_tiny",
     stride=2,
-    vae=TrainConfig(
-        steps=2000,
-        batch_size=2,
-        optimizer=_muon(1e-3, 20),
-        log_every=25,
-        save_every=500,
-        validate_every=250,
+    vae=replace(
+        _SMALL_VAE, steps=2000, optimizer=_muon(1e-3, 20), save_every=500, validate_every=250
     ),
-    denoiser=TrainConfig(
-        steps=2500,
-        batch_size=4,
-        optimizer=_muon(2e-3, 50),
-        log_every=25,
-        save_every=250,
-        validate_every=500,
-        sample_every=500,
-    ),
+    denoiser=replace(_SMALL_DENOISER, steps=2500, batch_size=4, optimizer=_muon(2e-3, 50)),
 )
 """EgoSim's architecture, small, from scratch on recorded clips: the VAE, then the denoiser.
 
     egosim-train real_tiny --metadata CLIPS/metadata.csv --out runs/real_tiny
 
-runs on a CPU, in an hour on two cores. Every stage resumes: run the same command again after an
+takes an hour on two CPU cores. Every stage resumes: run the same command again after an
 interruption.
 """
 
@@ -317,7 +281,7 @@ DEBUG = FromClips(
 
     egosim-train debug --out runs/debug
 
-takes minutes on 2 CPU cores. A clip has three windows of 9 frames to train on and two to test on.
+takes minutes on two CPU cores. A clip has three training windows of 9 frames, or two test windows.
 """
 
 RECIPES: dict[str, tuple[str, Recipe]] = {
@@ -334,11 +298,11 @@ RECIPES: dict[str, tuple[str, Recipe]] = {
     "egosim_14b_fewshot": ("Adapt EgoSim's 14B transformer to a few clips.", EGOSIM_14B_FEWSHOT),
     "egosim_14b_lora": ("Train a LoRA of EgoSim's 14B transformer.", EGOSIM_14B_LORA),
 }
-"""Recipes by name, each with the line that describes it in the help."""
+"""Recipes by name, each with its line of the help."""
 
 
 def get(name: str) -> Recipe:
-    """Return the recipe of a name. Raises `InputError` with the nearest name if there is none."""
+    """Return a recipe by name. Raises `InputError` with the nearest name for an unknown one."""
     if name not in RECIPES:
         near = difflib.get_close_matches(name, RECIPES, n=1, cutoff=0.0)
         raise InputError(f"There is no recipe {name!r}. Nearest: {near[0]}.")

@@ -1,8 +1,8 @@
 """The page of a training run: loss curves, sample clips, times and settings in one HTML file.
 
-It is made of the files in the run folder alone, so that it can be made again at any time, also
-while the run continues. The page loads nothing: curves and pictures are inline data, and its
-content security policy allows no other. Every text is escaped.
+It depends only on the files in the run folder, so you can write it at any time, also while the run
+continues. The page loads nothing: curves, images and video are inline data, and its content
+security policy allows nothing else. Every text is escaped.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ VALIDATION = "validation_"
 SPEED = (
     "step_time_s", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min",
 )  # fmt: skip
-"""Metrics of a run's speed, which are in the table of the last values."""
+"""Metrics of speed: they are in the table of the last values, and have no curve."""
 COLORS = {"training": "tab:blue", "validation": "tab:orange"}
 MAX_POINTS = 1000
-"""Points of a curve; of longer ones, means of consecutive values are drawn."""
+"""Maximum number of points of a curve; longer curves show means of consecutive values."""
 MAX_SHEETS, SHEET_PX, JPEG_QUALITY = 8, 1200, 85
-"""Contact sheets on a page, evenly spaced from the first to the last, and their width."""
+"""Maximum number of contact sheets, evenly spaced in time; their width; their JPEG quality."""
 MAX_CLIP_BYTES, MAX_SHEET_BYTES = 1 << 24, 1 << 27
-"""Size of a sample video beyond which the page omits it, and of a sheet that is read."""
+"""Maximum size of a sample video, which the page omits beyond it, and of a contact sheet."""
 _HEAD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy"
@@ -84,25 +84,25 @@ def write_page(run: Path, out: Path | None = None) -> Path:
 
 
 def stages_of(run: Path) -> list[Stage]:
-    """Return the trainings in a run folder: its own, or those of its stages, in their order."""
+    """Return the trainings of a run folder: its own, or its stages in their order."""
     if (alone := Stage(run)).is_training:
         return [alone]
     found = (Stage(path.parent) for path in sorted(run.glob(f"*/{METRICS}")))
     stages = [stage for stage in found if stage.is_training]
-    places = {name: place for place, name in enumerate(alone.json(CONFIG))}
-    return sorted(stages, key=lambda stage: places.get(stage.folder.name, len(places)))
+    order = {name: index for index, name in enumerate(alone.json(CONFIG))}
+    return sorted(stages, key=lambda stage: order.get(stage.folder.name, len(order)))
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One training of a run, by its folder."""
+    """One training of a run and its folder."""
 
     folder: Path
     """Folder with metrics.jsonl, config.json, and samples/ if there are sample clips."""
 
     @property
     def is_training(self) -> bool:
-        """True if a training has written the folder: evaluations have such files, too."""
+        """True if a training wrote the folder; evaluations have files of the same names."""
         return (self.folder / METRICS).exists() and "training" in self.json(CONFIG)
 
     def sections(self) -> Iterator[str]:
@@ -146,7 +146,7 @@ class Stage:
 
     @property
     def curves(self) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-        """Curves by the title of their plot: training and validation are in one."""
+        """Curves by the title of their plot; training and validation share one."""
         plots: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
         for name, points in self.metrics.items():
             if level := re.fullmatch(f"{VALIDATION}loss_([0-9.]+)", name):
@@ -159,13 +159,13 @@ class Stage:
         return {name: plots[name] for name in [*first, *(n for n in plots if n not in first)]}
 
     def json(self, name: str) -> dict[str, Any]:
-        """Return the values of a JSON file; none if it is not there."""
+        """Return the values of a JSON file; empty if it is missing."""
         path = self.folder / name
         value = read_json(path) if path.exists() else {}
         return value if isinstance(value, dict) else {}
 
     def _samples(self) -> Iterator[str]:
-        """Yield the newest sample clips as a video, and contact sheets, the newest first."""
+        """Yield the newest sample clips as a video, then contact sheets, newest first."""
         sheets = sorted(self.folder.glob("samples/step_*.png"))
         if not sheets:
             return
@@ -178,11 +178,11 @@ class Stage:
         for sheet in reversed([sheets[i] for i in chosen]):
             number = re.sub(r"\D", "", sheet.stem)
             yield f"<p>step {int(number or 0):,}</p>"
-            yield f'<img alt="{escape(sheet.stem)}" src="{_data("image/jpeg", _small(sheet))}">'
+            yield f'<img alt="{escape(sheet.stem)}" src="{_data("image/jpeg", _thumbnail(sheet))}">'
 
 
 def draw_curves(plots: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> bytes:
-    """Return an SVG of plots over the number of updates, three in a row."""
+    """Return an SVG of plots over the number of updates, three per row."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -194,7 +194,7 @@ def draw_curves(plots: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
     axes = iter(figure.subplots(rows, columns, squeeze=False).flat)
     for (title, curves), plot in zip(plots.items(), axes, strict=False):
         for kind, (steps, values) in curves.items():
-            x, y = _shortened(steps, values)
+            x, y = _downsample(steps, values)
             mark, color = "o" if len(x) < 30 else None, COLORS.get(kind)
             plot.plot(x, y, marker=mark, markersize=3, linewidth=1.2, label=kind, color=color)
         finite = np.concatenate([y[np.isfinite(y)] for _, y in curves.values()])
@@ -208,13 +208,13 @@ def draw_curves(plots: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
     for unused in axes:
         unused.set_axis_off()
     data = io.BytesIO()
-    with rc_context({"svg.hashsalt": "egosim"}):  # the same curves are the same file
+    with rc_context({"svg.hashsalt": "egosim"}):  # fixed ids: the same curves give the same bytes
         figure.savefig(data, format="svg", metadata={"Date": None})
     return data.getvalue()
 
 
-def _shortened(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most `MAX_POINTS` points of a curve, means of consecutive ones if it has more."""
+def _downsample(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a curve with at most `MAX_POINTS` points, means of consecutive ones if it has more."""
     count = -(-len(steps) // MAX_POINTS)
     if count == 1:
         return steps, values
@@ -223,14 +223,14 @@ def _shortened(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.add.reduceat(steps, starts) / sizes, np.add.reduceat(values, starts) / sizes
 
 
-def _small(sheet: Path) -> bytes:
-    """Return a contact sheet as a JPEG of at most `SHEET_PX` columns."""
+def _thumbnail(sheet: Path) -> bytes:
+    """Return a contact sheet as a JPEG at most `SHEET_PX` wide."""
     from PIL import Image
 
-    picture = Image.open(io.BytesIO(read_bytes(sheet, limit=MAX_SHEET_BYTES))).convert("RGB")
-    picture.thumbnail((SHEET_PX, picture.height))
+    image = Image.open(io.BytesIO(read_bytes(sheet, limit=MAX_SHEET_BYTES))).convert("RGB")
+    image.thumbnail((SHEET_PX, image.height))
     data = io.BytesIO()
-    picture.save(data, "JPEG", quality=JPEG_QUALITY)
+    image.save(data, "JPEG", quality=JPEG_QUALITY)
     return data.getvalue()
 
 
@@ -244,7 +244,7 @@ def _table(rows: Mapping[str, str]) -> str:
 
 
 def _details(title: str, value: Any) -> list[str]:
-    """Return a folded table of a JSON value, by dotted paths."""
+    """Return a folded table of a JSON value by dotted paths."""
     rows = dict(_flat(value))
     if not rows:
         return []

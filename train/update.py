@@ -1,9 +1,10 @@
-"""One update of a training: its task, its state, its pure functions and their compiled form.
+"""One training update: its task, its state, its pure functions and their compiled form.
 
     (state, frozen weights, batch)  ->  loss and gradients  ->  guard  ->  optimizer  ->  state
 
-The guard skips an update whose loss or gradient norm is not finite or, on request, whose gradient
-norm is far above its running mean; a skipped update changes no weight.
+The guard skips an update if its loss or gradient norm is not finite. With
+`skip_grad_norm_factor` it also skips one whose gradient norm is far above the running mean. A
+skipped update changes no weight.
 """
 
 from __future__ import annotations
@@ -30,25 +31,23 @@ Metrics = dict[str, jax.Array]
 GUARD_WARMUP = 50
 """Updates before the guard compares a gradient norm with the running mean."""
 GRAD_NORM_DECAY = 0.98
-"""Decay of the running mean of gradient norms, which averages over some 50 updates."""
-
-
+"""Decay of the running mean of gradient norms; it averages over about 50 updates."""
 MAX_CONSECUTIVE_SKIPS = 3
-"""Number of updates skipped in a row at which the run stops."""
+"""Number of consecutive skipped updates that stops the run."""
 
 
 @runtime_checkable
 class Task(Protocol):
-    """The networks that are trained, their examples and their loss."""
+    """Networks to train, their examples and their loss."""
 
     @property
     def trained(self) -> Any:
-        """The nnx filter of the trained weights; the others are frozen."""
+        """The nnx filter of the trained weights; all others are frozen."""
         ...
 
     @property
     def frozen_dtype(self) -> str:
-        """The dtype in which the frozen weights are stored."""
+        """The dtype of the frozen weights."""
         ...
 
     def networks(self, rngs: nnx.Rngs) -> nnx.Module:
@@ -56,29 +55,29 @@ class Task(Protocol):
         ...
 
     def examples(self) -> Any:
-        """Return the Grain transform from a shard's record to an example, a dict of arrays."""
+        """Return the Grain transform from a record to an example, a dict of arrays, or None."""
         ...
 
     def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
-        """Return the shapes of a batch of examples, to compile for before there is one."""
+        """Return the shapes of a batch of examples, for compilation without data."""
         ...
 
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " *keys"]:
-        """Return the random keys of each sample of a batch."""
+        """Return the random keys of each sample."""
         ...
 
     def loss(
         self, networks: Any, batch: Batch, keys: Key[Array, " *keys"]
     ) -> tuple[jax.Array, Metrics]:
-        """Return the mean loss over a batch, and further numbers to log."""
+        """Return the mean loss of a batch, and further metrics to log."""
         ...
 
     def validate(self, networks: Any, batch: Batch) -> Metrics:
-        """Return deterministic metrics of each sample, which depend on it and its `record` only."""
+        """Return deterministic metrics of each sample; they depend only on it and its `record`."""
         ...
 
     def flops(self, samples: int) -> float:
-        """Return the model FLOPs of an update on `samples` samples; NaN if they are unknown."""
+        """Return the model FLOPs of an update on `samples` samples; NaN if unknown."""
         ...
 
 
@@ -88,7 +87,7 @@ class Stage(NamedTuple):
     task: Task
     """Networks, examples and loss."""
     training: TrainConfig
-    """Hyper-parameters of its training."""
+    """Its hyper-parameters."""
 
 
 @no_type_check
@@ -104,9 +103,9 @@ class TrainState:
     opt_state: Any
     """State of the optax transformation."""
     grad_norm_ema: jax.Array
-    """Running geometric mean of the gradient norms, skipped updates excluded, float32; first 0."""
+    """Running geometric mean of gradient norms without skipped updates, float32; 0 at first."""
     consecutive_skips: jax.Array
-    """Number of updates skipped in a row, int32."""
+    """Number of consecutive skipped updates, int32."""
     ema_params: nnx.State | None
     """Exponential moving average of `params`; None without `ema_decay`."""
 
@@ -129,13 +128,13 @@ class TrainState:
         config: OptimizerConfig,
         optimizer: optax.GradientTransformation,
     ) -> TrainState:
-        """Return the state after an update by gradients of global norm `norm`."""
+        """Return the state after an update with gradients of global norm `norm`."""
         updates, opt_state = optimizer.update(gradients, self.opt_state, self.params)
         params: Any = optax.apply_updates(self.params, updates)
         ema_params: Any = self.ema_params
         if ema_params is not None and config.ema_decay is not None:
             ema_params = optax.incremental_update(params, ema_params, 1 - config.ema_decay)
-        # Geometric, so that a spike hardly moves the mean that it is compared with.
+        # A geometric mean: a spike hardly moves the mean that the guard compares it with.
         norm = jnp.maximum(norm, jnp.finfo(norm.dtype).tiny)
         mixed = self.grad_norm_ema**GRAD_NORM_DECAY * norm ** (1 - GRAD_NORM_DECAY)
         return TrainState(
@@ -148,42 +147,35 @@ class TrainState:
         )
 
     def skip_update(self) -> TrainState:
-        """Return the state after an update that changes no weight."""
+        """Return the state after a skipped update, which changes no weight."""
         return replace(self, step=self.step + 1, consecutive_skips=self.consecutive_skips + 1)
 
     @property
     def eval_params(self) -> nnx.State:
-        """Weights to validate and to keep: the moving average, if there is one."""
+        """Weights to validate and to export: the moving average, if there is one."""
         return self.params if self.ema_params is None else self.ema_params
 
 
 def make_update(
-    task: Task,
-    graph: nnx.GraphDef,
-    config: OptimizerConfig,
-    *,
-    steps: int,
-    seed: int,
-    grad_accum_steps: int = 1,
+    task: Task, graph: nnx.GraphDef, training: TrainConfig
 ) -> Callable[[TrainState, nnx.State, Batch], tuple[TrainState, Metrics]]:
     """Return the update, a function of state, frozen weights and batch.
 
-    Its randomness is a function of seed and step alone. With `grad_accum_steps` the batch is split
-    into so many parts, taken one after the other, which gives the same gradient. The update is
-    skipped if its loss or gradient norm is not finite, or if its gradient norm exceeds
-    `config.skip_grad_norm_factor` times the running mean.
+    Its randomness depends only on seed and step. `grad_accum_steps` parts of the batch are
+    processed one after the other and give the same gradient.
     """
-    optimizer = make_optimizer(config, steps)
+    config, optimizer = training.optimizer, make_optimizer(training.optimizer, training.steps)
 
     def update(state: TrainState, frozen: nnx.State, batch: Batch) -> tuple[TrainState, Metrics]:
         def loss(params: nnx.State, batch: Batch, keys: jax.Array) -> tuple[jax.Array, Metrics]:
             return task.loss(nnx.merge(graph, params, frozen), batch, keys)
 
-        key = jax.random.fold_in(jax.random.key(seed), state.step)
+        # Keys depend on the step, not on a saved key, so a resumed run repeats the noise.
+        key = jax.random.fold_in(jax.random.key(training.seed), state.step)
         keys = task.keys(key, next(iter(batch.values())).shape[0])
         gradient = jax.value_and_grad(loss, has_aux=True)
-        if grad_accum_steps > 1:
-            gradient = accumulate_gradients(gradient, grad_accum_steps)
+        if training.grad_accum_steps > 1:
+            gradient = accumulate_gradients(gradient, training.grad_accum_steps)
         (value, metrics), gradients = gradient(state.params, batch, keys)
 
         norm = optax.tree.norm(gradients)
@@ -192,6 +184,7 @@ def make_update(
             limit = config.skip_grad_norm_factor * state.grad_norm_ema
             valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
         changed = state.apply_gradients(gradients, norm, config, optimizer)
+        # `where` drops the NaNs of a bad update: the optimizer state stays finite, too.
         state = jax.tree.map(
             lambda new, old: jnp.where(valid, new, old), changed, state.skip_update()
         )
@@ -202,14 +195,15 @@ def make_update(
 
 
 def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[..., Any]:
-    """Return the mean of `gradient(params, batch, keys)` over parts of a batch, taken in turn.
+    """Return a function that averages `gradient(params, batch, keys)` over parts of a batch.
 
-    Part i has every `parts`-th sample from the i-th on, so that each device's samples stay on it.
+    Part i has samples i, i + `parts`, i + 2 `parts`, ...
     """
 
     def split(x: jax.Array) -> jax.Array:
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(split(jax.random.key_data(x)))
+        # Not "(k b)": with strided parts, no sample moves to another device.
         x = rearrange(x, "(b k) ... -> k b ...", k=parts)
         return constrain(x, (None, "batch", *[None] * (x.ndim - 2)))
 
@@ -227,21 +221,16 @@ def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[.
 
 
 def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
-    """Return the means over updates, fetched from the devices at once.
+    """Fetch the metrics of updates from the devices and return their means.
 
-    Skipped updates are only counted, as `skipped_updates`.
+    Skipped updates are counted as `skipped_updates` and excluded from the means.
     """
     fetched = jax.device_get(rows)
     kept = [row for row in fetched if not row["consecutive_skips"]]
     names = [name for name in fetched[0] if name != "consecutive_skips"]
-    metrics = {name: average(kept, name) for name in names if kept}
+    metrics = {name: float(np.mean([row[name] for row in kept])) for name in names if kept}
     skipped = len(fetched) - len(kept)
     return {**metrics, "skipped_updates": float(skipped)} if skipped else metrics
-
-
-def average(rows: Sequence[Mapping[str, np.ndarray]], name: str) -> float:
-    """Return the mean of one metric over rows."""
-    return float(np.mean([row[name] for row in rows]))
 
 
 def make_validation(
@@ -249,7 +238,7 @@ def make_validation(
 ) -> Callable[[nnx.State, nnx.State, Batch], Metrics]:
     """Return the validation, a function of trained weights, frozen weights and batch.
 
-    It returns the sums of the metrics by the samples' `weight`, and that of the weights.
+    It returns the sum of each metric under the samples' `weight`, and the sum of these weights.
     """
 
     def validate(params: nnx.State, frozen: nnx.State, batch: Batch) -> Metrics:
@@ -262,7 +251,7 @@ def make_validation(
 
 
 def mean_validation(rows: Iterable[Mapping[str, jax.Array]]) -> tuple[dict[str, float], int]:
-    """Return the means over the samples of all batches (`make_validation`), and their number."""
+    """Return the mean of each metric over the samples of all batches, and the number of samples."""
     fetched = [jax.device_get(row) for row in rows]
     totals = {name: sum(float(row[name]) for row in fetched) for name in fetched[0]}
     samples = totals.pop("weight")
@@ -273,25 +262,25 @@ def mean_validation(rows: Iterable[Mapping[str, jax.Array]]) -> tuple[dict[str, 
 class Programs:
     """The jitted update and validation of a task, with the shapes and shardings of their arguments.
 
-    Needs no weights and no data, and no devices either if the mesh is abstract.
+    Needs neither weights nor data; with an abstract mesh, no devices either.
     """
 
     graph: nnx.GraphDef
     """Graph of the task's networks."""
     create: Callable[..., TrainState]
-    """Function that returns the initial state, of random weights where none were loaded."""
+    """Return the initial state; weights that were not loaded are random."""
     state: TrainState
-    """Shapes of the state."""
+    """Shape and dtype of each array of the state."""
     state_sharding: Any
     """Shardings of the state."""
     frozen: Any
-    """Shapes of the frozen weights."""
+    """Shape and dtype of each frozen weight."""
     frozen_sharding: Any
     """Shardings of the frozen weights."""
     update: Any
-    """Jitted function of `make_update`, which donates the state."""
+    """Jitted update (`make_update`), which donates the state."""
     validate: Any
-    """Jitted function of `make_validation`."""
+    """Jitted validation (`make_validation`)."""
 
     @classmethod
     def of(cls, task: Task, training: TrainConfig, mesh: Mesh) -> Programs:
@@ -315,14 +304,6 @@ class Programs:
 
         state, placed = jax.eval_shape(create), batch_sharding(mesh)
         sharding, frozen_sharding = state_sharding(mesh, state), state_sharding(mesh, frozen)
-        update = make_update(
-            task,
-            graph,
-            training.optimizer,
-            steps=training.steps,
-            seed=training.seed,
-            grad_accum_steps=training.grad_accum_steps,
-        )
         return cls(
             graph=graph,
             create=create,
@@ -331,7 +312,7 @@ class Programs:
             frozen=frozen,
             frozen_sharding=frozen_sharding,
             update=jax.jit(
-                update,
+                make_update(task, graph, training),
                 in_shardings=(sharding, frozen_sharding, placed),
                 out_shardings=(sharding, None),
                 donate_argnums=0,

@@ -176,15 +176,15 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
     import jax
     from flax import nnx
 
-    from egosim_jax.train.config import OptimizerConfig
+    from egosim_jax.train.config import OptimizerConfig, TrainConfig
     from egosim_jax.train.tasks.denoising import Denoising
     from egosim_jax.train.update import TrainState, make_update
 
     task = Denoising(model=config)
     graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)
-    optimizer = OptimizerConfig(name="muon")
-    update = jax.jit(make_update(task, graph, optimizer, steps=steps, seed=0), donate_argnums=0)
-    state = TrainState.create(params, optimizer, steps)
+    training = TrainConfig(steps=steps, optimizer=OptimizerConfig(name="muon"))
+    update = jax.jit(make_update(task, graph, training), donate_argnums=0)
+    state = TrainState.create(params, training.optimizer, steps)
     with closing(make_loader(source, batch_size=BATCH, seed=0)) as batches:
         state, before = update(state, frozen, jax.device_put(next(batches)))
         jax.block_until_ready(state)

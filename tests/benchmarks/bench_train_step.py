@@ -118,7 +118,7 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     from egosim_jax.configs.model import Networks
     from egosim_jax.convert.tables import clip_vision, umt5, wan_dit
     from egosim_jax.io.weights import fill
-    from egosim_jax.train.config import OptimizerConfig
+    from egosim_jax.train.config import OptimizerConfig, TrainConfig
     from egosim_jax.train.tasks.denoising import Denoising, condition_of
     from egosim_jax.train.update import TrainState, make_update
     from tests.translation import translate
@@ -153,7 +153,8 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     graph, params, frozen = nnx.split(networks, task.trained, ...)
 
     optimizer = OptimizerConfig(name="muon", learning_rate=LEARNING_RATE)
-    update = jax.jit(make_update(task, graph, optimizer, steps=1, seed=0), donate_argnums=0)
+    training = TrainConfig(steps=1, optimizer=optimizer)
+    update = jax.jit(make_update(task, graph, training), donate_argnums=0)
     state = TrainState.create(params, optimizer, steps=1)
     placed = {name: jnp.asarray(array) for name, array in batch.items()}
 

@@ -78,7 +78,7 @@ class Adversarial(Refining):
         frames = jax.random.choice(
             draw, self.video.frames, (self.perceptual_frames,), replace=False
         )
-        decoded, loss, metrics = self.perceived(networks.vae, video, keys[0], frames)
+        decoded, loss, metrics = self.refinement_loss(networks.vae, video, keys[0], frames)
         real, fake = (x[:, frames].reshape(-1, *x.shape[2:]) for x in (video, decoded))
         graph, state = nnx.split(networks.critic)
         held = nnx.merge(graph, jax.lax.stop_gradient(state))

@@ -12,7 +12,7 @@ HOSTILE = "<script>alert(1)</script>"
 
 
 def write_stage(folder: Path, *, steps: int = 40, samples: tuple[int, ...] = ()) -> Path:
-    """Write the files of a training that is at its end."""
+    """Write the files of a finished training."""
     folder.mkdir(parents=True)
     lines = [
         {"step": step, "loss": 2 / step, "lr": 1e-3, "grad_norm": 0.5, "step_time_s": 0.25}

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def logged(out: Path) -> list[dict[str, float]]:
-    """Return the log of a run without timings; a last line that is cut off is omitted."""
+    """Return the log of a run without timings; an incomplete last line is omitted."""
     path = out / "metrics.jsonl"
     timings = ("step_time_s", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min")
     text = path.read_text("utf-8") if path.exists() else ""
@@ -66,7 +66,7 @@ class Run:
         return started
 
     def finish(self) -> None:
-        """Let it run to its end."""
+        """Run to the end."""
         codes = [process.wait(timeout=900) for process in self.start()]
         assert codes == [0] * self.processes, self.output()
 
@@ -88,11 +88,11 @@ class Run:
         return logged(self.out)
 
     def is_saving(self) -> bool:
-        """Return whether the processes that run now, or ran last, have an incomplete checkpoint."""
+        """Return True if the current or last processes have an incomplete checkpoint."""
         return bool(self._incomplete() - self._left)
 
     def _incomplete(self) -> set[tuple[str, int]]:
-        """Return names and inodes: those of an earlier kill are removed after the next start."""
+        """Return names and inodes; files of an earlier kill disappear after the next start."""
         found = set()
         for path in (self.out / "checkpoints").glob("*tmp*"):
             with contextlib.suppress(FileNotFoundError):

@@ -1,6 +1,6 @@
 """A line fitted to points: a task that compiles quickly, to test the loop around any task.
 
-As a program: OUT DATA and JSON of the fields of `TrainConfig`, with `hang` a step that never ends.
+As a program: OUT, DATA and JSON of `TrainConfig` fields; reading never ends at record `hang`.
 """
 
 import json
@@ -77,7 +77,7 @@ def write_points(
     factor: float = 1e30,
     unreadable: tuple[int, ...] = (),
 ) -> Path:
-    """Points of a line with some noise; the `huge` are far from it, the `unreadable` are NaN."""
+    """Write noisy points of a line; `huge` ones are far from it, `unreadable` ones are NaN."""
     rng = np.random.default_rng(0)
     kernel = rng.normal(size=(4, WIDTH))
     with ShardWriter(folder, kind="latents") as writer:

@@ -20,7 +20,7 @@ from egosim_jax.train.update import Programs
 
 
 def resident(name: str) -> int:
-    """Bytes that the kernel counts for this process: VmRSS now, VmHWM the most so far."""
+    """Bytes that the kernel counts for this process: VmRSS now, VmHWM at its peak."""
     lines = Path("/proc/self/status").read_text("utf-8").splitlines()
     (line,) = (line for line in lines if line.startswith(name))
     return int(line.split()[1]) * 1024

@@ -16,7 +16,7 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.sharding import batch_sharding, make_mesh, state_sharding
-from egosim_jax.train.config import OptimizerConfig
+from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import TrainState, make_update
 from egosim_jax.types import MeshConfig, VideoSpec
@@ -67,6 +67,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str, task: str = "
     chosen = TASKS[task]
     mesh = make_mesh(MeshConfig(data=data, fsdp=fsdp, context=context))
     config = OptimizerConfig(learning_rate=1e-3)
+    training = TrainConfig(steps=STEPS, optimizer=config, grad_accum_steps=parts)
 
     def create() -> TrainState:
         params = nnx.state(chosen.networks(nnx.Rngs(0)), nnx.Param)
@@ -98,7 +99,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str, task: str = "
         )
         value, gradients = gradient(state.params, put(0))
         update = jax.jit(
-            make_update(chosen, graph, config, steps=STEPS, seed=0, grad_accum_steps=parts),
+            make_update(chosen, graph, training),
             in_shardings=(sharding, None, placed),
             out_shardings=(sharding, None),
         )

@@ -29,7 +29,7 @@ DWM = dataclasses.replace(
     tokenizer=dataclasses.replace(SMALL.tokenizer, max_tokens=8),
     posterior="sampled",
 )
-"""`dwm_tabletop`, tiny, with all of the randomness of a training of DWM."""
+"""A tiny `dwm_tabletop` with all random draws of DWM's training."""
 TASKS = {
     "egosim": Denoising(model=MODEL, dropout=DROPOUT),
     "dwm": Denoising(model=DWM, dropout=DROPOUT, navigation=0.3),

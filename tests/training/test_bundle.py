@@ -1,4 +1,4 @@
-"""A bundle trains as the trainer does, where little is installed, and its weights come back."""
+"""A bundle trains like the trainer, with few packages, and its weights can be joined again."""
 
 import json
 import os
@@ -17,9 +17,9 @@ from egosim_jax.generation.generator import Generator
 from egosim_jax.io import parts
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.testing import write_latents, write_weights
-from egosim_jax.train import bundle, bundled
-from egosim_jax.train.bundle import write_bundle
-from egosim_jax.train.bundled import FILES, LATENTS, Latents, main
+from egosim_jax.train import bundle_writer
+from egosim_jax.train.bundle import FILES, LATENTS, BundleRecipe, Latents, main
+from egosim_jax.train.bundle_writer import write_bundle
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.loop import train
 from egosim_jax.train.recipes import TABLETOP
@@ -45,7 +45,7 @@ ABSENT = "grain tyro av open3d cv2 array_record ftfy tokenizers matplotlib huggi
 BARE = f"""
 import sys
 sys.modules.update(dict.fromkeys({ABSENT!r}.split()))
-from egosim_jax.train.bundled import main
+from egosim_jax.train.bundle import main
 import egosim_jax
 print(egosim_jax.__file__)
 sys.exit(main(sys.argv[1:]))
@@ -54,7 +54,7 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.fixture(scope="module")
 def latents(tmp_path_factory):
-    """Shards with one record five times, so that every batch is the same, exact in float16."""
+    """Shards with one record five times: every batch is the same, and exact in float16."""
     folder = tmp_path_factory.mktemp("latents")
     record = ShardReader(write_latents(folder / "any", MODEL, records=1))[0]
     arrays = {
@@ -85,7 +85,7 @@ def written(latents, weights, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(written, tmp_path_factory):
-    """Run folder of a training from the bundle that was not interrupted."""
+    """Run folder of an uninterrupted training from the bundle."""
     out = tmp_path_factory.mktemp("trained") / "run"
     assert main(["train", "--bundle", str(written), "--out", str(out)]) == ExitCode.DONE
     return out
@@ -158,13 +158,13 @@ def test_a_kill_between_checkpoint_and_weights_loses_neither(
 
 
 def test_a_wider_model_on_a_gpu_starts_from_random_weights(written):
-    recipe = bundled.BundleRecipe.read(written, "gpu", steps=7)
+    recipe = BundleRecipe.read(written, "gpu", steps=7)
     assert recipe.weights is None
-    assert recipe.task.model.dit.dim == bundle.WIDER["model"]["dit"]["dim"]
+    assert recipe.task.model.dit.dim == bundle_writer.WIDER["model"]["dit"]["dim"]
     assert recipe.training.steps == 7
     assert recipe.training.optimizer.name == "muon"  # as in the stage
     assert recipe.task.change_loss_weight == 2.0
-    same = bundled.BundleRecipe.read(written, "cpu")
+    same = BundleRecipe.read(written, "cpu")
     assert (same.task, same.training) == STAGE
 
 
@@ -180,7 +180,7 @@ def test_each_epoch_has_every_record_once_in_another_order(written, monkeypatch,
 
 def test_records_are_split_into_shards_of_limited_size(latents, weights, tmp_path, monkeypatch):
     record = sum(array.nbytes for array in ShardReader(latents)[0].arrays.values())
-    monkeypatch.setattr(bundle, "SHARD_BYTES", bundle.HEADER_BYTES + record)
+    monkeypatch.setattr(bundle_writer, "SHARD_BYTES", bundle_writer.HEADER_BYTES + record)
     data = {"train": latents, "test": latents}
     write_bundle(tmp_path / "b", STAGE, latents=data, weights=weights, dtype="float16")
     shards = sorted(path.name for path in (tmp_path / "b" / LATENTS).glob("train-*"))
@@ -203,7 +203,7 @@ def test_every_file_has_its_hash_and_no_code_is_missing(written):
     hashes = json.loads((written / FILES).read_text())["sha256"]
     files = {str(p.relative_to(written)) for p in written.rglob("*") if p.is_file()} - {FILES}
     assert hashes.keys() == files
-    assert {"egosim_jax/train/bundled.py", "recipe.json", "weights/dit.safetensors"} <= files
+    assert {"egosim_jax/train/bundle.py", "recipe.json", "weights/dit.safetensors"} <= files
 
 
 @pytest.mark.slow
@@ -220,7 +220,7 @@ def test_a_recipe_writes_its_clips_and_weights_into_a_bundle(weights, tmp_path):
     )
     assert recipe.train() == ExitCode.DONE
     assert [len(Latents(out, split)) for split in ("train", "test")] == [4, 1]
-    written = bundled.BundleRecipe.read(out, "cpu")
+    written = BundleRecipe.read(out, "cpu")
     assert (written.task, written.training) == recipe.stages()["denoiser"]
     assert written.weights == out / "weights"
     assert (tmp_path / "b_data" / "latents").is_dir()

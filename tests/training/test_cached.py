@@ -1,4 +1,4 @@
-"""Shards made of DWM's caches are those that encoding the videos makes."""
+"""Shards from DWM's caches equal shards from encoded videos."""
 
 import dataclasses
 

@@ -12,7 +12,7 @@ from flax import nnx
 
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.configs.model import Networks
-from egosim_jax.train.tasks.denoising import Denoising, drawn, loss_weights, without_hands
+from egosim_jax.train.tasks.denoising import Denoising, draw_latents, loss_weights, without_hands
 from egosim_jax.types import InputError
 from tests.training.run_tiny import MODEL
 
@@ -70,13 +70,13 @@ def test_drawn_latents_differ_by_stream_and_by_sample():
     names = ("target", "prior", "hands")
     batch = {name: jnp.zeros((2, 1, 1, 1, 16)) for name in names}
     batch |= {f"{name}_std": jnp.ones((2, 1, 1, 1, 16)) for name in names}
-    found = drawn(batch, jax.random.split(jax.random.key(0), 2))
+    found = draw_latents(batch, jax.random.split(jax.random.key(0), 2))
     rows = np.stack([found[name] for name in names]).reshape(6, 16)
     assert len({tuple(row) for row in rows}) == 6
 
 
 class Seen:
-    """Denoiser that keeps what it was given, and predicts 0."""
+    """Denoiser that keeps its inputs and predicts 0."""
 
     def prepare(self, condition, text, image=None):
         self.condition, self.image = condition, image
@@ -166,7 +166,7 @@ def test_a_lora_is_all_that_its_task_trains_and_the_rest_is_in_the_compute_dtype
 
 
 def test_tasks_and_update_import_no_reader_of_data_or_options():
-    """A bundle for a bare machine brings its own."""
+    """A bare machine lacks these packages; a bundle has its own reader."""
     heavy = ("array_record", "av", "cv2", "grain", "matplotlib", "open3d", "orbax", "PIL", "tyro")
     code = "import sys; from egosim_jax.train.tasks import autoencoding, denoising; "
     code += "from egosim_jax.train import update; print(*sys.modules)"

@@ -1,4 +1,4 @@
-"""Latents that are encoded once: whole, and the same however they were made."""
+"""Encoding to latents shards: complete, and the same after interruptions or on many processes."""
 
 import dataclasses
 import io
@@ -83,7 +83,7 @@ def encoded(source, weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file but what the run says of its machine."""
+    """Every file except the description of the machine."""
     return {
         path.name: path.read_bytes() for path in folder.iterdir() if path.name != "environment.json"
     }
@@ -323,7 +323,7 @@ def test_shards_that_do_not_name_the_packing_of_their_mask_are_refused(tmp_path)
 
 
 def test_the_command_goes_on_after_a_kill(weights, tmp_path):
-    """Killed when its first part is there."""
+    """Killed when its first part exists."""
     clips = write_clips(tmp_path / "clips", DEBUG.video, count=6, frames=13)
     fixed = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
 

@@ -1,4 +1,4 @@
-"""FLOPs: the known count of the 14B, what the compiler counts, and MFU from them."""
+"""FLOPs: the known count of the 14B, the compiler's count, and MFU."""
 
 import dataclasses
 

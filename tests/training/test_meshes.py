@@ -14,13 +14,13 @@ from tests.flags import devices
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 MESHES = [(1, 8, 1, 1), (4, 2, 1, 1), (1, 4, 2, 2), (2, 2, 2, 1)]
-"""Data, fsdp, context, and parts in which a batch is taken."""
+"""Sizes of data, fsdp and context, and number of gradient accumulation steps."""
 
 
 def run(
     mesh: tuple[int, int, int, int], out: Path, task: str = "egosim"
 ) -> tuple[dict[str, np.ndarray], str]:
-    """The numbers of a mesh, and what the compiler said."""
+    """Return the numbers of a mesh, and the output of the compiler."""
     command = [sys.executable, "-m", "tests.training.run_mesh", *map(str, mesh), str(out), task]
     environment = os.environ | devices(math.prod(mesh[:3]))
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""metrics.jsonl of runs that are started again."""
+"""metrics.jsonl of resumed runs."""
 
 import pytest
 

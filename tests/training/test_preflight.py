@@ -111,7 +111,7 @@ def test_an_option_of_the_report_is_refused_by_a_training(option, capsys):
 
 @pytest.fixture
 def room(monkeypatch):
-    """Compile nothing: what fits is what is said here, and what was tried can be read."""
+    """Compile nothing: the test says which settings fit, and gets the tried ones."""
     stage, target = recipes.DEBUG.stages()["denoiser"], targets.find("cpu:1")
     stage = stage._replace(training=replace(stage.training, batch_size=8))
     measured = module.compile_step(stage, target)

@@ -1,4 +1,4 @@
-"""Refining a VAE: its loss, what it trains, and its command."""
+"""Refining a VAE: loss, trained weights, command."""
 
 import sys
 from dataclasses import replace
@@ -16,7 +16,7 @@ from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.__main__ import main
 from egosim_jax.train.config import TrainConfig
-from egosim_jax.train.refining import RefineVAE
+from egosim_jax.train.refine_vae import RefineVAE
 from egosim_jax.train.tasks.autoencoding import Autoencoding
 from egosim_jax.train.tasks.refining import MOVING, Refining, motion_weights
 from egosim_jax.types import InputError, VideoSpec

@@ -1,4 +1,4 @@
-"""The page of a training run, of folders as `train` writes them."""
+"""The page of a training run, from folders like those that `train` writes."""
 
 import base64
 import io
@@ -24,7 +24,7 @@ def test_the_page_has_curves_samples_times_and_settings(tmp_path):
     page = write_page(run).read_text()
     assert "<h2>run: step 40 of 40</h2>" in page
     (curves,) = inline(page, r"image/svg\+xml")
-    assert curves.count(b'id="axes_') == 3  # loss with that of validations, lr, grad_norm
+    assert curves.count(b'id="axes_') == 3  # loss and validation loss, lr, grad_norm
     assert [Image.open(io.BytesIO(sheet)).size for sheet in inline(page, "image/jpeg")] == [
         (192, 80)
     ] * 2

@@ -1,4 +1,4 @@
-"""Sample clips of a training whose denoiser gets zeros as image tokens, as DWM-Wan's does."""
+"""Sample clips of a training whose denoiser gets zeros as image tokens, like DWM-Wan."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Training the video VAE from scratch: reconstruction, edges and a KL term.
+"""Training of the video VAE from scratch: reconstruction, edge and KL terms.
 
 For a clip x in [-1, 1] with moments mu, log s^2 and a sample z = mu + s e, e ~ N(0, 1), decoded
 to y, the loss is
@@ -6,9 +6,9 @@ to y, the loss is
     (y - x)^2 + edge_weight * (|dx/du - dy/du| over rows and columns)
               + kl_weight * KL(N(mu, s^2) || N(0, 1))
 
-each term a mean over its elements. The edge term keeps fingers and small objects, which the
-squared error alone blurs first. The encoder is trained on all three videos of a triplet (target,
-prior and hands), because all three are encoded later.
+Each term is a mean over its elements. The edge term keeps fingers and small objects, which the
+squared error alone blurs first. The VAE trains on target, prior and hands, because all three are
+encoded later.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ class Autoencoding:
     vae: VideoCodecConfig
     """Config of the VAE."""
     video: VideoSpec
-    """Frames of a crop, and the size of the videos that it is cut from."""
+    """Number of frames of a crop, and the size of the full videos."""
     crop: tuple[int, int] = (64, 64)
     """Rows and columns of a crop in pixels."""
     stream_probs: tuple[float, float, float] = (0.6, 0.25, 0.15)
-    """Probabilities that a crop is of the target, the prior and the hands."""
+    """Probabilities of a crop of the target, the prior and the hands."""
     edge_weight: float = 0.05
     """Weight of the edge term."""
     kl_weight: float = 5e-5
     """Weight of the KL term."""
 
     def __post_init__(self) -> None:
-        """Check that a crop fits into the video and that the VAE can encode it."""
+        """Raise `InputError` for a crop larger than the video, or one the VAE cannot encode."""
         for name, crop, size in zip(
             ("rows", "columns"), self.crop, (self.video.height, self.video.width), strict=True
         ):
@@ -72,7 +72,7 @@ class Autoencoding:
         return "float32"
 
     def examples(self) -> Any:
-        """Return the transform that cuts one random crop out of a record."""
+        """Return the transform that cuts a random crop out of a record."""
         from egosim_jax.data.transforms import RandomCrop
 
         return RandomCrop(self.video, self.crop, self.stream_probs)
@@ -83,7 +83,7 @@ class Autoencoding:
         return {"video": jax.ShapeDtypeStruct(shape, np.uint8)}
 
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " b"]:
-        """Return per-sample keys; the first one draws the noise for the batch."""
+        """Return a key per sample; the first one draws the noise of the batch."""
         others = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(1, batch))
         return jnp.concatenate([key[None], others])
 

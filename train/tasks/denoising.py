@@ -1,8 +1,8 @@
-"""Training the denoiser on cached latents, with its small encoders if the model trains them.
+"""Training of the denoiser on cached latents, and of its small encoders if the model trains them.
 
-The loss is the diffusion objective (`diffusion/objective.py`) under a condition from which prior,
-mask, hands and text are dropped at random (`conditioning/condition.py`). Latents may be drawn
-from their posteriors at each update (DWM; `conditioning/posterior.py`).
+The loss is the diffusion objective (`diffusion/objective.py`). Condition dropout removes prior,
+mask, hands and text at random (`conditioning/condition.py`). DWM draws the latents from their
+posteriors at each update (`conditioning/posterior.py`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError
 
 VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)
-"""Noise levels at which the validation loss is measured."""
+"""Noise levels of the validation loss."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class Denoising:
     """The task of training the denoiser."""
 
     model: ModelConfig
-    """The model whose denoiser is trained."""
+    """Model of the denoiser."""
     objective: Objective = field(default_factory=Objective)
     """Distribution and weighting of the noise levels."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
@@ -44,17 +44,17 @@ class Denoising:
     change_loss_weight: float = 0.0
     """Additional loss weight where the clip differs from its prior.
 
-    It differs at hands, at what they move and in unobserved regions, which cover little of a frame
-    and are all that has to be learned."""
+    It differs at hands, at moved objects and in unobserved regions. They cover little of a frame
+    and are all that there is to learn."""
     rank: int | None = None
-    """Rank of a LoRA, which is then trained instead of the weights; None: no LoRA."""
+    """Rank of a LoRA to train instead of the weights; None: no LoRA."""
     navigation: float = 0.0
-    """Rate of samples without hands whose target is the prior, so that the camera alone moves.
+    """Rate of samples without hands whose target is the prior: only the camera moves.
 
-    DWM's regularizer, on in none of its releases."""
+    This is DWM's regularizer, which no release of it uses."""
 
     def __post_init__(self) -> None:
-        """Check that a weight of changes, and navigation, have a prior to compare with."""
+        """Raise `InputError` for navigation or change weights without the inputs they need."""
         if not 0 <= self.navigation <= 1:
             raise InputError(
                 f"The rate of samples without hands must be in [0, 1], not {self.navigation}. "
@@ -62,7 +62,7 @@ class Denoising:
             )
         if self.navigation and not {"prior", "hands"} <= {*dict(self.model.layout.parts)}:
             raise InputError(
-                f"{self.model.name} has no prior or no hands, so that it cannot be trained to move "
+                f"{self.model.name} has no prior or no hands, so it cannot be trained to move "
                 "the camera alone: omit the rate of such samples. (--navigation)"
             )
         if self.change_loss_weight and "prior" not in self.model.layout:
@@ -73,7 +73,7 @@ class Denoising:
 
     @property
     def trained(self) -> Any:
-        """The nnx filter of all weights, or of those of the LoRA."""
+        """The nnx filter of the trained weights: all, or the LoRA."""
         return nnx.Param if self.rank is None else lora.trained(self.model.dit.also_train)
 
     @property
@@ -96,7 +96,7 @@ class Denoising:
         return networks
 
     def examples(self) -> None:
-        """Return no transform: a latents record is an example."""
+        """Return None, the identity: a latents record is an example."""
 
     def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
         """Return the shapes of a batch of latents records."""
@@ -105,7 +105,7 @@ class Denoising:
         return example_shapes(self.model, batch)
 
     def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, "b 2"]:
-        """Return two keys per sample: of its condition dropout and of its noise."""
+        """Return two keys per sample: one for condition dropout, one for noise."""
         drop, draw = jax.random.split(key)
         return jnp.stack([jax.random.split(drop, batch), jax.random.split(draw, batch)], axis=1)
 
@@ -114,7 +114,7 @@ class Denoising:
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout."""
         if self.model.posterior == "sampled":
-            batch = drawn(batch, keys[:, 1])
+            batch = draw_latents(batch, keys[:, 1])
         if self.navigation:
             batch = without_hands(batch, keys[:, 0], self.navigation)
         condition = condition_of(networks, batch, self.model)
@@ -128,7 +128,7 @@ class Denoising:
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return each sample's errors at fixed noise levels, under the full condition.
 
-        The noise is fixed by the number of the record, in whatever batch it is.
+        The record number alone seeds the noise, so the batch size has no effect.
         """
         target = batch["target"]
         condition = condition_of(networks, batch, self.model)
@@ -144,22 +144,22 @@ class Denoising:
         return {"loss": jnp.stack(list(errors.values())).mean(axis=0), **errors}
 
     def flops(self, samples: int) -> float:
-        """Return the model FLOPs of an update, of the denoiser only, which has nearly all."""
+        """Return the model FLOPs of an update, of the denoiser alone, which has nearly all."""
         model = self.model
         forward = model.dit.forward_flops(
             latents=model.latent_shape,
             text=model.tokenizer.max_tokens,
             image=model.image_tokens,
         )
-        # Backward: gradients of activations and of weights; those of a LoRA's weights cost little.
+        # Forward, then gradients of activations and of weights; a LoRA's weights cost little.
         weights = 3 if self.rank is None else 2
         return samples * (weights * forward.weights + 3 * forward.attention)
 
 
-def drawn(batch: Batch, keys: Key[Array, " b"]) -> Batch:
-    """Return a batch with latents drawn from the posteriors whose deviations it has."""
+def draw_latents(batch: Batch, keys: Key[Array, " b"]) -> Batch:
+    """Return a batch with latents drawn from their posteriors."""
     latents = {}
-    # From 2 on: `split(key)`, by which the objective draws its noise, is `fold_in` of 0 and 1.
+    # Count from 2: the objective's `split(key)` gives the same keys as `fold_in` of 0 and 1.
     for number, name in enumerate(("target", "prior", "hands"), start=2):
         if name in batch:
             own = jax.vmap(jax.random.fold_in, (0, None))(keys, number)
@@ -168,7 +168,7 @@ def drawn(batch: Batch, keys: Key[Array, " b"]) -> Batch:
 
 
 def without_hands(batch: Batch, keys: Key[Array, " b"], rate: float) -> Batch:
-    """Return a batch of which a share of samples has no hands and the prior as target."""
+    """Return a batch in which samples at `rate` have no hands and the prior as target."""
     own = jax.vmap(jax.random.fold_in, (0, None))(keys, 1)
     where = (jax.vmap(jax.random.uniform)(own) < rate)[:, None, None, None, None]
     return {
@@ -179,7 +179,7 @@ def without_hands(batch: Batch, keys: Key[Array, " b"], rate: float) -> Batch:
 
 
 def condition_of(networks: Networks, batch: Batch, model: ModelConfig) -> Condition:
-    """Return the condition of a batch of latents records, encoded by the networks in training."""
+    """Return the condition of a batch of latents records, encoded by the trained networks."""
     zeros = model.zero_image(len(batch["target"]))
     image = {} if zeros is None else {"image": jnp.asarray(zeros)}
     return encode_condition(networks, {**image, **batch})
@@ -190,8 +190,8 @@ def loss_weights(
 ) -> Float[Array, "b f h w 1"]:
     """Return the loss weight of each location, with mean 1 over a sample.
 
-    Before the division by its mean it is 1 + change * min(d, 1), with d the mean squared difference
-    of the latents, whose channels have a standard deviation of 1.
+    Before normalization it is 1 + change * min(d, 1). d is the mean squared difference of the
+    latents, whose channels have standard deviation 1.
     """
     difference = jnp.square(target - prior).mean(axis=-1, keepdims=True)
     weight = 1 + change * jnp.minimum(difference, 1)

@@ -1,17 +1,17 @@
-"""Training a video VAE further, with a term that compares as eyes do and more weight on motion.
+"""Refinement of a trained video VAE, with a perceptual term and more weight on motion.
 
-LPIPS (`evaluation/metrics/lpips.py`, AlexNet) is added to the loss of `autoencoding` between some
-frames of the crop and of its reconstruction:
+The loss of `autoencoding` gets a term of LPIPS (`evaluation/metrics/lpips.py`, AlexNet) between
+some frames of the crop and their reconstructions:
 
     perceptual_weight * mean over frames of LPIPS(y_t, x_t)
 
-The squared error is smallest for the mean of all that a latent cell may stand for, which is a
-blur; LPIPS is smaller for any one of them. The decoder can be trained alone, which leaves the
-latents as they are, and with them denoisers that were trained on them.
+A latent cell allows many images. The squared error is smallest for their mean, which is a blur;
+LPIPS is smaller for any single one. Training the decoder alone keeps the latents, so denoisers
+that were trained on them stay valid.
 
-Hands and what they carry cover little of a frame and are the hardest to reconstruct: a latent cell
-stands for four frames, in which they have moved on. The squared error may therefore weight places
-by their motion, the variance v of their colors over the frames of the crop:
+Hands and carried objects cover little of a frame and are the hardest to reconstruct: they move
+during the four frames of a latent cell. The squared error can weight each location by its motion,
+the variance v of its color over the frames of the crop:
 
     1 + motion_weight * min(v / MOVING, 1),   divided by its mean over the crop
 """
@@ -34,49 +34,49 @@ from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError
 
 Part = Literal["all", "decoder"]
-"""Weights of a VAE that are trained."""
+"""Trained part of a VAE."""
 DECODER = ("decoder", "from_latents")
 """Modules that decode latents."""
 MOVING = 0.02
-"""Variance over time of the colors, in [-1, 1], of a place that counts as fully moving."""
-SMALLEST = 32
-"""Fewest rows and columns of a crop of which AlexNet's last layers see anything."""
+"""Variance over time of colors in [-1, 1] from which a location counts as fully moving."""
+MIN_CROP = 32
+"""Minimum rows and columns of a crop for AlexNet, whose last layers would be empty."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refining(Autoencoding):
-    """The task of training the VAE of a weights folder further."""
+    """The task of refining a trained VAE."""
 
     perceptual_weight: float = 0.1
     """Weight of the perceptual term; above 0 it needs egosim-jax[metrics]."""
     perceptual_frames: int = 4
-    """Frames of a crop that the perceptual term compares, drawn at random."""
+    """Number of random frames of a crop that the perceptual term compares."""
     motion_weight: float = 0.0
-    """Additional weight of the squared error where something moves."""
+    """Additional weight of the squared error at motion."""
     part: Part = "all"
-    """Weights that are trained; decoder: the latents stay as they are."""
+    """Trained part; decoder: the latents do not change."""
 
     def __post_init__(self) -> None:
-        """Check what the perceptual term compares, too."""
+        """Also raise `InputError` for crops or frames that LPIPS cannot compare."""
         super().__post_init__()
-        if self.perceptual_weight and min(self.crop) < SMALLEST:
+        if self.perceptual_weight and min(self.crop) < MIN_CROP:
             raise InputError(
                 f"A crop of {self.crop[0]} x {self.crop[1]} pixels is too small for LPIPS: it must "
-                f"have at least {SMALLEST} rows and columns, or --perceptual-weight be 0. (--crop)"
+                f"have at least {MIN_CROP} rows and columns, or --perceptual-weight be 0. (--crop)"
             )
         if not 0 < self.perceptual_frames <= self.video.frames:
             raise InputError(
-                f"The perceptual term must compare 1 to {self.video.frames} frames, which a crop "
-                f"has, not {self.perceptual_frames}. (--perceptual-frames)"
+                f"The perceptual term must compare 1 to {self.video.frames} frames, all of a crop, "
+                f"not {self.perceptual_frames}. (--perceptual-frames)"
             )
 
     def networks(self, rngs: nnx.Rngs) -> Networks:
-        """Return the VAE with random weights, under its name."""
+        """Return the VAE with random weights, as the only network of a model."""
         return Networks(vae=super().networks(rngs))
 
     @property
     def trained(self) -> Any:
-        """The nnx filter of all weights, or of those of the decoder."""
+        """The nnx filter of the trained weights: all, or the decoder."""
         if self.part == "all":
             return nnx.Param
         return lambda path, value: isinstance(value, nnx.Param) and path[1] in DECODER
@@ -89,7 +89,9 @@ class Refining(Autoencoding):
         frames = jax.random.choice(
             draw, self.video.frames, (self.perceptual_frames,), replace=False
         )
-        _, loss, metrics = self.perceived(networks.vae, to_model(batch["video"]), keys[0], frames)
+        _, loss, metrics = self.refinement_loss(
+            networks.vae, to_model(batch["video"]), keys[0], frames
+        )
         return loss, metrics
 
     def squared_error(
@@ -100,14 +102,14 @@ class Refining(Autoencoding):
             return super().squared_error(decoded, video)
         return (motion_weights(video, self.motion_weight) * jnp.square(decoded - video)).mean()
 
-    def perceived(
+    def refinement_loss(
         self,
         vae: Any,
         video: Float[Array, "b f h w 3"],
         key: Key[Array, ""],
         frames: Int[Array, " n"],
     ) -> tuple[Float[Array, "b f h w 3"], jax.Array, Metrics]:
-        """Return what `reconstruct` does, with the perceptual term of some frames in the loss."""
+        """Return the output of `reconstruct`; the loss also has LPIPS of the given frames."""
         decoded, loss, metrics = self.reconstruct(vae, video, key)
         if self.perceptual_weight:
             metrics["lpips"] = _lpips(decoded[:, frames], video[:, frames]).mean()
@@ -115,7 +117,7 @@ class Refining(Autoencoding):
         return decoded, loss, metrics
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
-        """Return PSNR and LPIPS of each clip's reconstruction from the mean latents."""
+        """Return PSNR and LPIPS of each clip, reconstructed from the mean latents."""
         vae: Any = networks.vae
         metrics = super().validate(vae, batch)
         if self.perceptual_weight:
@@ -127,7 +129,7 @@ class Refining(Autoencoding):
 
 
 def motion_weights(video: Float[Array, "b f h w 3"], weight: float) -> Float[Array, "b 1 h w 1"]:
-    """Return the weight of each place of a video, with mean 1: more where something moves."""
+    """Return the weight of each location of a video, with mean 1: higher at motion."""
     variance = video.var(axis=1, keepdims=True).mean(axis=-1, keepdims=True)
     weights = 1 + weight * jnp.minimum(variance / MOVING, 1)
     return weights / weights.mean(axis=(2, 3), keepdims=True)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egosim_jax.train import rollout_states
+from egosim_jax.train import from_tabletop
+from egosim_jax.train.from_tabletop import OwnRollouts
 from egosim_jax.train.recipes import TABLETOP
-from egosim_jax.train.rollout_states import OwnRollouts
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, state_after, to_episode
 
@@ -23,7 +23,7 @@ def clips():
 
 def states_of(clips, monkeypatch, generate, perception) -> list[Any]:
     monkeypatch.setattr(
-        rollout_states, "load_generator", lambda config, weights: (generate, SPEC.fps)
+        from_tabletop, "load_generator", lambda config, weights: (generate, SPEC.fps)
     )
     make = OwnRollouts(config="tiny", weights=Path(), digests={}, perceptions=(perception,))
     return list(make(clips))

@@ -1,4 +1,4 @@
-"""Base class of the recipes: a training that one command runs, or compiles for a preflight."""
+"""The interface of a recipe: a training that one command runs, or compiles for a preflight."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ class Recipe(ABC):
     preflight: str | None = None
     """Machine to compile for instead of training, such as h200:8, v5p:2x2x2 or cpu:1.
 
-    It need not be present. Reports whether each stage's update fits, and needs no other option."""
+    The machine can be absent. Reports whether each stage's update fits; needs no other option."""
     json: bool = False
     """With --preflight: print JSON."""
     search: bool = True
-    """With --preflight: also compile other settings for the same batch, which takes minutes."""
+    """With --preflight: also compile other settings for the same batch size; takes minutes."""
 
     def run(self) -> int:
         """Train, or run the preflight, and return the exit code."""
         if self.preflight is None:
-            for option, given in {"--json": self.json, "--no-search": not self.search}.items():
-                if given:
+            for option, is_given in {"--json": self.json, "--no-search": not self.search}.items():
+                if is_given:
                     raise InputError(
-                        f"{option} has no effect without --preflight: give it, or leave this out."
+                        f"{option} has no effect without --preflight: add it, or omit {option}."
                     )
             for stage in self.stages().values():
                 stage.training.check_packages()
@@ -46,7 +46,7 @@ class Recipe(ABC):
         return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
 
     def require(self, *names: str) -> list[Path]:
-        """Return paths that only a training needs. Raises `InputError` if one is not given."""
+        """Return paths that only training needs. Raises `InputError` if one is not given."""
         if missing := [name for name in names if getattr(self, name) is None]:
             options = ", ".join(f"--{name}" for name in missing)
             raise InputError(f"Missing {options}: required to train. Only --preflight needs none.")
@@ -58,4 +58,4 @@ class Recipe(ABC):
 
     @abstractmethod
     def stages(self) -> Mapping[str, Stage]:
-        """Return the trainings by the names of the recipe's options."""
+        """Return the trainings by the names of the fields that configure them."""

@@ -1,9 +1,9 @@
-"""Clips to train and to validate on, of metadata with and without a split."""
+"""Training and validation clips of metadata with and without a split."""
 
 import pytest
 
 from egosim_jax.data.metadata import read_metadata
-from egosim_jax.train.from_scratch import of_split
+from egosim_jax.train.from_scratch import select_split
 from egosim_jax.types import InputError
 
 
@@ -28,29 +28,31 @@ def named(items):
 
 def test_splits_that_are_given_are_kept(read):
     items = read("test", "train", "train", "test")
-    assert named(of_split(items, "train")) == ["clip1", "clip2"]
-    assert named(of_split(items, "test")) == ["clip0", "clip3"]
+    assert named(select_split(items, "train")) == ["clip1", "clip2"]
+    assert named(select_split(items, "test")) == ["clip0", "clip3"]
 
 
 @pytest.mark.parametrize("split", ["train", None])
 def test_every_eighth_clip_is_held_out(read, split, capsys):
     items = read(*[split] * 17)
-    assert named(of_split(items, "test")) == ["clip7", "clip15"]
+    assert named(select_split(items, "test")) == ["clip7", "clip15"]
     assert "2 of 17 are held out" in capsys.readouterr().out
-    assert named(of_split(items, "train")) == [f"clip{n}" for n in range(17) if n not in (7, 15)]
+    assert named(select_split(items, "train")) == [
+        f"clip{n}" for n in range(17) if n not in (7, 15)
+    ]
 
 
 def test_of_few_clips_the_last_is_held_out(read):
     items = read("train", "train", "train")
-    assert named(of_split(items, "test")) == ["clip2"]
-    assert named(of_split(items, "train")) == ["clip0", "clip1"]
+    assert named(select_split(items, "test")) == ["clip2"]
+    assert named(select_split(items, "train")) == ["clip0", "clip1"]
 
 
 def test_one_clip_is_refused(read):
     with pytest.raises(InputError, match=r"one clip: .* validate"):
-        of_split(read("train"), "train")
+        select_split(read("train"), "train")
 
 
 def test_other_splits_are_refused(read):
     with pytest.raises(InputError, match="No clip has split=test; split is one of: train, val"):
-        of_split(read("train", "val"), "test")
+        select_split(read("train", "val"), "test")

@@ -11,13 +11,13 @@ from egosim_jax.io import weights
 from egosim_jax.io.weights import WeightsError
 from egosim_jax.models import abstract
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.train.wider import with_decoder_of
+from egosim_jax.train.refine_vae import widen_decoder
 
 NARROW = WanVAEConfig(
     dim=4, dim_mult=(1, 2, 3, 5), res_blocks=1, latent_mean=(0.0,) * 16, latent_std=(1.0,) * 16
 )
 ERROR = 2e-5
-"""Largest relative difference of float32 videos, whose sums are in another order."""
+"""Maximum relative difference of float32 videos, whose sums have another order."""
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def narrow(tmp_path):
 def load_wide(folder, out, *, decoder_dim):
     config = replace(NARROW, decoder_dim=decoder_dim)
     vae = abstract(config)
-    weights.load(with_decoder_of(config, folder, out) / "vae.safetensors", vae)
+    weights.load(widen_decoder(config, folder, out) / "vae.safetensors", vae)
     return vae
 
 
@@ -60,10 +60,10 @@ def test_every_new_channel_is_trained(narrow, tmp_path):
 
 def test_weights_of_the_same_width_are_used_as_they_are(narrow, tmp_path):
     _, folder = narrow
-    assert with_decoder_of(NARROW, folder, tmp_path / "wide") == folder
+    assert widen_decoder(NARROW, folder, tmp_path / "wide") == folder
 
 
 def test_another_encoder_is_refused(narrow, tmp_path):
     _, folder = narrow
     with pytest.raises(WeightsError, match=r"encoder"):
-        with_decoder_of(replace(NARROW, dim=6, decoder_dim=6), folder, tmp_path / "wide")
+        widen_decoder(replace(NARROW, dim=6, decoder_dim=6), folder, tmp_path / "wide")
