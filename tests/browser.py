@@ -1,4 +1,4 @@
-"""Pages in headless Chromium, driven through its DevTools protocol, and that of `egosim play`."""
+"""Pages in headless Chromium by its DevTools protocol, and the page of `egosim play`."""
 
 import base64
 import io

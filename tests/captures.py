@@ -34,7 +34,7 @@ class World:
         self.video[:, :8, :8] = (10 + 20 * np.arange(frames))[:, None, None, None]
 
     def render_plane(self):
-        """Make the video that of a textured plane through the origin, as the cameras see it."""
+        """Make the video show a textured plane through the origin, as the cameras see it."""
         texture = np.random.default_rng(1).integers(0, 256, (128, 128, 3)).astype(np.uint8)
         texture = cv2.resize(texture, (1024, 1024), interpolation=cv2.INTER_CUBIC)
         plane_from_texture = np.array([[2 / 1024, 0, -1], [0, -2 / 1024, 1], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""XLA's flags in the tests, where compiling takes longer than what is compiled."""
+"""XLA's flags in the tests, where compiling takes longer than running."""
 
 from importlib.metadata import version
 

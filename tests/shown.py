@@ -1,4 +1,4 @@
-"""Networks without layers, by which a generated clip shows one of its conditions."""
+"""Networks without layers, so that a generated clip shows one of its conditions."""
 
 from dataclasses import replace
 

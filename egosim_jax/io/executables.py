@@ -35,7 +35,7 @@ TRACED = (
     "generation/encoding.py", "generation/generator.py", "generation/stream.py", "models",
     "sharding.py", "types",
 )  # fmt: skip
-"""Modules that run while a function is traced, and so determine what is compiled."""
+"""Modules that run while a function is traced, and so determine the compiled program."""
 FOLDER, MAX_FILES = "executables", 64
 """Name of the cache, and its maximum number of compiled functions."""
 JAX_FOLDER, JAX_MAX_FILES = "jax", 1024

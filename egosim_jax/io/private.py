@@ -1,9 +1,9 @@
-"""Caches of native code: what is loaded runs, so only its user may have written it.
+"""Caches of native code. A loaded file runs, so only its user may have written it.
 
 A cache is a folder `~/.cache/egosim_jax/NAME` (`XDG_CACHE_HOME/egosim_jax/NAME` if that is set to
 an absolute path) that belongs to the user, that nobody else can read or write and that is no link.
-`PrivateCache` opens a file first; owner, mode, links and checksum are then those of what was
-opened. Whatever is wrong is said in a warning, and the file is made again. `private_folder` is for
+`PrivateCache` opens a file first, and then checks owner, mode, links and checksum of the open file.
+A bad file causes a warning and is made again. `private_folder` is for
 a library that reads and writes its files itself.
 """
 
@@ -144,7 +144,7 @@ def _file_problem(found: os.stat_result) -> str | None:
 
 
 def _origin_problem(found: os.stat_result) -> str | None:
-    """Return the reason to think that another user wrote a file; None if there is none."""
+    """Return the reason to think that another user wrote a file, or None."""
     if not stat.S_ISREG(found.st_mode):
         return "it is not a regular file"
     if found.st_uid != os.getuid():

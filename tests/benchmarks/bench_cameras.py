@@ -9,7 +9,7 @@ other one is printed as WRONG, and so is a focal length that is off by a tenth o
 
 At the end thresholds are set on half of the clips and tried on the other half. A reconstruction is
 right if its clip has a right one and its focal length is the device's. The threshold of each figure
-is `--margin` times the worst of the right ones in the half; those of the view are not set by data.
+is `--margin` times the worst of the right ones in the half; thresholds of the view are fixed.
 The second command does this with verdicts of an earlier run.
 """
 
@@ -34,7 +34,7 @@ from egosim_jax.perception.estimates import CameraEstimate, Rung
 
 @dataclass(frozen=True)
 class Clip:
-    """Video, masks and what is known of its camera."""
+    """Video, masks and the known parts of its camera."""
 
     folder: str
     hands: str | None
@@ -91,7 +91,7 @@ def main(
     margin: float = 2.0,
     verdicts: Annotated[Path | None, tyro.conf.arg(help="Figures of an earlier run.")] = None,
 ) -> None:
-    """Estimate the cameras of each clip and compare the verdicts with what is right.
+    """Estimate the cameras of each clip and compare the verdicts with the ground truth.
 
     Args:
         folder: With the real clips.

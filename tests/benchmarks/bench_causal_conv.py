@@ -1,6 +1,6 @@
 """Times the forms of the causal convolution: `python -m tests.benchmarks.bench_causal_conv`.
 
-`convolve` takes `by_image` on a CPU and `direct` elsewhere. The shapes are those of a video VAE
+`convolve` takes `by_image` on a CPU and `direct` elsewhere. The shapes occur in a video VAE
 of width 24 on two clips of 17 frames, 64 x 64, from full resolution down, and its two ends.
 """
 

@@ -75,7 +75,7 @@ def main(seed: int = 0) -> None:
 
 def measure(program: Program, frames: Frames) -> Figures:
     """Fuse and render with one program."""
-    import open3d  # noqa: F401  (importing it is not what is timed)
+    import open3d  # noqa: F401  (its import is not timed)
 
     fuse, render = {"ours": (_fuse, _render), "Open3D": (_fuse_plainly, _render_plainly)}[program]
     Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # forget the most so far

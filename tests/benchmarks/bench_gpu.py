@@ -6,7 +6,7 @@
     python -m tests.benchmarks.bench_gpu clip
 
 All of it at full width and with 24,960 tokens, on random weights. TFLOP/s and MFU count what the
-model needs (`forward_flops` of its config), not what is computed again. `--profile` says where the
+model needs (`forward_flops` of its config), without recomputation. `--profile` says where the
 time of the last case went, kernel by kernel. The memory that was taken is compared with what the
 program was compiled to take.
 """
@@ -220,7 +220,7 @@ def _measure(
 ) -> Iterator[dict[str, Any]]:
     """Compile for shapes, then draw arguments of these shapes and run; `make` makes the first.
 
-    What is made is given away at each run, and comes back as the first result.
+    Each run donates the array, and gets it back as the first result.
     """
     traced = run.trace(*args)
     if options.target is not None:
@@ -302,8 +302,8 @@ def _half(params: Any) -> Any:
 def _draw(shapes: Any) -> Any:
     """Random arrays of these shapes; zeros would be multiplied faster.
 
-    What is a weight is as large as weights are, and data have a deviation of 1: on smaller numbers
-    a GPU takes less power, and is faster.
+    Weights have the scale of trained weights, and data have a deviation of 1: on smaller numbers a
+    GPU takes less power, and is faster.
     """
     paths, tree = jax.tree.flatten_with_path(shapes)
     drawn = []

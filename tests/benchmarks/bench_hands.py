@@ -38,7 +38,7 @@ HUMAN = SKELETONS["human"]
 FINGERS = np.stack([HUMAN.colors[4 * finger + 1] for finger in range(5)]).astype(np.float32)
 PALETTE = FINGERS * 255 / FINGERS.max(-1, keepdims=True)
 JOINTS = [[1, 2, 3, 4], [5, 6, 7, 8], [0, 9, 10, 11, 12], [13, 14, 15, 16], [17, 18, 19, 20]]
-"""Joints that have the color of each finger: the wrist has that of the middle one."""
+"""Joints that have the color of each finger: the wrist has the color of the middle finger."""
 GRID = [
     TrackConfig(side=side, missing=missing, palm=palm)
     for side, missing, palm in product((0.25, 0.5, 1.0), (2.5, 3.5, 5.0), (0.25, 0.5, 1.0))

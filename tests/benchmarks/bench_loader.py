@@ -2,8 +2,8 @@
 
 Samples a second, in batches of 8, of two kinds of shards:
 
-    videos    files as mp4, of which a window of 17 frames of 160 x 96 is decoded: target, prior,
-              hands, mask, and the first frame
+    videos    mp4 files; a window of 17 frames of 160 x 96 is decoded: target, prior, hands, mask,
+              and the first frame
     latents   arrays that are read as they are, a training step's input
 
 Theirs is a `DataLoader` over the same reader with the same transform, and with as many worker

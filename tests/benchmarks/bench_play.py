@@ -37,7 +37,7 @@ WIDTH = 880
 EMPTY = 0.2
 """Share of the page, on the left, that the scene leaves empty and the recording lacks."""
 DISMISS = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
-"""Script that closes notifications, as that of a browser without a GPU."""
+"""Script that closes notifications, such as the one about a browser without a GPU."""
 
 
 def make_clip(page, button):

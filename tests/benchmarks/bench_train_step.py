@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig
 
 GOAL, BAR = 1.0, 1.25
-"""Ratio of times, ours to theirs: what is aimed at, and what must not be exceeded."""
+"""Ratio of times, ours to theirs: the goal, and the maximum."""
 BATCH = 8
 LEARNING_RATE = 2e-3
 LOSS, LATER = 1e-4, 1e-2
@@ -75,7 +75,7 @@ def main(pairs: int = 9, threads: int = THREADS) -> None:
     wall = median(theirs.wall for _, theirs in times)
     print(
         f"step on {threads} threads: ours {median(ours.wall for ours, _ in times):.2f} s, "
-        f"torch {wall:.2f} s (of which the update {median(theirs.updating):.2f} s), "
+        f"torch {wall:.2f} s (the update alone {median(theirs.updating):.2f} s), "
         f"ratio {ratio:.3f} [{ratios[low]:.3f}, {ratios[high]:.3f}] "
         f"({level:.1%}, {pairs} pairs), of processor seconds "
         f"{median(ours.processor / theirs.processor for ours, theirs in times):.3f}; "

@@ -49,7 +49,7 @@ from tests.benchmarks.routing import Routing
 
 SHIPPED = Path(__file__).parents[2] / "egosim_jax" / "weights" / "tabletop"
 PROBE = 6
-"""Updates by which a variant's seconds are measured; the first two do not count."""
+"""Number of updates that are timed for a variant; the first two do not count."""
 FIRST_SCENE = 100
 """Seed of the first held-out scene."""
 
@@ -293,7 +293,7 @@ class Judge:
         return self.score(self.model, Networks.load(self.model, weights))
 
     def __call__(self, trained: Trained) -> dict[str, float]:
-        """Return the scores of a trained variant, the other networks being those of the start."""
+        """Return the scores of a trained variant, with the other networks as at the start."""
         if not self.clips:
             return {}
         parts = trained.networks.parts()

@@ -1,7 +1,7 @@
 """Commands that are killed at random times and run again, until what they write is complete.
 
-What is written is then compared, byte for byte, with what one run without a kill writes. Only what
-says when, or by which process, something was written is skipped: `IGNORED` and `TIMED`.
+The files are then compared, byte for byte, with the files of a run without a kill. Only times and
+process numbers are skipped: `IGNORED` and `TIMED`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ COMMANDS = {
     "--training.batch-size 2 --training.log-every 1 --training.save-every 2",
     "convert": "egosim_jax.convert weights ../torch --config debug",
 }
-"""Each without its `--out out`; run in a folder next to those of `INPUTS`."""
+"""Each without its `--out out`; run in a folder next to the folders of `INPUTS`."""
 WEIGHTS = "from egosim_jax import configs, testing; from pathlib import Path; "
 WEIGHTS += "testing.write_weights(Path('weights'), configs.get('debug'))"
 INPUTS = {
@@ -94,7 +94,7 @@ def kill_often(name: str, folder: Path, *, kills: int, seed: int) -> Tally:
     """Kill a command so many times; several times in each trial, whose end is compared."""
     chance = random.Random(f"{seed} {name}")
     arguments = ["-m", *COMMANDS[name].split(), "--out", "out"]
-    _finish(arguments, folder / f"{name}_warm")  # compiles what is kept
+    _finish(arguments, folder / f"{name}_warm")  # fills the compile cache
     then = time.monotonic()
     wanted = _finish(arguments, folder / f"{name}_reference")
     tally = Tally(name, time.monotonic() - then)

@@ -90,7 +90,7 @@ def check(name: str, work: Path, *, seed: int = 0, most: int | None = None) -> R
                 raise AssertionError("it failed by itself")
             _check_kept(before, forked(lambda: dict(writer.read(place)), work), after)
             again = forked(write_again, work)
-            _check_same("what is read", after, again)
+            _check_same("the contents read", after, again)
             _check_same("files", wanted, files(place, writer))
         except AssertionError as error:
             report.failures.append(f"{where}: {error}")
@@ -121,7 +121,7 @@ def forked(function: Callable[[], Any], work: Path) -> Any:
     result.parent.mkdir(parents=True, exist_ok=True)
     outcome = watch(lambda: result.write_text(json.dumps(function()), "utf-8"), work / "nowhere")
     if outcome.code:
-        raise AssertionError("what is there cannot be read, or the writer fails")
+        raise AssertionError("the files cannot be read, or the writer fails")
     return json.loads(result.read_text("utf-8"))
 
 

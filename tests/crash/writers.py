@@ -21,7 +21,7 @@ import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
-import open3d  # noqa: F401 - what is imported once is not imported in every fork
+import open3d  # noqa: F401 - imported once, it is not imported in every fork
 from jax.sharding import SingleDeviceSharding
 from PIL import Image
 from safetensors.numpy import save_file
@@ -60,11 +60,11 @@ class Writer:
     write: Callable[[Path, Path, int], object]
     """Given the place, the folder of inputs and the version."""
     read: Callable[[Path], Read]
-    """Raises if what is there is neither complete nor absent."""
+    """Raises if the files are neither complete nor absent."""
     before: bool = True
     """True if there is a version 0."""
     same_bytes: bool = True
-    """True if two runs write the same files; else only what is read is compared."""
+    """True if two runs write the same files; else only the contents read are compared."""
 
 
 def inputs(folder: Path) -> None:

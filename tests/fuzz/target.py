@@ -42,7 +42,7 @@ class Target:
     lossy: str = ""
     """Reason that a changed file may be read with another result unnoticed; else empty."""
     mutations: tuple[Mutate, ...] = ()
-    """Changes that know the format, besides those of bytes."""
+    """Mutations that know the format, besides mutations of bytes."""
 
 
 def pixels(*shape: int) -> np.ndarray:

@@ -16,7 +16,7 @@ MESHES = ((1, 8, 1), (4, 2, 1), (1, 4, 2))
 
 
 def dump() -> Iterator[str]:
-    """A line for each weight: its shape, and that of a device's part on each mesh."""
+    """A line for each weight: its shape, and the shape of a device's part on each mesh."""
     for name in ("egosim_14b", "debug"):
         networks = Networks.abstract(configs.get(name))
         params = nnx.state(networks, nnx.Param)

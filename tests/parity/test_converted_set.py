@@ -1,6 +1,6 @@
 """A whole model as others save it, converted, against the modules that saved it.
 
-The networks are those of a Wan 2.1 image-to-video model, tiny, with random weights: saved by
+The networks form a tiny Wan 2.1 image-to-video model with random weights: saved by
 diffusers and transformers themselves, or in the files of the Wan release. Converted and widened to
 52 channels, whose kernel for the hands is 0, they denoise and decode as the originals do.
 """

@@ -38,7 +38,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def generated(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both clips, of which one has no mask: it fails, the other is made."""
+    """Two clips. One has no mask and fails; the other is made."""
     broken = tmp_path_factory.mktemp("broken")
     shutil.copytree(clips.parent, broken, dirs_exist_ok=True)
     (broken / "sample_1" / "pc_mask_video.mp4").unlink()

@@ -1,4 +1,4 @@
-"""`egosim experiment dwm` from clips to its report, and again with what is missing."""
+"""`egosim experiment dwm` from clips to its report, and again for the missing parts."""
 
 import json
 from dataclasses import replace

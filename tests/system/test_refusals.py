@@ -23,7 +23,9 @@ from tests.crash import writers
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts what is small or read-only"),
+    pytest.mark.skipif(
+        os.geteuid() != 0, reason="only root mounts small or read-only file systems"
+    ),
 ]
 MODEL = "--config debug --weights {made}/weights"
 CLIPS = "--metadata {made}/clips0/metadata.csv"
@@ -49,7 +51,7 @@ COMMANDS = {
     "to-torch": "egosim-convert to-torch {made}/weights --config debug --out {out}",
 }
 LONG = {"experiment", "debug", "tabletop"}
-"""Commands that take minutes, of which only the end is tested."""
+"""Commands that take minutes; only their end is tested."""
 FREE = {"evaluate": 1, "view": 1, "lora": 1, "look": 1}
 """Free pages of the full disk by command; 8 for the others."""
 PASSING = (".lock", ".tmp", ".part", ".part.log")

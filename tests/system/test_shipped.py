@@ -1,4 +1,4 @@
-"""The shipped weights do what is expected of them.
+"""The shipped weights reach their recorded scores.
 
 Retraining changes every figure: `python -m tests.system.test_shipped` writes `shipped.json` and
 `shipped.png` again, the only places that have them.

@@ -26,7 +26,7 @@ CELL = "b (f t) (h i) (w j) c -> b f h w (t i j c)"
 
 @dataclass(frozen=True, kw_only=True)
 class ToyCodecConfig:
-    """Linear video codec; the first latent frame is that of the first frame, repeated."""
+    """Linear video codec; the first latent frame encodes the first frame, repeated."""
 
     table: ClassVar[str] = "tests.toy_family.tables.codec"
 

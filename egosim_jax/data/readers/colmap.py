@@ -126,7 +126,7 @@ class Colmap:
 
 
 def make_rate(fps: float) -> Fraction:
-    """Return a frame rate that the user gave as a fraction. Raises `InputError` if it is none."""
+    """Return a given frame rate as a fraction. Raises `InputError` if it is out of range."""
     if not 0 < fps <= 1000:
         raise InputError(f"--fps is {fps}: it must be above 0 and at most 1000.")
     return Fraction(fps).limit_denominator(1001)

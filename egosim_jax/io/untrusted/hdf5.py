@@ -55,7 +55,7 @@ def read_hdf5(
 ) -> Hdf5Contents:
     """Read arrays of numbers and attributes of text of an HDF5 file.
 
-    `arrays` gives the shapes of those that must exist. Raises `InputError` for what is missing, of
+    `arrays` gives the shapes of required arrays. Raises `InputError` for arrays that are missing, of
     another shape, not in the file itself, too large or damaged.
     """
     return read_file(_read, path, arrays, optional or {}, texts)

@@ -180,7 +180,7 @@ def match_features(folder: Path, config: ColmapConfig) -> None:
 def reconstruct(
     folder: Path, config: ColmapConfig, mapper: Mapper, focal_px: float | None
 ) -> Model:
-    """Return the reconstruction that registers most images, an empty one if there is none.
+    """Return the reconstruction that registers most images; without one, an empty model.
 
     This runs in the child.
     """
