@@ -55,8 +55,8 @@ def read_hdf5(
 ) -> Hdf5Contents:
     """Read arrays of numbers and attributes of text of an HDF5 file.
 
-    `arrays` gives the shapes of required arrays. Raises `InputError` for arrays that are missing, of
-    another shape, not in the file itself, too large or damaged.
+    `arrays` gives the shapes of required arrays. Raises `InputError` for arrays that are missing,
+    of another shape, not in the file itself, too large or damaged.
     """
     return read_file(_read, path, arrays, optional or {}, texts)
 

@@ -38,7 +38,7 @@ class ColmapConfig:
     features: int = 4096
     """Most SIFT features of an image."""
     peak_threshold: float = 0.0067
-    """Least contrast of a feature."""
+    """Minimum contrast of a feature."""
     overlap: int = 10
     """Following images that each one is matched with."""
     init_angle_deg: float = 2.0
