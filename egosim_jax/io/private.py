@@ -116,18 +116,17 @@ def _open_folder(name: str, check: Callable[[Path], str | None]) -> Path | None:
 
 
 def _forget(folder: Path, most: int) -> None:
-    """Remove the files of a folder that were used longest ago."""
+    """Remove the files of a folder that were used longest ago.
+
+    Where reading a file does not change its time, those that were written longest ago.
+    """
     with os.scandir(folder) as entries:
         files = [entry for entry in entries if not entry.is_dir(follow_symlinks=False)]
-        found = [(_used(entry.stat(follow_symlinks=False)), entry.name) for entry in files]
-    names = [name for _, name in sorted(found) if TEMPORARY not in name]
+        found = {entry.name: entry.stat(follow_symlinks=False) for entry in files}
+    used = {name: max(times.st_atime, times.st_mtime) for name, times in found.items()}
+    names = [name for name in sorted(used, key=used.__getitem__) if TEMPORARY not in name]
     for name in names[:-most]:
         (folder / name).unlink(missing_ok=True)
-
-
-def _used(found: os.stat_result) -> float:
-    """Return when a file was used; where reading changes no time, when it was written."""
-    return max(found.st_atime, found.st_mtime)
 
 
 def _refused(path: Path, problem: str) -> None:

@@ -94,7 +94,7 @@ def test_a_run_resumes_on_other_numbers_of_devices(points, tmp_path):
     """Relative, in float32: sums are taken in another order. The data is the same, in order."""
     run(tmp_path / "one", points, steps=40)
     out = tmp_path / "run"
-    schedule = {"steps": 40, "save_every": 10, "pause": 0.02}
+    schedule = {"steps": 40, "save_every": 10, "pause": 0.06}
     meshes = [(8, {"fsdp": 8}), (8, {"data": 4, "fsdp": 2})]
     for count, (devices, mesh) in enumerate(meshes, start=1):
         process = start(out, points, devices=devices, mesh=mesh, **schedule)
