@@ -1,5 +1,7 @@
 """Reading of LoRA files in every common naming.
 
+Our own code, because each library reads its own naming alone, and only into PyTorch modules.
+
 A tensor's name has a prefix (`diffusion_model.`, `transformer.`, `base_model.model.`,
 `lora_unet_`), a layer of the denoiser in one of its table's namings, with dots or, in kohya's
 files, underscores, and the role of the tensor: `lora_A` or `lora_down`, `lora_B` or `lora_up`,

@@ -1,5 +1,8 @@
 """Solvers of the sampling equation, from noise down to data, and the loop that runs them.
 
+Our own code, because the samplers of other libraries keep state between calls and run step by step
+from Python; here all steps are one compiled scan.
+
 A solver's coefficients depend on the process and on the visited times alone. They are computed for
 all steps on the host in float64, and the integration is one `lax.scan` over their rows
 (`integrate`). Latents stay float32 between steps, whatever dtype the network computes in. DDIM and

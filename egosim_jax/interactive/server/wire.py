@@ -1,5 +1,7 @@
 """Messages as MessagePack with NumPy arrays, compatible with OpenPI, and as JSON.
 
+Our own code, because msgpack-numpy unpickles arrays of objects and has no limits for hostile input.
+
 An array is a map of `__ndarray__`, `data`, `dtype` and `shape`. A NumPy scalar is a map of
 `__npgeneric__`, `data` and `dtype`. Their keys are bytes. Nothing is unpickled: only numeric dtypes
 are read, and the shape must match the number of bytes.
