@@ -14,7 +14,7 @@ import tyro
 from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
 from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch, widening_of
 from egosim_jax.convert.source import tokenizer_files
-from egosim_jax.convert.stream import (
+from egosim_jax.convert.writer import (
     Weight,
     apart,
     in_memory,

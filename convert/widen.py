@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from egosim_jax.convert.stream import Weight
+from egosim_jax.convert.writer import Weight
 
 if TYPE_CHECKING:
     from egosim_jax.conditioning.layout import ChannelLayout

@@ -3,7 +3,7 @@
 Frozen dataclasses with checks belong here. Operations on them do not, and no module imports jax: a
 generator in any framework can use these types.
 
-    Triplet, Clip, Action, View, SceneState, Perceived, GroundTruth   the data flow (`flow.py`)
+    Triplet, Clip, Action, View, SceneState, Perceived, GroundTruth   the data flow (`data.py`)
     Cameras, is_rigid                                                 camera paths (`cameras.py`)
     InputError, VideoSpec, VideoGrid, MeshConfig, check_*             sizes (`settings.py`)
 
@@ -23,7 +23,7 @@ is kept.
 from __future__ import annotations
 
 from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, is_rigid
-from egosim_jax.types.flow import (
+from egosim_jax.types.data import (
     HAND_SIZE_M,
     JOINTS,
     NEAR_IMAGE,
