@@ -14,6 +14,8 @@ import tyro
 from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
 from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch, widening_of
 from egosim_jax.convert.source import tokenizer_files
+from egosim_jax.convert.tables import pipeline_files, table_of
+from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.convert.writer import (
     Weight,
     apart,
@@ -22,8 +24,6 @@ from egosim_jax.convert.writer import (
     write_file,
     write_sharded,
 )
-from egosim_jax.convert.tables import pipeline_files, table_of
-from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.mapped import OURS, Tensor

@@ -11,9 +11,9 @@ import numpy as np
 
 from egosim_jax.convert.detect import DetectedNetwork
 from egosim_jax.convert.rules import Leaf, Rule, assign, shape_only
-from egosim_jax.convert.writer import Weight, stored_as
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.convert.widen import Widening, WidenMode
+from egosim_jax.convert.writer import Weight, stored_as
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.io.weights import WeightsError, mismatches
 from egosim_jax.types import InputError
