@@ -218,7 +218,7 @@ def test_a_full_size_checkpoint_has_the_layers_of_the_release(name, modules, wei
 
 def test_a_difference_needs_the_weights_it_is_from():
     changes = {"patch.bias": np.ones(32, np.float32)}
-    with pytest.raises(InputError, match=r"give those weights\. \(--base\)"):
+    with pytest.raises(InputError, match=r"give these weights\. \(--base\)"):
         checkpoint(changes, COGVIDEOX, None)
 
 

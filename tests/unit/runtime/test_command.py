@@ -228,7 +228,7 @@ def test_the_groups_of_options_are_in_the_help(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "first"),
     [
-        ("simulate", "Act several times in a scene that remembers what was done"),
+        ("simulate", "Act several times in a scene that keeps its changes"),
         ("data annotate", "Make clips with prior, mask, hands"),
         ("train debug", "Train `debug` for a few updates"),
         ("convert weights", "Convert every network of a checkpoint folder"),
