@@ -27,6 +27,8 @@ MAX_BYTES = 1 << 30
 MAX_VALUE = 1e12
 """Maximum coordinate or error of a point."""
 PARTS = ("cameras", "images", "points3D")
+MAX_SIDE_PX = 1 << 16
+"""Maximum width and height of an image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +92,14 @@ def _read(folder: Path, copy: Path, suffix: str) -> Model:
                 _check_size(part, (copy / f"{part}.bin").read_bytes())
             model.read_binary(copy)
         else:
+            _check_rotations(copy / "images.txt")
             model.read_text(copy)
+        if any(
+            not 0 < side <= MAX_SIDE_PX
+            for c in model.cameras.values()
+            for side in (c.width, c.height)
+        ):
+            raise ValueError("a camera has an impossible image size")
         found = to_arrays(model)
         numbers = np.column_stack([found.points, found.error_px])
         if not (np.abs(numbers) < MAX_VALUE).all():
@@ -112,12 +121,29 @@ def _check_size(part: str, data: bytes) -> None:
             parameters = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params
             end += 24 + 8 * len(parameters)
         elif part == "images":  # a pose, a name that ends with 0, and keypoints
+            _check_rotation(struct.unpack_from("<4d", data, end + 4))
             end = data.index(b"\0", end + 64) + 1
             end += 8 + 24 * number(data, end)[0]
         else:  # a point and its track
             end += 51 + 8 * number(data, end + 43)[0]
     if end != len(data):
         raise ValueError(f"{part}.bin has {len(data):,} bytes, its records {end:,}")
+
+
+def _check_rotations(path: Path) -> None:
+    """Raise `ValueError` for an impossible rotation in a text file."""
+    lines = (line.strip() for line in path.read_text("utf-8").splitlines())
+    records = (line for line in lines if not line.startswith("#"))
+    for record in records:
+        if record:
+            _check_rotation(tuple(map(float, record.split()[1:5])))
+            next(records, None)  # the keypoints, which may be an empty line
+
+
+def _check_rotation(quaternion: tuple[float, ...]) -> None:
+    # pycolmap normalizes quaternions, and would read zeros as the identity.
+    if not 0.5 < np.linalg.norm(quaternion) < 2:
+        raise ValueError(f"the quaternion {quaternion} is not a rotation")
 
 
 def to_arrays(model: Any) -> Model:

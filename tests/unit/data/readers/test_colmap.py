@@ -154,6 +154,30 @@ def test_a_truncated_file_or_a_false_count_is_refused(world, tmp_path, name):
             read_model(folder)
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_rotation_of_zeros_is_refused(world, tmp_path, binary):
+    folder = write_model(tmp_path, world, binary=binary)
+    if binary:
+        data = (folder / "images.bin").read_bytes()
+        (folder / "images.bin").write_bytes(data[:12] + bytes(32) + data[44:])
+    else:
+        lines = (folder / "images.txt").read_text().splitlines()
+        first = next(n for n, line in enumerate(lines) if line and not line.startswith("#"))
+        words = lines[first].split()
+        lines[first] = " ".join([words[0], "0", "0", "0", "0", *words[5:]])
+        (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match="is not a rotation"):
+        read_model(folder)
+
+
+def test_a_camera_without_a_size_is_refused(world, tmp_path):
+    folder = write_model(tmp_path, world, binary=False)
+    text = (folder / "cameras.txt").read_text()
+    (folder / "cameras.txt").write_text(text.replace(f" {world.width} ", " -4 ", 1))
+    with pytest.raises(InputError, match="impossible image size"):
+        read_model(folder)
+
+
 def test_a_name_that_leaves_the_folder_of_images_is_not_found(world, tmp_path, imported):
     folder = write_model(tmp_path / "room", world, binary=False)
     text = (folder / "images.txt").read_text()
