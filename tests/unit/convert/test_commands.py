@@ -25,7 +25,7 @@ from safetensors.torch import save_file
 from egosim_jax import configs
 from egosim_jax.configs.dwm_wan_14b import DWMWanDiTConfig
 from egosim_jax.configs.model import Networks
-from egosim_jax.convert import commands, stream
+from egosim_jax.convert import commands, writer
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of, wan_dit
@@ -248,12 +248,12 @@ def test_the_hash_in_the_header_distinguishes_weights(tmp_path):
 
 SLOW = """
 import sys, time
-from egosim_jax.convert import stream
-in_rows = stream.in_rows
+from egosim_jax.convert import writer
+in_rows = writer.in_rows
 def slowly(array):
     time.sleep(0.02)
     return in_rows(array)
-stream.in_rows = slowly
+writer.in_rows = slowly
 from egosim_jax.convert.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -326,7 +326,7 @@ def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
 
 @pytest.mark.parametrize("layout", ["wan", "diffusers"])
 def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, monkeypatch):
-    monkeypatch.setattr(stream, "MAX_FILE_BYTES", 200_000)  # bytes, so that there is more than one
+    monkeypatch.setattr(writer, "MAX_FILE_BYTES", 200_000)  # bytes, so that there is more than one
     assert convert(checkpoint, tmp_path / "ours") == 0
     assert back(tmp_path / "ours", tmp_path / "theirs", "--layout", layout) == 0
     for network in NETWORKS:

@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from transformers import CLIPVisionModel, UMT5EncoderModel
 
 from egosim_jax import configs
-from egosim_jax.convert import stream
+from egosim_jax.convert import writer
 from egosim_jax.convert.__main__ import main
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_metadata
@@ -142,7 +142,7 @@ def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch, name):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(stream.os, "pwrite", full)
+        patch.setattr(writer.os, "pwrite", full)
         out = tmp_path / "out" / "x.safetensors"
         assert "No space left" in one_line(capsys, 1, *args, "--out", out)
     assert not [path for path in tmp_path.glob("out/**/*.safetensors") if path.is_file()]
