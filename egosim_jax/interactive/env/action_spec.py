@@ -3,7 +3,7 @@
 There is one row per frame. It has the numbers of each hand, then six for the camera if the
 `ActionSpec` includes it:
 
-    keypoints  63 per hand: 21 joints in the world, in meters, in the order of `simulation/episode.py`
+    keypoints  63 per hand: 21 joints in the world, in meters, ordered as in `simulation/episode.py`
     wrist       7 per hand: wrist position in meters, rotation vector, closure from 0 to 1
     gripper     7 per hand: the same numbers for a gripper, whose fingers close
     camera      6: translation in meters and rotation vector, in the axes of the first camera
