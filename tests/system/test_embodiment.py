@@ -83,7 +83,7 @@ def test_the_sheet_has_a_row_for_each_model_between_conditions_and_ground_truth(
 def test_started_again_it_trains_nothing_and_reports_the_same(
     weights, run, report, capsys, monkeypatch
 ):
-    for name in ("train.loop.train", "generator.Generator.generate"):
+    for name in ("train.loop.train", "generation.generator.Generator.generate"):
         monkeypatch.setattr(f"egosim_jax.{name}", lambda *_, **__: pytest.fail("it was done"))
     (run / "report.json").unlink()
     assert main(experiment(weights, run)) == 0
