@@ -3,8 +3,8 @@
 A cache is a folder `~/.cache/egosim_jax/NAME` (`XDG_CACHE_HOME/egosim_jax/NAME` if that is set to
 an absolute path) that belongs to the user, that nobody else can read or write and that is no link.
 `PrivateCache` opens a file first, and then checks owner, mode, links and checksum of the open file.
-A bad file causes a warning and is made again. `private_folder` is for
-a library that reads and writes its files itself.
+A bad file causes a warning and is made again. `private_folder` is for a library that reads and
+writes its files itself.
 """
 
 from __future__ import annotations
