@@ -180,6 +180,12 @@ def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list
                 f"{name} is interlaced: rows of two times alternate in a frame. Convert it, for "
                 "instance with `ffmpeg -i IN -vf bwdif=mode=send_frame OUT.mp4`."
             )
+        a, b, c, d = _display_matrix(frame)
+        if (a or d) and (b or c):
+            raise InputError(
+                f"{name} is rotated by an angle that is not a multiple of 90°. Remove the rotation "
+                "with `ffmpeg -display_rotation 0 -i IN -c copy OUT.mp4`."
+            )
     return frames
 
 
@@ -219,10 +225,15 @@ def shown_size(stream: VideoStream, frame: VideoFrame) -> tuple[int, int]:
     return height, width
 
 
+def pixel_aspect(stream: VideoStream) -> Fraction:
+    """Return width over height of the stored pixels of a stream; 1 if they count as square."""
+    ratio = stream.sample_aspect_ratio or Fraction(1)
+    return Fraction(1) if abs(ratio - 1) <= MAX_UNSQUARE else ratio
+
+
 def _square_width(stream: VideoStream, width: int) -> int:
     """Return the width of a stored frame in square pixels."""
-    ratio = stream.sample_aspect_ratio or 1
-    return width if abs(ratio - 1) <= MAX_UNSQUARE else max(1, round(width * ratio))
+    return max(1, round(width * pixel_aspect(stream)))
 
 
 def _check_color(source: VideoStream | VideoFrame, name: str) -> None:
@@ -235,24 +246,28 @@ def _check_color(source: VideoStream | VideoFrame, name: str) -> None:
         )
     if source.colorspace not in _MATRICES:
         raise InputError(
-            f"{name} has the color matrix {source.colorspace} of ITU-T H.273, which cannot be "
-            "converted. Encode it again with `-colorspace bt709`."
+            f"{name} has the color matrix {source.colorspace} of ITU-T H.273, which is not read. "
+            "Convert it, for instance with `ffmpeg -i IN -vf zscale=matrix=709 OUT.mp4`."
         )
 
 
 def _upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
-    """Rotate and mirror a frame by its display matrix (a b u, c d v, x y w).
+    """Rotate and mirror a frame by its display matrix."""
+    a, b, c, d = _display_matrix(frame)
+    if b or c:
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+
+
+def _display_matrix(frame: VideoFrame) -> tuple[int, int, int, int]:
+    """Return a, b, c and d of a frame's display matrix (a b u, c d v, x y w).
 
     A point (x, y) is shown at (a x + c y, b x + d y), y downward.
     """
     if "DISPLAYMATRIX" not in frame.side_data:
-        return pixels
-    a, b, _, c, d, *_ = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32)
-    if (a or d) and (b or c):
-        raise InputError("the video is rotated by an angle that is not a multiple of 90°.")
-    if b or c:
-        pixels, a, d = pixels.swapaxes(0, 1), c, b
-    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+        return 1, 0, 0, 1
+    a, b, _, c, d, *_ = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32).tolist()
+    return a, b, c, d
 
 
 def check_size(name: str, frames: int, area: int, max_frames: int) -> None:

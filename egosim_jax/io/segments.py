@@ -26,6 +26,7 @@ from egosim_jax.io.decoding import (
     frame_rate,
     open_file,
     open_video,
+    pixel_aspect,
     shown_size,
     to_rgb,
 )
@@ -54,11 +55,13 @@ def probe_long_video(path: Path) -> VideoInfo:
             decoded = next(_frames(stream, name, listing.keys[0][1]))
             height, width = shown_size(stream, decoded)
             fps, unit = frame_rate(stream, name), stream.time_base
+            aspect = pixel_aspect(stream)
     return VideoInfo(
         frames=len(listing.times),
         height=height,
         width=width,
         fps=fps,
+        pixel_aspect=aspect,
         unevenness_s=_unevenness(listing.times) * float(unit or 0),
     )
 

@@ -38,6 +38,7 @@ from egosim_jax.io.decoding import (
     frame_rate,
     open_file,
     open_video,
+    pixel_aspect,
     read_frames,
     read_packets,
     shown_size,
@@ -68,8 +69,19 @@ class VideoInfo:
     height: int
     width: int
     fps: Fraction
+    pixel_aspect: Fraction = Fraction(1)
+    """Width over height of a stored pixel; frames are read with square ones."""
     unevenness_s: float = 0.0
     """Maximum deviation of frame times from equal spacing, in seconds; 0 if not measured."""
+
+    def check_square(self, name: str) -> None:
+        """Raise `InputError` if intrinsics of stored pixels would not fit the frames."""
+        if self.pixel_aspect != 1:
+            raise InputError(
+                f"{name} stores pixels {self.pixel_aspect} times as wide as high, and it is not "
+                "known whether its intrinsics are for these or for square ones. Convert it with `ffmpeg "
+                "-i IN -vf scale=iw*sar:ih,setsar=1 OUT.mp4`, and the intrinsics with it."
+            )
 
 
 def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
@@ -149,7 +161,13 @@ def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
                 raise
         if size is None:
             raise InputError(f"{name} holds no frames.")
-        return VideoInfo(frames=frames, height=size[0], width=size[1], fps=frame_rate(stream, name))
+        return VideoInfo(
+            frames=frames,
+            height=size[0],
+            width=size[1],
+            fps=frame_rate(stream, name),
+            pixel_aspect=pixel_aspect(stream),
+        )
 
 
 def _decode(
