@@ -79,8 +79,8 @@ class VideoInfo:
         if self.pixel_aspect != 1:
             raise InputError(
                 f"{name} stores pixels {self.pixel_aspect} times as wide as high, and it is not "
-                "known whether its intrinsics are for these or for square ones. Convert it with `ffmpeg "
-                "-i IN -vf scale=iw*sar:ih,setsar=1 OUT.mp4`, and the intrinsics with it."
+                "known whether its intrinsics are for these or for square ones. Convert it with "
+                "`ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT.mp4`, and the intrinsics, too."
             )
 
 
