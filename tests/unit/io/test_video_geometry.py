@@ -1,6 +1,7 @@
 """Videos are shown as their files say: track, rotation, aspect and color, by every opener."""
 
 import re
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,6 +18,7 @@ import egosim_jax
 from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.data.clips import encoded_first_frame
 from egosim_jax.data.readers.taste_rob import TasteRob
+from egosim_jax.io import decoding
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.segments import probe_long_video, read_segment
 from egosim_jax.io.video import (
@@ -271,10 +273,19 @@ def test_colors_of_bt2020_are_converted(tmp_path):
     assert np.abs(frame[48, 64] - 255 * linear ** (1 / 2.4)).max() <= 8
 
 
-def test_pixels_of_an_absurd_aspect_are_refused_before_they_are_resized(tmp_path):
-    path = write_tracks(tmp_path / "a.mkv", Track(image=UP, aspect=Fraction(30_000, 1)))
+def test_frames_that_square_pixels_make_too_large_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(decoding, "MAX_IMAGE_PIXELS", 10 * HEIGHT * WIDTH)
+    path = write_tracks(tmp_path / "a.mkv", Track(image=UP, aspect=Fraction(20)))
     with pytest.raises(InputError, match="square pixels"):
         read_video(path)
+
+
+def _ready(graph):
+    while True:
+        try:
+            yield graph.vpull()
+        except (av.BlockingIOError, av.EOFError):
+            return
 
 
 def converted(path, target, *filters):
@@ -286,13 +297,13 @@ def converted(path, target, *filters):
         graph = Graph()
         nodes = [graph.add_buffer(template=old), *(graph.add(*f.split("=", 1)) for f in filters)]
         graph.link_nodes(*nodes, graph.add("buffersink")).configure()
-        for frame in source.decode(old):
+        for frame in [*source.decode(old), None]:
             graph.vpush(frame)
-            coded = graph.vpull()
-            coded.pts = None
-            coder = new.codec_context
-            coder.color_primaries, coder.color_trc = coded.color_primaries, coded.color_trc
-            container.mux(new.encode(coded))
+            for coded in _ready(graph):
+                coded.pts = None
+                coder = new.codec_context
+                coder.color_primaries, coder.color_trc = coded.color_primaries, coded.color_trc
+                container.mux(new.encode(coded))
         container.mux(new.encode())
     return target
 
@@ -307,6 +318,39 @@ def test_the_advised_conversion_is_read(tmp_path, member):
     back = read_video(converted(path, tmp_path / "b.mp4", *filters.split(",")))
     assert back.frames.shape[1:] == UP.shape
     assert len(back.frames) >= FRAMES - 1
+
+
+def with_aperture(data, width, height):
+    """An MP4 whose sample description ends with a clean aperture."""
+    box = struct.pack(">I4s8I", 40, b"clap", width, 1, height, 1, 0, 1, 0, 1)
+    data, start, end = bytearray(data), 0, 0
+    for kind, fields in {b"moov": 0, b"trak": 0, b"mdia": 0, b"minf": 0, b"stbl": 0,
+                         b"stsd": 8, b"avc1": 78}.items():  # fmt: skip
+        while data[start + 4 : start + 8] != kind:
+            start += struct.unpack_from(">I", data, start)[0]
+        (size,) = struct.unpack_from(">I", data, start)
+        struct.pack_into(">I", data, start, size + len(box))
+        start, end = start + 8 + fields, start + size
+    return bytes(data[:end]) + box + bytes(data[end:])
+
+
+def test_a_crop_of_mp4_is_refused():
+    data = encode_video(np.stack([UP] * 3), 8)
+    assert decode_video(with_aperture(data, WIDTH, HEIGHT)).frames.shape == (3, HEIGHT, WIDTH, 3)
+    for width, height in ((WIDTH - 8, HEIGHT), (WIDTH, HEIGHT // 2)):
+        with pytest.raises(InputError, match=r"cropped .*ffmpeg -i IN"):
+            decode_video(with_aperture(data, width, height))
+
+
+@pytest.mark.parametrize("crop", [0xAA, 0xBB, 0xCC, 0xDD], ids=["bottom", "top", "left", "right"])
+def test_a_crop_of_matroska_is_refused(tmp_path, crop):
+    data = write_tracks(tmp_path / "a.mkv", Track(image=UP)).read_bytes()
+    unit = b"\x54\xb2\x81\x04"  # DisplayUnit, which makes room
+    assert data.count(unit) == 1
+    none, some = (data.replace(unit, bytes([0x54, crop, 0x81, n])) for n in (0, 8))
+    assert probe_encoded(none).width == WIDTH
+    with pytest.raises(InputError, match=r"PixelCrop.*ffmpeg -i IN"):
+        probe_encoded(some)
 
 
 def test_a_gif_is_refused_with_the_formats_that_are_read(tmp_path):
