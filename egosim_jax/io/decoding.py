@@ -16,7 +16,7 @@ Only the contents of regular files are opened, never names or addresses inside a
 checked against limits before anything is decoded. Detectable damage is refused: the decoder must
 report no error, mark no frame as corrupt and return a frame for each packet that the container
 lists. H.264 has no checksum, so a changed bit that leaves a valid stream passes. Frames outside the
-edit list are omitted, as in every player.
+edit list are omitted, as in every player. FFV1 has checksums, which are checked here.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from av.video.stream import VideoStream
 
 from egosim_jax.io.bounded import open_regular, quote_path, refusing
 from egosim_jax.io.boxes import check_boxes
+from egosim_jax.io.ffv1 import is_intact
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
 from egosim_jax.types import InputError
 
@@ -158,6 +159,7 @@ def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Pa
                 if packet.is_corrupt:
                     raise DamagedError(f"{name} is cut off after {read} frames.")
                 if packet.size:
+                    check_packet(stream, packet, name)
                     read += 1
                     yield packet
     except DamagedError:
@@ -167,6 +169,13 @@ def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Pa
     listed = len(stream.index_entries)
     if read < listed:
         raise DamagedError(f"{name} is cut off: it holds {read} of the {listed} frames it lists.")
+
+
+def check_packet(stream: VideoStream, packet: Packet, name: str) -> None:
+    """Raise `DamagedError` if a packet does not have the checksum that is in it."""
+    coder = stream.codec_context
+    if coder.name == "ffv1" and not is_intact(bytes(packet), coder.extradata):
+        raise DamagedError(f"{name} is damaged: a packet does not have its checksum.")
 
 
 def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:

@@ -21,6 +21,7 @@ from egosim_jax.io.decoding import (
     DamagedError,
     File,
     FrameBuffer,
+    check_packet,
     check_size,
     decode_packet,
     frame_rate,
@@ -117,6 +118,7 @@ def _list(file: File, name: str) -> _Listing:
                     continue
                 if packet.is_corrupt or packet.pts is None or len(times) > MAX_SAMPLES:
                     raise DamagedError(f"{name} is damaged after {len(times)} frames.")
+                check_packet(stream, packet, name)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
                 if not packet.is_discard:
