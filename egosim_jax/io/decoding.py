@@ -3,14 +3,15 @@
 Everything that opens a video opens it here, so that each file has one track, geometry and color:
 
 - The track is the first that the file marks as default, else the first. Cover art, thumbnails and
-  other still images are skipped, as are tracks of one frame beside longer ones.
+  other still images are skipped, as are tracks of one frame if there are longer ones.
 - Frames are rotated and mirrored by the display matrix. Pixels that are not square are resized to
   square ones: the width is multiplied by the sample aspect ratio of the container or, without one,
   of the codec. A ratio within 1 % of 1:1 comes from rounding a size to whole pixels.
 - Chroma is sited as the file or the standard of its codec states: on the left columns in MPEG-2,
   MPEG-4, H.264 and H.265. Where neither states it, chroma is centered.
 - Colors of wide gamut (BT.2020, P3) are converted to BT.709. HDR and other transfer functions that
-  need a tone curve, interlaced frames and matrices that FFmpeg cannot convert are refused.
+  need a tone curve, matrices that FFmpeg cannot convert, interlaced frames, frames of two views
+  and spherical ones are refused.
 
 Only the contents of regular files are opened, never names or addresses inside a file. The header is
 checked against limits before anything is decoded. Detectable damage is refused: the decoder must
@@ -86,6 +87,8 @@ _TO_BT709 = (
     "ffmpeg -i IN -vf scale=out_primaries=bt709:out_transfer=bt709:out_color_matrix=bt709,"
     "format=yuv420p OUT.mp4"
 )
+_ONE_VIEW, _RECTILINEAR = (0, 8), 4
+"""FFmpeg's types of stereo with one view in a frame, and its projection of a pinhole."""
 _FORMATS = "MP4, MOV, Matroska, WebM, AVI or MPEG-TS"
 _OPTIONS = {
     "format_whitelist": "mov,mp4,m4a,matroska,webm,avi,mpegts",
@@ -112,7 +115,7 @@ def open_file(path: Path) -> Iterator[File]:
 def open_video(file: File, name: str, max_frames: int | None) -> Iterator[VideoStream]:
     """Open the main video stream of a file within the limits; None allows any length.
 
-    Raises `InputError` if there is none, or if its color cannot be read right.
+    Raises `InputError` for a file without a video stream, or if its color cannot be read right.
     """
     check_boxes(file, name)
     with refusing(f"{name} is not a readable video"):
@@ -183,18 +186,7 @@ def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list
     with refusing(f"{name} is damaged", DamagedError):
         frames = stream.decode(packet)
     for frame in frames:
-        _check_color(frame, name)
-        if frame.interlaced_frame:
-            raise InputError(
-                f"{name} is interlaced: rows of two times alternate in a frame. Convert it, for "
-                "instance with `ffmpeg -i IN -vf bwdif=mode=send_frame OUT.mp4`."
-            )
-        a, b, c, d = _display_matrix(frame)
-        if (a or d) and (b or c):
-            raise InputError(
-                f"{name} is rotated by an angle that is not a multiple of 90°. Remove the rotation "
-                "with `ffmpeg -display_rotation 0 -i IN -c copy OUT.mp4`."
-            )
+        _check_frame(frame, name)
     return frames
 
 
@@ -258,6 +250,34 @@ def _check_color(source: VideoStream | VideoFrame, name: str) -> None:
             f"{name} has the color matrix {source.colorspace} of ITU-T H.273, which is not read. "
             "Convert it, for instance with `ffmpeg -i IN -vf zscale=matrix=709 OUT.mp4`."
         )
+
+
+def _check_frame(frame: VideoFrame, name: str) -> None:
+    """Raise `InputError` if a frame is not one upright image of a pinhole or its like."""
+    _check_color(frame, name)
+    a, b, c, d = _display_matrix(frame)
+    if (a or d) and (b or c):
+        problem = "is rotated by an angle that is not a multiple of 90°"
+        command = "ffmpeg -display_rotation 0 -i IN -c copy OUT.mp4"
+    elif frame.interlaced_frame:
+        problem = "is interlaced: rows of two times alternate in a frame"
+        command = "ffmpeg -i IN -vf bwdif=mode=send_frame OUT.mp4"
+    elif _side_value(frame, "STEREO3D") not in (None, *_ONE_VIEW):
+        problem = "is stereoscopic: each frame holds two views, for instance side by side (sbsl)"
+        command = "ffmpeg -i IN -vf stereo3d=sbsl:ml OUT.mp4"
+    elif _side_value(frame, "SPHERICAL") not in (None, _RECTILINEAR):
+        problem = "is spherical (360° or 180°), not the image of a pinhole"
+        command = "ffmpeg -i IN -vf v360=e:flat:h_fov=90:v_fov=60 OUT.mp4"
+    else:
+        return
+    raise InputError(f"{name} {problem}. Convert it, for instance with `{command}`.")
+
+
+def _side_value(frame: VideoFrame, kind: str) -> int | None:
+    """Return the first field of a frame's side data, or None if the frame has none."""
+    if kind not in frame.side_data:
+        return None
+    return int(np.frombuffer(bytes(frame.side_data[kind]), np.int32, count=1)[0])
 
 
 def _upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:

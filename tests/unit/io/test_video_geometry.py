@@ -54,6 +54,7 @@ class Track:
     disposition: Disposition | None = None
     frames: int = FRAMES
     interlaced: bool = False
+    x264: str = ""
     color: tuple[int, int, int] | None = None
     """Primaries, transfer function and matrix of ITU-T H.273."""
 
@@ -74,6 +75,8 @@ def write_tracks(path, *tracks):
             stream = container.add_stream(track.codec, rate=30)
             stream.width, stream.height, stream.pix_fmt = width, height, track.pix_fmt
             stream.options = dict(OPTIONS.get(track.codec, {}))
+            if track.x264:
+                stream.options["x264-params"] = track.x264
             if track.interlaced:
                 stream.codec_context.flags |= av.codec.context.Flags.interlaced_dct
             if track.aspect is not None:
@@ -195,6 +198,9 @@ REFUSED: dict[str, tuple[str, str, list[Track]]] = {
     ),
     "matrix-of-ycgco": ("mkv", "matrix 8", [Track(image=UP, color=(1, 1, 8))]),
     "interlaced": ("mp4", "interlaced.*bwdif", [Track(image=UP, interlaced=True)]),
+    "two-views-in-a-frame": (
+        "mkv", "stereoscopic.*stereo3d", [Track(image=UP, x264="frame-packing=3")],
+    ),
     "oblique": ("mp4", "not a multiple of 90", [Track(image=UP, rotation=30)]),
 }  # fmt: skip
 
@@ -291,7 +297,7 @@ def _ready(graph):
 
 
 def converted(path, target, *filters):
-    """What `ffmpeg -i path -vf filters target` does, by the same filters of the same library."""
+    """Do what `ffmpeg -i path -vf filters target` does, by the filters of the same library."""
     with av.open(str(path)) as source, av.open(str(target), "w") as container:
         old = source.streams.video[0]
         new = container.add_stream("libx264", rate=old.average_rate)
@@ -322,26 +328,43 @@ def test_the_advised_conversion_is_read(tmp_path, member):
     assert len(back.frames) >= FRAMES - 1
 
 
-def with_aperture(data, width, height):
-    """An MP4 whose sample description ends with a clean aperture."""
-    box = struct.pack(">I4s8I", 40, b"clap", width, 1, height, 1, 0, 1, 0, 1)
-    data, start, end = bytearray(data), 0, 0
+def box(kind, *content):
+    return struct.pack(">I4s", 8 + sum(map(len, content)), kind) + b"".join(content)
+
+
+def described(data, *boxes):
+    """An MP4 whose sample description ends with some boxes."""
+    data, more, start, end = bytearray(data), b"".join(boxes), 0, 0
     for kind, fields in {b"moov": 0, b"trak": 0, b"mdia": 0, b"minf": 0, b"stbl": 0,
                          b"stsd": 8, b"avc1": 78}.items():  # fmt: skip
         while data[start + 4 : start + 8] != kind:
             start += struct.unpack_from(">I", data, start)[0]
         (size,) = struct.unpack_from(">I", data, start)
-        struct.pack_into(">I", data, start, size + len(box))
+        struct.pack_into(">I", data, start, size + len(more))
         start, end = start + 8 + fields, start + size
-    return bytes(data[:end]) + box + bytes(data[end:])
+    return bytes(data[:end]) + more + bytes(data[end:])
 
 
 def test_a_crop_of_mp4_is_refused():
     data = encode_video(np.stack([UP] * 3), 8)
-    assert decode_video(with_aperture(data, WIDTH, HEIGHT)).frames.shape == (3, HEIGHT, WIDTH, 3)
+
+    def cropped(width, height):
+        return described(data, box(b"clap", struct.pack(">8I", width, 1, height, 1, 0, 1, 0, 1)))
+
+    assert decode_video(cropped(WIDTH, HEIGHT)).frames.shape == (3, HEIGHT, WIDTH, 3)
     for width, height in ((WIDTH - 8, HEIGHT), (WIDTH, HEIGHT // 2)):
         with pytest.raises(InputError, match=r"cropped .*ffmpeg -i IN"):
-            decode_video(with_aperture(data, width, height))
+            decode_video(cropped(width, height))
+
+
+def test_a_spherical_video_is_refused():
+    """Its boxes are Google's, of Spherical Video V2."""
+    projection = box(b"proj", box(b"prhd", bytes(16)), box(b"equi", bytes(20)))
+    sphere = box(b"sv3d", box(b"svhd", bytes(4), b"camera\0"), projection)
+    data = described(encode_video(np.stack([UP] * 3), 8), sphere)
+    for opener in (decode_video, probe_encoded):
+        with pytest.raises(InputError, match=r"spherical.*v360"):
+            opener(data)
 
 
 @pytest.mark.parametrize("crop", [0xAA, 0xBB, 0xCC, 0xDD], ids=["bottom", "top", "left", "right"])
@@ -417,6 +440,35 @@ def test_ten_trips_lose_little_and_move_no_edge(turned):
         assert loss[key, 9] > loss[key, 0] - 1.5, loss
     np.testing.assert_allclose(found[9], found[0], atol=0.05)
     np.testing.assert_allclose(found[9], [31.5, 63.5] * 2, atol=0.5)
+
+
+@pytest.mark.parametrize("place", ["left", "center", "topleft"])
+def test_chroma_is_read_where_the_file_has_it(tmp_path, place):
+    frame = np.full((64, 96, 3), 128, np.uint8)
+    frame[:, 32:64] = (220, 40, 40)
+    number = ["left", "center", "topleft"].index(place)
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.options = {"crf": "0", "x264-params": f"chromaloc={number}"}
+        graph = Graph()
+        source = graph.add_buffer(
+            width=96, height=64, format=av.VideoFormat("rgb24"), time_base=Fraction(1, 30)
+        )
+        scale = graph.add("scale", f"flags=bicubic+accurate_rnd:out_chroma_loc={place}")
+        nodes = source, scale, graph.add("format", "yuv420p"), graph.add("buffersink")
+        graph.link_nodes(*nodes).configure()
+        for index in range(3):
+            full = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            full.pts, full.time_base = index, Fraction(1, 30)
+            graph.vpush(full)
+            container.mux(stream.encode(graph.vpull()))
+        container.mux(stream.encode())
+    for found in (
+        read_video(tmp_path / "a.mp4"),
+        read_segment(tmp_path / "a.mp4", start=0, count=1),
+    ):
+        np.testing.assert_allclose(edges(found.frames[0]), [31.5, 63.5] * 2, atol=0.25)
 
 
 def test_a_written_file_states_its_colors(tmp_path):
