@@ -9,9 +9,9 @@ Everything that opens a video opens it here, so that each file has one track, ge
   of the codec. A ratio within 1 % of 1:1 comes from rounding a size to whole pixels.
 - Chroma is sited as the file or the standard of its codec states: on the left columns in MPEG-2,
   MPEG-4, H.264 and H.265. Where neither states it, chroma is centered.
-- Colors of wide gamut (BT.2020, P3) are converted to BT.709. HDR and other transfer functions that
-  need a tone curve, matrices that FFmpeg cannot convert, interlaced frames, frames of two views
-  and spherical ones are refused.
+- Colors of wide gamut (BT.2020, P3) are converted to BT.709, but not by `official` decoding.
+- HDR and other transfer functions that need a tone curve, matrices that FFmpeg cannot convert,
+  interlaced frames, frames of two views and spherical ones are refused.
 
 Only the contents of regular files are opened, never names or addresses inside a file. The header is
 checked against limits before anything is decoded. Detectable damage is refused: the decoder must
