@@ -7,7 +7,6 @@
   multiples of 16. A given size crops the image to its aspect ratio. A crop that loses more than
   40 % of the image, such as landscape from portrait, is refused.
 - Length: all frames, cut to 4k+1. More than 601 frames need `--clips` or `--num-frames`.
-- HDR (PQ or HLG) is refused: converted to 8 bits without its tone curve, it looks pale.
 """
 
 from __future__ import annotations

@@ -70,11 +70,6 @@ def open_source(source: Source, depth_files: Path | None = None) -> Recording:
         recording = Recording.load(source.path)
     else:
         info = probe_long_video(source.path)
-        if info.hdr:
-            raise InputError(
-                f"{quote_path(source.path)} is HDR (PQ or HLG): only standard dynamic range is "
-                "read. Convert it with a tone curve, for instance FFmpeg's zscale and tonemap."
-            )
         if info.unevenness_s > MAX_UNEVENNESS_S:
             raise InputError(
                 f"{quote_path(source.path)} has a variable frame rate: its timestamps deviate "

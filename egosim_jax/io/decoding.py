@@ -1,11 +1,23 @@
 """Decode untrusted videos, packet by packet and frame by frame.
 
+Everything that opens a video opens it here, so that each file has one track, geometry and color:
+
+- The track is the first that the file marks as default, else the first. Cover art, thumbnails and
+  other still images are skipped, as are tracks of one frame if there are longer ones.
+- Frames are rotated and mirrored by the display matrix. Pixels that are not square are resized to
+  square ones: the width is multiplied by the sample aspect ratio of the container or, without one,
+  of the codec. A ratio within 1 % of 1:1 comes from rounding a size to whole pixels.
+- Chroma is sited as the file or the standard of its codec states: on the left columns in MPEG-2,
+  MPEG-4, H.264 and H.265. Where neither states it, chroma is centered.
+- Colors of wide gamut (BT.2020, P3) are converted to BT.709, but not by `official` decoding.
+- HDR and other transfer functions that need a tone curve, matrices that FFmpeg cannot convert,
+  interlaced frames, frames of two views and spherical ones are refused.
+
 Only the contents of regular files are opened, never names or addresses inside a file. The header is
 checked against limits before anything is decoded. Detectable damage is refused: the decoder must
 report no error, mark no frame as corrupt and return a frame for each packet that the container
-lists. H.264 has no checksum, so a changed bit that leaves a valid stream passes. Frames are rotated
-and mirrored by the display matrix, and frames outside the edit list are omitted, as in every
-player.
+lists. H.264 has no checksum, so a changed bit that leaves a valid stream passes. Frames outside the
+edit list are omitted, as in every player. FFV1 has checksums, which are checked here.
 """
 
 from __future__ import annotations
@@ -20,14 +32,16 @@ from typing import Literal
 
 import av
 import numpy as np
-from av.container import InputContainer
+from av.error import ArgumentError
 from av.packet import Packet
+from av.stream import Disposition
 from av.video.frame import VideoFrame
-from av.video.reformatter import Interpolation
+from av.video.reformatter import ColorPrimaries, Interpolation
 from av.video.stream import VideoStream
 
 from egosim_jax.io.bounded import open_regular, quote_path, refusing
 from egosim_jax.io.boxes import check_boxes
+from egosim_jax.io.ffv1 import is_intact
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
 from egosim_jax.types import InputError
 
@@ -55,8 +69,27 @@ _SCALERS: dict[Decoding, Interpolation] = {
     "accurate": ACCURATE,
     "official": Interpolation.BICUBIC,
 }
-_HDR = (16, 18)
-"""Transfer functions PQ and HLG (ITU-T H.273, table 3)."""
+MAX_UNSQUARE = 0.01
+"""Maximum deviation of the sample aspect ratio from 1 of pixels that count as square."""
+_STILL = (
+    Disposition.attached_pic
+    | Disposition.timed_thumbnails
+    | Disposition.still_image
+    | Disposition.metadata
+)
+_TRANSFERS = {8: "linear", 9: "logarithmic", 10: "logarithmic", 16: "PQ", 17: "DCDM", 18: "HLG"}
+"""Transfer functions that need a tone curve (ITU-T H.273, table 3)."""
+_WIDE_GAMUT = (9, 11, 12)
+"""Primaries of BT.2020, DCI-P3 and Display P3 (ITU-T H.273, table 2)."""
+_MATRICES = (0, 1, 2, 4, 5, 6, 7, 9)
+"""Matrices that FFmpeg's scaler converts, or 2, not stated (ITU-T H.273, table 4)."""
+_TO_BT709 = (
+    "ffmpeg -i IN -vf scale=out_primaries=bt709:out_transfer=bt709:out_color_matrix=bt709,"
+    "format=yuv420p OUT.mp4"
+)
+_ONE_VIEW, _RECTILINEAR = (0, 8), 4
+"""FFmpeg's types of stereo with one view in a frame, and its projection of a pinhole."""
+_FORMATS = "MP4, MOV, Matroska, WebM, AVI or MPEG-TS"
 _OPTIONS = {
     "format_whitelist": "mov,mp4,m4a,matroska,webm,avi,mpegts",
     "protocol_whitelist": "none",
@@ -79,38 +112,57 @@ def open_file(path: Path) -> Iterator[File]:
 
 
 @contextmanager
-def open_video(file: File, name: str, max_frames: int | None) -> Iterator[InputContainer]:
-    """Open a container with a video stream within the limits; None allows any length."""
+def open_video(file: File, name: str, max_frames: int | None) -> Iterator[VideoStream]:
+    """Open the main video stream of a file within the limits; None allows any length.
+
+    Raises `InputError` for a file without a video stream, or if its color cannot be read right.
+    """
     check_boxes(file, name)
     with refusing(f"{name} is not a readable video"):
-        container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
+        try:
+            container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
+        except ArgumentError as error:  # of a format that is not in the list
+            raise InputError(
+                f"{name} is not a readable video: it must be {_FORMATS}. Convert it, for instance "
+                "with `ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
+            ) from error
     with container:
-        if not container.streams.video:
+        shown = [stream for stream in container.streams.video if not stream.disposition & _STILL]
+        if not shown:
             raise InputError(f"{name} has no video stream.")
-        stream = container.streams.video[0]
+        shown = [stream for stream in shown if stream.frames != 1] or shown  # 0 if not listed
+        main = [stream for stream in shown if stream.disposition & Disposition.default]
+        stream = (main or shown)[0]
         if stream.codec_context is None:
             raise InputError(f"{name} is of a codec that is not known.")
         with refusing(f"{name} is not a readable video"):
             stream.codec_context.options = _OPTIONS
             stream.thread_type = "AUTO"
-            area = stream.height * stream.width
+        _check_color(stream, name)
+        area = stream.height * _square_width(stream, stream.width)
+        if area > MAX_IMAGE_PIXELS:
+            raise InputError(
+                f"{name} has frames of {area:,} square pixels, more than {MAX_IMAGE_PIXELS:,}, the "
+                f"maximum (sample aspect ratio {stream.sample_aspect_ratio})."
+            )
         check_size(name, stream.frames if max_frames else 1, area, max_frames or 1)
-        yield container
+        yield stream
 
 
-def read_packets(container: InputContainer, name: str, max_frames: int) -> Iterator[Packet | None]:
+def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Packet | None]:
     """Yield packets, then None, which flushes the decoder.
 
     Raises `DamagedError` at the end if the file was cut off.
     """
-    stream, read = container.streams.video[0], 0
+    read = 0
     try:
         with refusing(f"{name} is damaged", DamagedError):
-            for number, packet in enumerate(container.demux(stream)):
+            for number, packet in enumerate(stream.container.demux(stream)):
                 check_size(name, number // 2, 0, max_frames)  # empty packets count, too
                 if packet.is_corrupt:
                     raise DamagedError(f"{name} is cut off after {read} frames.")
                 if packet.size:
+                    check_packet(stream, packet, name)
                     read += 1
                     yield packet
     except DamagedError:
@@ -122,17 +174,27 @@ def read_packets(container: InputContainer, name: str, max_frames: int) -> Itera
         raise DamagedError(f"{name} is cut off: it holds {read} of the {listed} frames it lists.")
 
 
+def check_packet(stream: VideoStream, packet: Packet, name: str) -> None:
+    """Raise `DamagedError` if a packet does not have the checksum that is in it."""
+    coder = stream.codec_context
+    if coder.name == "ffv1" and not is_intact(bytes(packet), coder.extradata):
+        raise DamagedError(f"{name} is damaged: a packet does not have its checksum.")
+
+
 def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
     """Decode a packet; None flushes the decoder. Raises `DamagedError`."""
     with refusing(f"{name} is damaged", DamagedError):
-        return stream.decode(packet)
+        frames = stream.decode(packet)
+    for frame in frames:
+        _check_frame(frame, name)
+    return frames
 
 
-def read_frames(container: InputContainer, name: str, max_frames: int) -> Iterator[VideoFrame]:
+def read_frames(stream: VideoStream, name: str, max_frames: int) -> Iterator[VideoFrame]:
     """Yield decoded frames. Raises `DamagedError` where the video is damaged."""
-    stream, size = container.streams.video[0], None
+    size = None
     shown = given = 0
-    for packet in read_packets(container, name, max_frames):
+    for packet in read_packets(stream, name, max_frames):
         shown += packet is not None and not packet.is_discard
         for frame in decode_packet(stream, packet, name):
             size = size or (frame.height, frame.width)
@@ -145,25 +207,96 @@ def read_frames(container: InputContainer, name: str, max_frames: int) -> Iterat
         raise DamagedError(f"{name} is damaged: {given} of its {shown} frames can be decoded.")
 
 
-def to_rgb(frame: VideoFrame, decoding: Decoding) -> np.ndarray:
-    """Return a decoded frame as upright RGB `h w 3`."""
-    frame_rgb = frame.reformat(format="rgb24", interpolation=_SCALERS[decoding])
-    return upright(frame, frame_rgb.to_ndarray())
+def to_rgb(stream: VideoStream, frame: VideoFrame, decoding: Decoding) -> np.ndarray:
+    """Return a decoded frame of a stream as it is shown: upright RGB `h w 3` of square pixels."""
+    wide = frame.color_primaries in _WIDE_GAMUT and decoding == "accurate"
+    frame_rgb = frame.reformat(
+        width=_square_width(stream, frame.width),
+        format="rgb24",
+        interpolation=_SCALERS[decoding],
+        dst_color_primaries=ColorPrimaries.BT709 if wide else None,
+    )
+    return _upright(frame, frame_rgb.to_ndarray())
 
 
-def upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
-    """Rotate and mirror a frame by its display matrix (a b u, c d v, x y w).
+def shown_size(stream: VideoStream, frame: VideoFrame) -> tuple[int, int]:
+    """Return height and width of a decoded frame of a stream as it is shown."""
+    empty = np.broadcast_to(np.uint8(0), (frame.height, _square_width(stream, frame.width)))
+    height, width = _upright(frame, empty).shape
+    return height, width
+
+
+def pixel_aspect(stream: VideoStream) -> Fraction:
+    """Return width over height of the stored pixels of a stream; 1 if they count as square."""
+    ratio = stream.sample_aspect_ratio or Fraction(1)
+    return Fraction(1) if abs(ratio - 1) <= MAX_UNSQUARE else ratio
+
+
+def _square_width(stream: VideoStream, width: int) -> int:
+    """Return the width of a stored frame in square pixels."""
+    return max(1, round(width * pixel_aspect(stream)))
+
+
+def _check_color(source: VideoStream | VideoFrame, name: str) -> None:
+    """Raise `InputError` if the colors of a stream or frame cannot be read right."""
+    transfer = _TRANSFERS.get(source.color_trc)
+    if transfer is not None:
+        raise InputError(
+            f"{name} is HDR or a camera's own format (transfer function {transfer}): without a "
+            f"tone curve it would be pale. Convert it, for instance with FFmpeg 8: `{_TO_BT709}`."
+        )
+    if source.colorspace not in _MATRICES:
+        raise InputError(
+            f"{name} has the color matrix {source.colorspace} of ITU-T H.273, which is not read. "
+            "Convert it, for instance with `ffmpeg -i IN -vf zscale=matrix=709 OUT.mp4`."
+        )
+
+
+def _check_frame(frame: VideoFrame, name: str) -> None:
+    """Raise `InputError` if a frame is not one upright image of a pinhole or its like."""
+    _check_color(frame, name)
+    a, b, c, d = _display_matrix(frame)
+    if (a or d) and (b or c):
+        problem = "is rotated by an angle that is not a multiple of 90°"
+        command = "ffmpeg -display_rotation 0 -i IN -c copy OUT.mp4"
+    elif frame.interlaced_frame:
+        problem = "is interlaced: rows of two times alternate in a frame"
+        command = "ffmpeg -i IN -vf bwdif=mode=send_frame OUT.mp4"
+    elif _side_value(frame, "STEREO3D") not in (None, *_ONE_VIEW):
+        problem = "is stereoscopic: each frame holds two views, for instance side by side (sbsl)"
+        command = "ffmpeg -i IN -vf stereo3d=sbsl:ml OUT.mp4"
+    elif _side_value(frame, "SPHERICAL") not in (None, _RECTILINEAR):
+        problem = "is spherical (360° or 180°), not the image of a pinhole"
+        command = "ffmpeg -i IN -vf v360=e:flat:h_fov=90:v_fov=60 OUT.mp4"
+    else:
+        return
+    raise InputError(f"{name} {problem}. Convert it, for instance with `{command}`.")
+
+
+def _side_value(frame: VideoFrame, kind: str) -> int | None:
+    """Return the first field of a frame's side data, or None if the frame has none."""
+    if kind not in frame.side_data:
+        return None
+    return int(np.frombuffer(bytes(frame.side_data[kind]), np.int32, count=1)[0])
+
+
+def _upright(frame: VideoFrame, pixels: np.ndarray) -> np.ndarray:
+    """Rotate and mirror a frame by its display matrix."""
+    a, b, c, d = _display_matrix(frame)
+    if b or c:
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+
+
+def _display_matrix(frame: VideoFrame) -> tuple[int, int, int, int]:
+    """Return a, b, c and d of a frame's display matrix (a b u, c d v, x y w).
 
     A point (x, y) is shown at (a x + c y, b x + d y), y downward.
     """
     if "DISPLAYMATRIX" not in frame.side_data:
-        return pixels
-    a, b, _, c, d, *_ = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32)
-    if (a or d) and (b or c):
-        raise InputError("the video is rotated by an angle that is not a multiple of 90°.")
-    if b or c:
-        pixels, a, d = pixels.swapaxes(0, 1), c, b
-    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+        return 1, 0, 0, 1
+    a, b, _, c, d, *_ = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32).tolist()
+    return a, b, c, d
 
 
 def check_size(name: str, frames: int, area: int, max_frames: int) -> None:
@@ -182,11 +315,6 @@ def frame_rate(stream: VideoStream, name: str) -> Fraction:
     if not rate:
         raise InputError(f"{name} does not say its frame rate.")
     return rate
-
-
-def is_hdr(stream: VideoStream) -> bool:
-    """Return True if the transfer function of a stream is PQ or HLG."""
-    return stream.codec_context.color_trc in _HDR
 
 
 class FrameBuffer:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from av.container import InputContainer
 from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
 
 from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.boxes import MAX_SAMPLES
@@ -21,14 +21,15 @@ from egosim_jax.io.decoding import (
     DamagedError,
     File,
     FrameBuffer,
+    check_packet,
     check_size,
     decode_packet,
     frame_rate,
-    is_hdr,
     open_file,
     open_video,
+    pixel_aspect,
+    shown_size,
     to_rgb,
-    upright,
 )
 from egosim_jax.io.video import Video, VideoInfo
 from egosim_jax.types import InputError, check_counts
@@ -51,17 +52,17 @@ def probe_long_video(path: Path) -> VideoInfo:
     name = quote_path(path)
     with open_file(path) as file:
         listing = _list(file, name)
-        with open_video(file, name, None) as container:
-            decoded = next(_frames(container, name, listing.keys[0][1]))
-            height, width = upright(decoded, np.empty((decoded.height, decoded.width))).shape
-            stream = container.streams.video[0]
-            fps, hdr, unit = frame_rate(stream, name), is_hdr(stream), stream.time_base
+        with open_video(file, name, None) as stream:
+            decoded = next(_frames(stream, name, listing.keys[0][1]))
+            height, width = shown_size(stream, decoded)
+            fps, unit = frame_rate(stream, name), stream.time_base
+            aspect = pixel_aspect(stream)
     return VideoInfo(
         frames=len(listing.times),
         height=height,
         width=width,
         fps=fps,
-        hdr=hdr,
+        pixel_aspect=aspect,
         unevenness_s=_unevenness(listing.times) * float(unit or 0),
     )
 
@@ -89,19 +90,19 @@ def read_segment(
                 f"{len(listing.times)}, counted from 0."
             )
         first, last = listing.times[start], listing.times[start + count - 1]
-        with open_video(file, name, None) as container:
+        with open_video(file, name, None) as stream:
             key = max((k for k in listing.keys if k[0] <= first), default=listing.keys[0])
-            for decoded in _frames(container, name, key[1]):
+            for decoded in _frames(stream, name, key[1]):
                 time = first - 1 if decoded.pts is None else decoded.pts
                 if time < first:
                     continue
                 if time != listing.times[start + len(kept)]:
                     break
-                frame = to_rgb(decoded, "accurate")
+                frame = to_rgb(stream, decoded, "accurate")
                 kept.append(frame if each is None else each(frame))
                 if time >= last:
                     break
-            fps = frame_rate(container.streams.video[0], name)
+            fps = frame_rate(stream, name)
     if len(kept) < count:
         raise DamagedError(f"{name} is damaged: frame {start + len(kept)} cannot be decoded.")
     return Video(frames=kept.frames(), fps=fps)
@@ -110,14 +111,14 @@ def read_segment(
 def _list(file: File, name: str) -> _Listing:
     """List the frames of a video without decoding them."""
     times, keys = list[int](), list[tuple[int, int]]()
-    with open_video(file, name, None) as container:
-        stream = container.streams.video[0]
+    with open_video(file, name, None) as stream:
         try:
-            for packet in container.demux(stream):
+            for packet in stream.container.demux(stream):
                 if not packet.size:
                     continue
                 if packet.is_corrupt or packet.pts is None or len(times) > MAX_SAMPLES:
                     raise DamagedError(f"{name} is damaged after {len(times)} frames.")
+                check_packet(stream, packet, name)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
                 if not packet.is_discard:
@@ -136,9 +137,9 @@ def _unevenness(times: list[int]) -> float:
     return float(np.abs(np.array(times) - even).max())
 
 
-def _frames(container: InputContainer, name: str, dts: int) -> Iterator[VideoFrame]:
+def _frames(stream: VideoStream, name: str, dts: int) -> Iterator[VideoFrame]:
     """Yield decoded frames, starting at the key frame with decoding time `dts`."""
-    stream = container.streams.video[0]
+    container = stream.container
     container.seek(dts, stream=stream, backward=True)
     size, count = None, 0
     for packet in container.demux(stream):

@@ -3,7 +3,9 @@
 Colors are converted between RGB and YUV 4:2:0 with accurate rounding and interpolated chroma.
 EgoSim's loader (`decoding="official"`) uses the scaler's fast default, whose frames are about one
 gray level darker. That error would accumulate in a loop that writes clips and reads them back.
-Written files are tagged BT.601, limited range, as readers assume of untagged files.
+Written files are tagged with the matrix of BT.601 and limited range, as readers assume of untagged
+files, and with sRGB's primaries and transfer function. Their chroma is on the left columns, as
+H.264 says of files that do not state another place (`io/chroma.py`).
 `io/decoding.py` says which files are refused.
 """
 
@@ -19,11 +21,11 @@ from typing import Any, no_type_check
 
 import av
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import quote_path
+from egosim_jax.io.chroma import to_yuv420
 from egosim_jax.io.decoding import (
     ACCURATE,
     MAX_FRAMES,
@@ -34,19 +36,19 @@ from egosim_jax.io.decoding import (
     FrameBuffer,
     decode_packet,
     frame_rate,
-    is_hdr,
     open_file,
     open_video,
+    pixel_aspect,
     read_frames,
     read_packets,
+    shown_size,
     to_rgb,
-    upright,
 )
 from egosim_jax.types import InputError
 
 CRF = 10
 """Default quality of x264: 0 is lossless, 10 visually lossless (about 50 dB), 23 x264's own."""
-_SMPTE170M, _LIMITED_RANGE = 6, 1
+_SMPTE170M, _LIMITED_RANGE, _BT709, _SRGB = 6, 1, 1, 13
 
 
 @no_type_check
@@ -61,16 +63,25 @@ class Video:
 
 @dataclass(frozen=True, kw_only=True)
 class VideoInfo:
-    """Length, size and rate of a video, read without decoding it."""
+    """Length, size as shown and rate of a video, read without decoding it."""
 
     frames: int
     height: int
     width: int
     fps: Fraction
-    hdr: bool = False
-    """True if brightness is encoded for HDR, by PQ or HLG; its 8-bit version looks pale."""
+    pixel_aspect: Fraction = Fraction(1)
+    """Width over height of a stored pixel; frames are read with square ones."""
     unevenness_s: float = 0.0
     """Maximum deviation of frame times from equal spacing, in seconds; 0 if not measured."""
+
+    def check_square(self, name: str) -> None:
+        """Raise `InputError` if intrinsics of stored pixels would not fit the frames."""
+        if self.pixel_aspect != 1:
+            raise InputError(
+                f"{name} stores pixels {self.pixel_aspect} times as wide as high, and it is not "
+                "known whether its intrinsics are for these or for square ones. Convert it with "
+                "`ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT.mp4`, and the intrinsics, too."
+            )
 
 
 def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
@@ -138,19 +149,13 @@ def decode_video(
 
 def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
     frames, size = 0, None
-    with open_video(file, name, MAX_FRAMES) as container:
-        stream = container.streams.video[0]
+    with open_video(file, name, MAX_FRAMES) as stream:
         try:
-            for packet in read_packets(container, name, MAX_FRAMES):
+            for packet in read_packets(stream, name, MAX_FRAMES):
                 frames += packet is not None and not packet.is_discard
                 if size is None:
-                    size = next(
-                        (
-                            upright(p, np.empty((p.height, p.width))).shape
-                            for p in decode_packet(stream, packet, name)
-                        ),
-                        None,
-                    )
+                    decoded = decode_packet(stream, packet, name)
+                    size = shown_size(stream, decoded[0]) if decoded else None
         except DamagedError:
             if damage == "refuse" or size is None:
                 raise
@@ -161,7 +166,7 @@ def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
             height=size[0],
             width=size[1],
             fps=frame_rate(stream, name),
-            hdr=is_hdr(stream),
+            pixel_aspect=pixel_aspect(stream),
         )
 
 
@@ -176,19 +181,19 @@ def _decode(
     each: Callable[[np.ndarray], np.ndarray] | None,
 ) -> Video:
     start, stop, kept = frames.start, frames.stop, FrameBuffer(name)
-    with open_video(file, name, max_frames) as container:
+    with open_video(file, name, max_frames) as stream:
         try:
-            for index, decoded in enumerate(read_frames(container, name, max_frames)):
+            for index, decoded in enumerate(read_frames(stream, name, max_frames)):
                 if stop is not None and index >= stop:
                     break
                 if index < start:
                     continue
-                frame = to_rgb(decoded, decoding)
+                frame = to_rgb(stream, decoded, decoding)
                 kept.append(frame if each is None else each(frame))
         except DamagedError:
             if damage == "refuse" or not len(kept):
                 raise
-        fps = frame_rate(container.streams.video[0], name)
+        fps = frame_rate(stream, name)
     if not len(kept):
         wanted = f" from frame {start} on" if start else ""
         raise InputError(f"{name} holds no frames{wanted}.")
@@ -266,15 +271,9 @@ def _encode(
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         # With its macroblock tree, x264 is not deterministic on some processors.
         stream.options = {"crf": str(crf), "x264-params": "mbtree=0"}
-        stream.codec_context.colorspace = _SMPTE170M
-        stream.codec_context.color_range = _LIMITED_RANGE
+        coder = stream.codec_context
+        coder.colorspace, coder.color_range = _SMPTE170M, _LIMITED_RANGE
+        coder.color_primaries, coder.color_trc = _BT709, _SRGB
         for frame in frames:
-            coded = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-            coded = coded.reformat(
-                format="yuv420p",
-                interpolation=ACCURATE,
-                dst_colorspace=Colorspace.ITU601,
-                dst_color_range=ColorRange.MPEG,
-            )
-            container.mux(stream.encode(coded))
+            container.mux(stream.encode(to_yuv420(frame, ACCURATE)))
         container.mux(stream.encode())

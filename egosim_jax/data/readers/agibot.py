@@ -126,6 +126,7 @@ class AgiBot:
 
     def _read(self, files: _Files, part: _Part, folder: Path) -> Recording:
         info = probe_long_video(files.video)
+        info.check_square(quote_path(files.video))
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
         joints, tools, notes = _read_grippers(files.states)

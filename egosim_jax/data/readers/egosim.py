@@ -69,6 +69,7 @@ def _read(clip: Path, folder: Path) -> Recording:
     if video is None:
         raise InputError(f"{quote_path(clip)} has none of {', '.join(VIDEOS)}.")
     info = probe_long_video(video)
+    info.check_square(quote_path(video))
     poses_folder = _find_poses(clip / "_proc")
     paths = sorted(poses_folder.glob("extrinsics_*.npy"), key=natural_order)
     if len(paths) != info.frames:

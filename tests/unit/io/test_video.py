@@ -13,6 +13,7 @@ import pytest
 from egosim_jax.io import decoding
 from egosim_jax.io.boxes import check_boxes
 from egosim_jax.io.images import read_image
+from egosim_jax.io.segments import probe_long_video
 from egosim_jax.io.video import (
     decode_video,
     encode_video,
@@ -310,3 +311,31 @@ def test_the_groups_of_samples_of_a_phones_video_are_counted():
     many = group[:8] + (2**30).to_bytes(4, "big") + group[12:]
     with pytest.raises(InputError, match="more than 4,194,304 samples"):
         check_boxes(io.BytesIO((8 + len(many)).to_bytes(4, "big") + b"sbgp" + many), "a.mp4")
+
+
+@pytest.mark.parametrize(
+    ("level", "slicecrc", "slices"), [(3, 1, 4), (3, 1, 16), (3, 0, 4), (1, 0, 1)]
+)
+def test_a_damaged_slice_of_ffv1_is_refused_by_its_checksum(tmp_path, level, slicecrc, slices):
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        stream.options = {"level": str(level)}
+        if level == 3:
+            stream.options |= {"slicecrc": str(slicecrc), "slices": str(slices)}
+        for frame in detailed():
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    data = buffer.getvalue()
+    assert len(decode_video(data).frames) == 9
+    with av.open(io.BytesIO(data)) as container:
+        third = bytes([*container.demux(video=0)][2])
+    for at in (40, len(third) // 2, len(third) - 200):
+        where = data.index(third) + at
+        damaged = data[:where] + bytes(100) + data[where + 100 :]
+        if slicecrc:
+            (tmp_path / "damaged.mkv").write_bytes(damaged)
+            for reader in (read_video, probe_video, probe_long_video):
+                with pytest.raises(InputError, match="checksum"):
+                    reader(tmp_path / "damaged.mkv")

@@ -1,0 +1,487 @@
+"""Videos are shown as their files say: track, rotation, aspect and color, by every opener."""
+
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.filter import Graph
+from av.stream import Disposition
+
+import egosim_jax
+from egosim_jax.annotate.sources import Source, open_source
+from egosim_jax.data.clips import encoded_first_frame
+from egosim_jax.data.readers.taste_rob import TasteRob
+from egosim_jax.io import decoding
+from egosim_jax.io.images import decode_image
+from egosim_jax.io.segments import probe_long_video, read_segment
+from egosim_jax.io.video import (
+    decode_video,
+    encode_video,
+    probe_encoded,
+    probe_video,
+    read_video,
+    write_video,
+)
+from egosim_jax.types import InputError
+
+FRAMES = 9
+HEIGHT, WIDTH = 96, 128
+
+
+def shown_image(height=HEIGHT, width=WIDTH):
+    """Smooth, and different at every rotation and mirroring."""
+    y, x = np.meshgrid(np.linspace(0, 1, height), np.linspace(0, 1, width), indexing="ij")
+    return np.stack([40 + 150 * y, 60 + 120 * x, 200 - 90 * x * y], axis=-1).astype(np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """One stream of a file: what it stores, and what the file says of it."""
+
+    image: np.ndarray
+    codec: str = "libx264"
+    pix_fmt: str = "yuv420p"
+    aspect: Fraction | None = None
+    rotation: float | None = None
+    mirrored: bool = False
+    disposition: Disposition | None = None
+    frames: int = FRAMES
+    interlaced: bool = False
+    x264: str = ""
+    color: tuple[int, int, int] | None = None
+    """Primaries, transfer function and matrix of ITU-T H.273."""
+
+
+OPTIONS = {
+    "libx264": {"crf": "4"},
+    "libx265": {"x265-params": "log-level=none:crf=4"},
+    "libvpx-vp9": {"crf": "8", "b:v": "0", "cpu-used": "8"},
+}
+
+
+def write_tracks(path, *tracks):
+    """Write the tracks of a file, frame by frame, in the order of their times."""
+    with av.open(str(path), "w") as container:
+        streams = []
+        for track in tracks:
+            height, width, _ = track.image.shape
+            stream = container.add_stream(track.codec, rate=30)
+            stream.width, stream.height, stream.pix_fmt = width, height, track.pix_fmt
+            stream.options = dict(OPTIONS.get(track.codec, {}))
+            if track.x264:
+                stream.options["x264-params"] = track.x264
+            if track.interlaced:
+                stream.codec_context.flags |= av.codec.context.Flags.interlaced_dct
+            if track.aspect is not None:
+                stream.codec_context.sample_aspect_ratio = track.aspect
+            if track.rotation is not None or track.mirrored:
+                stream.set_display_rotation(track.rotation or 0, hflip=track.mirrored)
+            if track.disposition is not None:
+                stream.disposition = track.disposition
+            if track.color is not None:
+                coder = stream.codec_context
+                coder.color_primaries, coder.color_trc, coder.colorspace = track.color
+            streams.append(stream)
+        for index in range(FRAMES):
+            for track, stream in zip(tracks, streams, strict=True):
+                if index < track.frames:
+                    frame = av.VideoFrame.from_ndarray(track.image, format="rgb24")
+                    matrix = {1: 1, 9: 9}.get(track.color[2] if track.color else 0)
+                    frame = frame.reformat(format=track.pix_fmt, dst_colorspace=matrix)
+                    container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode())
+    return path
+
+
+def squeezed(image, aspect):
+    """Store an image with pixels that are `aspect` times as wide as high."""
+    return cv2.resize(
+        image, (round(image.shape[1] / aspect), image.shape[0]), interpolation=cv2.INTER_AREA
+    )
+
+
+OTHER = np.full((48, 64, 3), 90, np.uint8)
+WIDE = Fraction(4, 3)
+NARROW = Fraction(2, 3)
+UP = shown_image()
+
+READ: dict[str, tuple[str, np.ndarray, list[Track]]] = {
+    "plain": ("mp4", UP, [Track(image=UP)]),
+    "aspect-of-mp4": ("mp4", UP, [Track(image=squeezed(UP, WIDE), aspect=WIDE)]),
+    "aspect-of-codec-only": ("ts", UP, [Track(image=squeezed(UP, WIDE), aspect=WIDE)]),
+    "aspect-of-container-only": (
+        "mp4",
+        UP,
+        [Track(image=squeezed(UP, WIDE), aspect=WIDE, codec="libvpx-vp9")],
+    ),
+    "pixels-higher-than-wide": ("mkv", UP, [Track(image=squeezed(UP, NARROW), aspect=NARROW)]),
+    "rounding-is-no-aspect": ("mp4", UP, [Track(image=UP, aspect=Fraction(1280, 1281))]),
+    "rotated-90": ("mp4", np.rot90(UP), [Track(image=UP, rotation=90)]),
+    "rotated-180": ("mov", np.rot90(UP, 2), [Track(image=UP, rotation=180)]),
+    "rotated-270-and-aspect": (
+        "mp4",
+        np.rot90(UP, 3),
+        [Track(image=squeezed(UP, WIDE), aspect=WIDE, rotation=270)],
+    ),
+    "mirrored-and-aspect": (
+        "mp4",
+        UP[:, ::-1],
+        [Track(image=squeezed(UP, NARROW), aspect=NARROW, mirrored=True)],
+    ),
+    "default-track-second": (
+        "mp4",
+        UP,
+        [
+            Track(image=OTHER, disposition=Disposition(0)),
+            Track(image=UP, disposition=Disposition.default),
+        ],
+    ),
+    "default-track-second-in-matroska": (
+        "mkv",
+        UP,
+        [
+            Track(image=OTHER, disposition=Disposition.original),
+            Track(image=UP, disposition=Disposition.default),
+        ],
+    ),
+    "two-default-tracks": (
+        "mkv",
+        UP,
+        [
+            Track(image=UP, disposition=Disposition.default),
+            Track(image=OTHER, disposition=Disposition.default),
+        ],
+    ),
+    "cover-art-first": (
+        "mp4",
+        UP,
+        [
+            Track(image=OTHER, codec="mjpeg", pix_fmt="yuvj420p", frames=1,
+                  disposition=Disposition.attached_pic),
+            Track(image=UP),
+        ],
+    ),
+    "still-track-first": (
+        "mov",
+        UP,
+        [Track(image=OTHER, codec="mjpeg", pix_fmt="yuvj420p", frames=1), Track(image=UP)],
+    ),
+    "full-range": ("mp4", UP, [Track(image=UP, codec="mjpeg", pix_fmt="yuvj444p")]),
+    "bt709-matrix": ("mp4", UP, [Track(image=UP, color=(1, 1, 1))]),
+    "ten-bits": ("mp4", UP, [Track(image=UP, codec="libx265", pix_fmt="yuv420p10le")]),
+}  # fmt: skip
+
+SDR_2020 = Track(image=UP, codec="libx265", pix_fmt="yuv420p10le", color=(9, 14, 9))
+PQ = Track(image=UP, codec="libx265", pix_fmt="yuv420p10le", color=(9, 16, 9))
+HLG = Track(image=UP, codec="libx265", pix_fmt="yuv420p10le", color=(9, 18, 9))
+REFUSED: dict[str, tuple[str, str, list[Track]]] = {
+    "pq": ("mp4", "HDR .*PQ.*out_transfer=bt709", [PQ]),
+    "hlg": ("mkv", "HDR .*HLG.*out_transfer=bt709", [HLG]),
+    "hlg-in-8-bits": ("mp4", "HDR .*HLG", [Track(image=UP, color=(9, 18, 9))]),
+    "hlg-of-the-codec-only": ("ts", "HDR .*HLG", [HLG]),
+    "logarithmic": ("mkv", "logarithmic", [Track(image=UP, color=(1, 9, 1))]),
+    "hdr-track-is-the-default": (
+        "mp4",
+        "HDR .*PQ",
+        [
+            Track(image=OTHER, disposition=Disposition(0)),
+            Track(image=UP, color=(9, 16, 9), disposition=Disposition.default),
+        ],
+    ),
+    "matrix-of-ycgco": ("mkv", "matrix 8", [Track(image=UP, color=(1, 1, 8))]),
+    "interlaced": ("mp4", "interlaced.*bwdif", [Track(image=UP, interlaced=True)]),
+    "two-views-in-a-frame": (
+        "mkv", "stereoscopic.*stereo3d", [Track(image=UP, x264="frame-packing=3")],
+    ),
+    "oblique": ("mp4", "not a multiple of 90", [Track(image=UP, rotation=30)]),
+}  # fmt: skip
+
+
+def _imported(path: Path) -> np.ndarray:
+    (path.parent / "captions.csv").write_text(f"video,caption\n{path.name},A hand.\n")
+    (entry,) = TasteRob(source=path.parent).find()
+    recording = entry.read(path.parent)
+    frame = recording.read_frames(0, 2).frames[1]
+    assert frame.shape[:2] == (recording.height, recording.width)
+    return frame
+
+
+def _annotated(path: Path) -> np.ndarray:
+    return open_source(Source(name="a", path=path)).read_frames(1, 2).frames[0]
+
+
+def _probed(path: Path, probe: Callable) -> np.ndarray:
+    info = probe(path)
+    assert info.frames == FRAMES
+    return np.broadcast_to(np.uint8(0), (info.height, info.width, 3))
+
+
+OPENERS: dict[str, Callable[[Path], np.ndarray]] = {
+    "read_video": lambda path: read_video(path).frames[1],
+    "read_video-official": lambda path: read_video(path, decoding="official").frames[1],
+    "decode_video": lambda path: decode_video(path.read_bytes(), start=1).frames[0],
+    "read_segment": lambda path: read_segment(path, start=1, count=3).frames[0],
+    "probe_video": lambda path: _probed(path, probe_video),
+    "probe_encoded": lambda path: _probed(path, lambda p: probe_encoded(p.read_bytes())),
+    "probe_long_video": lambda path: _probed(path, probe_long_video),
+    "first_frame": lambda path: decode_image(
+        encoded_first_frame(path.rename(path.with_suffix(".mkv")))  # contents decide
+    ),
+    "data-import": _imported,
+    "annotate": _annotated,
+}
+
+
+@pytest.mark.parametrize("opener", OPENERS)
+@pytest.mark.parametrize("member", READ)
+def test_a_video_is_read_as_it_is_shown(tmp_path, member, opener):
+    suffix, expected, tracks = READ[member]
+    frame = OPENERS[opener](write_tracks(tmp_path / f"a.{suffix}", *tracks))
+    assert frame.shape == expected.shape
+    if frame.any():
+        assert np.abs(frame.astype(int) - expected)[4:-4, 4:-4].max() <= 8
+
+
+@pytest.mark.parametrize("opener", OPENERS)
+@pytest.mark.parametrize("member", REFUSED)
+def test_a_video_that_would_be_misread_is_refused(tmp_path, member, opener):
+    suffix, message, tracks = REFUSED[member]
+    path = write_tracks(tmp_path / f"a.{suffix}", *tracks)
+    with pytest.raises(InputError, match=message):
+        OPENERS[opener](path)
+
+
+def test_only_one_module_opens_videos():
+    """The others go through `open_video`, so that none has its own idea of geometry and color."""
+    package = Path(egosim_jax.__file__).parent
+    found = {
+        str(path.relative_to(package)): sorted(set(re.findall(r"av\.open|VideoCapture", text)))
+        for path in package.rglob("*.py")
+        if re.search(r"\bav\.open|VideoCapture", text := path.read_text())
+    }
+    assert found == {"io/decoding.py": ["av.open"], "io/video.py": ["av.open"]}
+    assert (package / "io/video.py").read_text().count('av.open(file, "w"') == 1
+
+
+def test_colors_of_bt2020_are_converted(tmp_path):
+    """Expected by the matrix of ITU-R BT.2087 between displays with a gamma of 2.4."""
+    stored = np.full((HEIGHT, WIDTH, 3), (128, 77, 51), np.uint8)
+    track = Track(image=stored, codec="libx265", pix_fmt="yuv420p10le", color=(9, 14, 9))
+    frame = read_video(write_tracks(tmp_path / "a.mp4", track)).frames[0]
+    linear = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083],
+                       [-0.0182, -0.1006, 1.1187]]) @ (stored[0, 0] / 255) ** 2.4  # fmt: skip
+    assert np.abs(frame[48, 64] - 255 * linear ** (1 / 2.4)).max() <= 8
+
+
+def test_frames_that_square_pixels_make_too_large_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(decoding, "MAX_IMAGE_PIXELS", 10 * HEIGHT * WIDTH)
+    path = write_tracks(tmp_path / "a.mkv", Track(image=UP, aspect=Fraction(20)))
+    with pytest.raises(InputError, match="square pixels"):
+        read_video(path)
+
+
+def _ready(graph):
+    while True:
+        try:
+            yield graph.vpull()
+        except (av.BlockingIOError, av.EOFError):
+            return
+
+
+def converted(path, target, *filters):
+    """Do what `ffmpeg -i path -vf filters target` does, by the filters of the same library."""
+    with av.open(str(path)) as source, av.open(str(target), "w") as container:
+        old = source.streams.video[0]
+        new = container.add_stream("libx264", rate=old.average_rate)
+        new.width, new.height, new.pix_fmt = old.width, old.height, "yuv420p"
+        graph = Graph()
+        nodes = [graph.add_buffer(template=old), *(graph.add(*f.split("=", 1)) for f in filters)]
+        graph.link_nodes(*nodes, graph.add("buffersink")).configure()
+        for frame in [*source.decode(old), None]:
+            graph.vpush(frame)
+            for coded in _ready(graph):
+                coded.pts = None
+                coder = new.codec_context
+                coder.color_primaries, coder.color_trc = coded.color_primaries, coded.color_trc
+                container.mux(new.encode(coded))
+        container.mux(new.encode())
+    return target
+
+
+@pytest.mark.parametrize("member", ["pq", "hlg", "interlaced"])
+def test_the_advised_conversion_is_read(tmp_path, member):
+    suffix, _, tracks = REFUSED[member]
+    path = write_tracks(tmp_path / f"a.{suffix}", *tracks)
+    with pytest.raises(InputError) as caught:
+        read_video(path)
+    (filters,) = re.findall(r"-vf (\S+) OUT", str(caught.value))
+    back = read_video(converted(path, tmp_path / "b.mp4", *filters.split(",")))
+    assert back.frames.shape[1:] == UP.shape
+    assert len(back.frames) >= FRAMES - 1
+
+
+def box(kind, *content):
+    return struct.pack(">I4s", 8 + sum(map(len, content)), kind) + b"".join(content)
+
+
+def described(data, *boxes):
+    """An MP4 whose sample description ends with some boxes."""
+    data, more, start, end = bytearray(data), b"".join(boxes), 0, 0
+    for kind, fields in {b"moov": 0, b"trak": 0, b"mdia": 0, b"minf": 0, b"stbl": 0,
+                         b"stsd": 8, b"avc1": 78}.items():  # fmt: skip
+        while data[start + 4 : start + 8] != kind:
+            start += struct.unpack_from(">I", data, start)[0]
+        (size,) = struct.unpack_from(">I", data, start)
+        struct.pack_into(">I", data, start, size + len(more))
+        start, end = start + 8 + fields, start + size
+    return bytes(data[:end]) + more + bytes(data[end:])
+
+
+def test_a_crop_of_mp4_is_refused():
+    data = encode_video(np.stack([UP] * 3), 8)
+
+    def cropped(width, height):
+        return described(data, box(b"clap", struct.pack(">8I", width, 1, height, 1, 0, 1, 0, 1)))
+
+    assert decode_video(cropped(WIDTH, HEIGHT)).frames.shape == (3, HEIGHT, WIDTH, 3)
+    for width, height in ((WIDTH - 8, HEIGHT), (WIDTH, HEIGHT // 2)):
+        with pytest.raises(InputError, match=r"cropped .*ffmpeg -i IN"):
+            decode_video(cropped(width, height))
+
+
+def test_a_spherical_video_is_refused():
+    """Its boxes are Google's, of Spherical Video V2."""
+    projection = box(b"proj", box(b"prhd", bytes(16)), box(b"equi", bytes(20)))
+    sphere = box(b"sv3d", box(b"svhd", bytes(4), b"camera\0"), projection)
+    data = described(encode_video(np.stack([UP] * 3), 8), sphere)
+    for opener in (decode_video, probe_encoded):
+        with pytest.raises(InputError, match=r"spherical.*v360"):
+            opener(data)
+
+
+@pytest.mark.parametrize("crop", [0xAA, 0xBB, 0xCC, 0xDD], ids=["bottom", "top", "left", "right"])
+def test_a_crop_of_matroska_is_refused(tmp_path, crop):
+    data = write_tracks(tmp_path / "a.mkv", Track(image=UP)).read_bytes()
+    unit = b"\x54\xb2\x81\x04"  # DisplayUnit, which makes room
+    assert data.count(unit) == 1
+    none, some = (data.replace(unit, bytes([0x54, crop, 0x81, n])) for n in (0, 8))
+    assert probe_encoded(none).width == WIDTH
+    with pytest.raises(InputError, match=r"PixelCrop.*ffmpeg -i IN"):
+        probe_encoded(some)
+
+
+def test_a_gif_is_refused_with_the_formats_that_are_read(tmp_path):
+    with av.open(str(tmp_path / "a.gif"), "w") as container:
+        stream = container.add_stream("gif", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "rgb8"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(OTHER, format="rgb24")))
+        container.mux(stream.encode())
+    with pytest.raises(InputError, match=r"must be MP4, .*ffmpeg -i IN"):
+        read_video(tmp_path / "a.gif")
+
+
+def edges(frame):
+    """Columns where luma and redness of a square cross the middle between it and the ground."""
+    row = frame[frame.shape[0] // 2].astype(float)
+    found = []
+    for values in (row @ [0.299, 0.587, 0.114], row[:, 0] - row[:, 1]):
+        middle = (values[5] + values[len(values) // 2]) / 2
+        above = (values > middle) != (values[5] > middle)
+        for at in np.flatnonzero(np.diff(above)):
+            found.append(at + (middle - values[at]) / (values[at + 1] - values[at]))
+    assert len(found) == 4
+    return np.array(found)
+
+
+def tabletop():
+    """Bodies of strong colors on a wooden table, with a shadow, that move a little."""
+    y, x = np.meshgrid(np.arange(96), np.arange(160), indexing="ij")
+    clip = []
+    for time in range(5):
+        grain = np.sin(0.3 * y + 0.05 * x)
+        frame = np.stack([150 + 20 * grain, 110 + 8 * grain, 70 + 0 * grain], axis=-1)
+        frame[30:40, 20 + time : 60 + time] *= 0.6
+        frame[40:70, 20 + time : 50 + time] = (200, 40, 40)
+        frame[np.hypot(y - 50, x - 100) < 18] = (40, 90, 200)
+        frame[20:30, 120:150] = (235, 210, 60)
+        clip.append(frame)
+    return np.clip(clip, 0, 255).astype(np.uint8)
+
+
+def psnr(frames, truth):
+    return 10 * np.log10(255**2 / np.mean((frames.astype(float) - truth) ** 2))
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["columns", "rows"])
+def test_ten_trips_lose_little_and_move_no_edge(turned):
+    square = np.full((5, 64, 96, 3), 128, np.uint8)
+    square[:, 20:44, 32:64] = (220, 40, 40)
+    table = tabletop()
+    if turned:
+        square, table = square.swapaxes(1, 2), table.swapaxes(1, 2)
+    again, loss, found = {0: square, 1: table}, {}, []
+    for trip in range(10):
+        for key, truth in enumerate((square, table)):
+            again[key] = decode_video(encode_video(again[key], 8)).frames
+            if trip in (0, 9):
+                loss[key, trip] = psnr(again[key], truth)
+        found.append(edges(again[0][2].swapaxes(0, 1) if turned else again[0][2]))
+    for key in (0, 1):
+        assert loss[key, 0] > 30
+        assert loss[key, 9] > loss[key, 0] - 1.5, loss
+    np.testing.assert_allclose(found[9], found[0], atol=0.05)
+    np.testing.assert_allclose(found[9], [31.5, 63.5] * 2, atol=0.5)
+
+
+@pytest.mark.parametrize("place", ["left", "center", "topleft"])
+def test_chroma_is_read_where_the_file_has_it(tmp_path, place):
+    frame = np.full((64, 96, 3), 128, np.uint8)
+    frame[:, 32:64] = (220, 40, 40)
+    number = ["left", "center", "topleft"].index(place)
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.options = {"crf": "0", "x264-params": f"chromaloc={number}"}
+        graph = Graph()
+        source = graph.add_buffer(
+            width=96, height=64, format=av.VideoFormat("rgb24"), time_base=Fraction(1, 30)
+        )
+        scale = graph.add("scale", f"flags=bicubic+accurate_rnd:out_chroma_loc={place}")
+        nodes = source, scale, graph.add("format", "yuv420p"), graph.add("buffersink")
+        graph.link_nodes(*nodes).configure()
+        for index in range(3):
+            full = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            full.pts, full.time_base = index, Fraction(1, 30)
+            graph.vpush(full)
+            container.mux(stream.encode(graph.vpull()))
+        container.mux(stream.encode())
+    for found in (
+        read_video(tmp_path / "a.mp4"),
+        read_segment(tmp_path / "a.mp4", start=0, count=1),
+    ):
+        np.testing.assert_allclose(edges(found.frames[0]), [31.5, 63.5] * 2, atol=0.25)
+
+
+def test_a_written_file_states_its_colors(tmp_path):
+    write_video(tmp_path / "a.mp4", tabletop(), 8)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        coder = container.streams.video[0].codec_context
+        stated = coder.colorspace, coder.color_range, coder.color_primaries, coder.color_trc
+    assert stated == (6, 1, 1, 13)  # BT.601's matrix, limited range; BT.709's primaries, sRGB
+
+
+def test_chroma_that_was_read_is_written_unchanged():
+    """The filters are left inverses of the reader's; only rounding and the codec remain."""
+    cells = np.random.default_rng(0).integers(60, 190, (1, 12, 16, 3)).astype(np.uint8)
+    once = decode_video(encode_video(cells.repeat(8, 1).repeat(8, 2), 8, crf=0)).frames
+    twice = decode_video(encode_video(once, 8, crf=0)).frames
+    assert psnr(twice, once) > 45
