@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -19,11 +19,13 @@ from typing import Any, no_type_check
 
 import av
 import numpy as np
+from av.container import InputContainer
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import quote_path
+from egosim_jax.io.boxes import MAX_SAMPLES
 from egosim_jax.io.decoding import (
     ACCURATE,
     MAX_FRAMES,
@@ -32,16 +34,19 @@ from egosim_jax.io.decoding import (
     Decoding,
     File,
     FrameBuffer,
+    check_size,
     decode_packet,
-    frame_rate,
     is_hdr,
     open_file,
     open_video,
     read_frames,
     read_packets,
+    skip_leading,
     to_rgb,
     upright,
 )
+from egosim_jax.io.listing import Listing, list_frames
+from egosim_jax.io.timing import Timeline
 from egosim_jax.types import InputError
 
 CRF = 10
@@ -64,13 +69,15 @@ class VideoInfo:
     """Length, size and rate of a video, read without decoding it."""
 
     frames: int
+    """Number of frames at the constant rate (`io/timing.py`)."""
     height: int
     width: int
     fps: Fraction
+    """Rate in frames per second, by time stamps."""
+    timeline: Timeline = field(repr=False, compare=False)
+    """Times of the frames."""
     hdr: bool = False
     """True if brightness is encoded for HDR, by PQ or HLG; its 8-bit version looks pale."""
-    unevenness_s: float = 0.0
-    """Maximum deviation of frame times from equal spacing, in seconds; 0 if not measured."""
 
 
 def probe_video(path: Path, *, damage: Damage = "refuse") -> VideoInfo:
@@ -137,32 +144,41 @@ def decode_video(
 
 
 def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
-    frames, size = 0, None
     with open_video(file, name, MAX_FRAMES) as container:
-        stream = container.streams.video[0]
-        try:
-            for packet in read_packets(container, name, MAX_FRAMES):
-                frames += packet is not None and not packet.is_discard
-                if size is None:
-                    size = next(
-                        (
-                            upright(p, np.empty((p.height, p.width))).shape
-                            for p in decode_packet(stream, packet, name)
-                        ),
-                        None,
-                    )
-        except DamagedError:
-            if damage == "refuse" or size is None:
-                raise
-        if size is None:
-            raise InputError(f"{name} holds no frames.")
-        return VideoInfo(
-            frames=frames,
-            height=size[0],
-            width=size[1],
-            fps=frame_rate(stream, name),
-            hdr=is_hdr(stream),
-        )
+        listing = list_frames(container, name, MAX_FRAMES, damage=damage)
+    file.seek(0)
+    with open_video(file, name, MAX_FRAMES) as container:
+        return describe(container, name, listing)
+
+
+def describe(container: InputContainer, name: str, listing: Listing) -> VideoInfo:
+    """Return a listed video's length, size and rate, and log which frames are not used.
+
+    Decodes the first frame. Raises `InputError` for a variable frame rate.
+    """
+    stream, timeline = container.streams.video[0], listing.timeline
+    timeline.check(name)
+    frames = (
+        frame
+        for packet in skip_leading(read_packets(container, name, MAX_SAMPLES))
+        for frame in decode_packet(stream, packet, name)
+    )
+    try:
+        first = next(frames, None)
+    except DamagedError as error:
+        raise listing.undecodable(name) if listing.cut else error from error
+    if first is None:
+        raise InputError(f"{name} holds no frames. Export or download it again.")
+    height, width = upright(first, np.empty((first.height, first.width))).shape
+    listing.report(name)
+    return VideoInfo(
+        frames=timeline.count,
+        height=height,
+        width=width,
+        fps=timeline.fps,
+        timeline=timeline,
+        hdr=is_hdr(stream),
+    )
 
 
 def _decode(
@@ -175,24 +191,38 @@ def _decode(
     damage: Damage,
     each: Callable[[np.ndarray], np.ndarray] | None,
 ) -> Video:
-    start, stop, kept = frames.start, frames.stop, FrameBuffer(name)
+    kept, before, position = FrameBuffer(name), None, -1
+    with open_video(file, name, max_frames) as container:
+        # Damage after the wanted frames does not matter, so decoding finds it.
+        listing = list_frames(container, name, max_frames, damage="stop")
+    timeline = listing.timeline
+    stop = timeline.count if frames.stop is None else min(frames.stop, timeline.count)
+    check_size(name, stop - frames.start, 0, max_frames)
+    moments_s = timeline.moments_s(frames.start, stop)
+    timeline.check(name, moments_s)
+    wanted = timeline.nearest(moments_s)
+    file.seek(0)
     with open_video(file, name, max_frames) as container:
         try:
-            for index, decoded in enumerate(read_frames(container, name, max_frames)):
-                if stop is not None and index >= stop:
+            for decoded in read_frames(container, name, max_frames):
+                if decoded.pts is not None and decoded.pts == before:
+                    continue  # a repeated time stamp
+                before, position = decoded.pts, position + 1
+                frame = None
+                while len(kept) < len(wanted) and wanted[len(kept)] == position:
+                    if frame is None:
+                        frame = to_rgb(decoded, decoding)
+                        frame = frame if each is None else each(frame)
+                    kept.append(frame)
+                if len(kept) == len(wanted) and stop < timeline.count:
                     break
-                if index < start:
-                    continue
-                frame = to_rgb(decoded, decoding)
-                kept.append(frame if each is None else each(frame))
-        except DamagedError:
+        except DamagedError as error:
             if damage == "refuse" or not len(kept):
-                raise
-        fps = frame_rate(container.streams.video[0], name)
+                raise listing.undecodable(name) if listing.cut else error from error
     if not len(kept):
-        wanted = f" from frame {start} on" if start else ""
-        raise InputError(f"{name} holds no frames{wanted}.")
-    return Video(frames=kept.frames(), fps=fps)
+        since = f" from frame {frames.start} on" if frames.start else ""
+        raise InputError(f"{name} holds no frames{since}.")
+    return Video(frames=kept.frames(), fps=timeline.fps)
 
 
 def write_video(
