@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.annotate.to_episode import nearest_frames, resized_intrinsics
+from egosim_jax.annotate.to_episode import resized_intrinsics
 from egosim_jax.data.lerobot_writer import HANDS, INTRINSICS, POSES, SCENE
-from egosim_jax.data.readers.lerobot import read_info, read_rows, read_tasks
+from egosim_jax.data.readers.lerobot import rate_of, read_info, read_rows, read_tasks
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.io.bounded import quote, quote_path
+from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState, VideoSpec
@@ -36,9 +37,10 @@ def episode_from_lerobot(
 ) -> Episode:
     """Return an episode of a dataset, at the length, size and rate of a model's clips.
 
-    Each clip starts in the last frame of the clip before. Frames are the nearest in time. The
-    scene is `state`, by default the one that `egosim data export` wrote. Raises `InputError` for a
-    dataset without hands, cameras or scene, and for an episode that is too short.
+    Each clip starts in the last frame of the clip before. Frames are the nearest in time, by the
+    column timestamp if there is one. The scene is `state`, by default the one that `egosim data
+    export` wrote. Raises `InputError` for a dataset without hands, cameras or scene, and for an
+    episode that is too short.
     """
     info = read_info(root, ["v3.0"])
     if missing := [name for name in (HANDS, POSES, INTRINSICS) if name not in info["features"]]:
@@ -47,7 +49,8 @@ def episode_from_lerobot(
             "cameras in the world. Import its video by `egosim data import lerobot` and annotate "
             "it, then use `egosim episode from-annotation`."
         )
-    rows = read_rows(root, info, number, [HANDS, POSES, INTRINSICS, "task_index"])
+    columns = [HANDS, POSES, INTRINSICS, "task_index"]
+    rows = read_rows(root, info, number, columns, optional=["timestamp"])
     state, image = _scene(root / SCENE.format(number), state)
     joints, poses = _joints(rows[HANDS]), _numbers(rows[POSES], (4, 4), POSES)
     lens = _numbers(rows[INTRINSICS], (3, 3), INTRINSICS)
@@ -57,7 +60,11 @@ def episode_from_lerobot(
             "lens. Choose another episode. (--episode)"
         )
     size = _size(info["features"], video)
-    moments = nearest_frames(len(poses), float(info["fps"]), float(video.fps))
+    fps = rate_of(info)
+    moments = Timeline.even(len(poses), fps).at_rate(video.fps)
+    if stamps := rows.get("timestamp"):
+        order, _, timeline = row_times(stamps, [fps], f"Episode {number} of {quote_path(root)}")
+        moments = order[timeline.at_rate(video.fps)]
     step = video.frames - 1
     possible = (len(moments) - 1) // step
     if not 0 < (count := possible if clips is None else clips) <= possible:

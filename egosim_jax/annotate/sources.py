@@ -16,8 +16,6 @@ from egosim_jax.types import InputError
 
 DEPTH_SUFFIXES = {".png": 0.001, ".npy": 1.0}
 """Suffix of depth maps -> unit in meters."""
-MAX_UNEVENNESS_S = 0.1
-"""Maximum deviation in seconds of a timestamp from a constant frame rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +68,6 @@ def open_source(source: Source, depth_files: Path | None = None) -> Recording:
         recording = Recording.load(source.path)
     else:
         info = probe_long_video(source.path)
-        if info.unevenness_s > MAX_UNEVENNESS_S:
-            raise InputError(
-                f"{quote_path(source.path)} has a variable frame rate: its timestamps deviate "
-                f"by up to {info.unevenness_s:.2f} s from a constant rate, and at most "
-                f"{MAX_UNEVENNESS_S:g} s is allowed. Convert it, for instance with `ffmpeg -i IN "
-                f"-fps_mode cfr -r {float(info.fps):.0f} OUT`."
-            )
         recording = Recording(
             recording_id=source.name,
             video=source.path,

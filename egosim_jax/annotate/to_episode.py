@@ -10,6 +10,7 @@ from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.data.transforms import resize_image, resize_video
 from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.images import read_image
+from egosim_jax.io.timing import Timeline
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import read_video
 from egosim_jax.simulation.episode import Episode
@@ -38,7 +39,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
         {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64"},
     )
     recorded = read_video(folder / "video.mp4")
-    moments = nearest_frames(len(recorded.frames), float(recorded.fps), float(video.fps))
+    moments = Timeline.even(len(recorded.frames), recorded.fps).at_rate(video.fps)
     step = video.frames - 1
     possible = (len(moments) - 1) // step
     count = possible if clips is None else clips
@@ -71,13 +72,6 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
         first_frame=resize_image(read_image(folder / "first_frame.png"), video.height, video.width),
         ground_truth=tuple(GroundTruth(frames=target) for target in frames),
     )
-
-
-def nearest_frames(count: int, source_fps: float, target_fps: float) -> np.ndarray:
-    """Return the source frames nearest in time to the frames at a target rate."""
-    last = int((count - 1) * target_fps / source_fps + 1e-6)  # not one less by rounding
-    times = np.arange(last + 1) * source_fps / target_fps
-    return np.minimum(np.floor(times + 0.5).astype(int), count - 1)
 
 
 def resized_intrinsics(

@@ -2,7 +2,7 @@
 
     recording.json    video and frames in it, rate, size, caption, names, depth files, provenance
     arrays.npz        where known: world_from_camera `f 4 4`, intrinsics_px `3 3`, joints_m
-                      `f n j 3`, and the fields of the scene's points
+                      `f n j 3`, times_s `f`, and the fields of the scene's points
 
     {"format": "egosim_jax.recording", "version": 1, "recording_id": "fold_12",
      "video": "/data/fold/12.mp4", "start": 0, "frames": 240, "fps": "30", "height": 1080, ...
@@ -40,7 +40,7 @@ from egosim_jax.io.bounded import check_version, quote, quote_path, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_depth_image
 from egosim_jax.io.run import write_json
-from egosim_jax.io.segments import read_segment
+from egosim_jax.io.segments import read_moments, read_segment
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import Video
 from egosim_jax.types import (
@@ -68,8 +68,10 @@ RATE = re.compile(r"[0-9]{1,40}(?:\.[0-9]{1,40}|/[1-9][0-9]{0,39})?")
 MAX_TEXT = 10_000
 """Maximum length of a caption, name or entry of the provenance, in characters."""
 _DTYPES = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64",
-           "points_m": "float32", "colors": "uint8", "error_px": "float32",
+           "times_s": "float64", "points_m": "float32", "colors": "uint8", "error_px": "float32",
            "frames": "int32", "indices": "int32", "pixels_px": "float32"}  # fmt: skip
+_OWN = ("world_from_camera", "intrinsics_px", "joints_m", "times_s")
+"""Arrays of a recording itself; the others are its points'."""
 
 
 @no_type_check
@@ -83,10 +85,12 @@ class Recording:
     """Video file of the recording."""
     start: int = 0
     """First frame of the recording in the video."""
+    times_s: Float[np.ndarray, " f"] | None = None
+    """Times of the frames after the first of the video, instead of `start`; None: no gaps."""
     frames: int
     """Number of frames of the recording."""
     fps: Fraction
-    """Frame rate of the video in frames per second."""
+    """Frame rate of the recording in frames per second."""
     height: int
     """Height of a displayed frame in pixels."""
     width: int
@@ -129,6 +133,17 @@ class Recording:
             raise InputError(
                 f"fps is {quote(str(self.fps))}: it must be a fraction above 0 and at most "
                 f"{MAX_FPS}."
+            )
+        times_s = self.times_s
+        if times_s is not None and not (
+            times_s.shape == (self.frames,)
+            and times_s[0] >= 0
+            and np.isfinite(times_s).all()
+            and (np.diff(times_s) > 0).all()
+        ):
+            raise InputError(
+                f"times_s is {times_s.shape} from {times_s[:1]} s: it must be {self.frames} "
+                "increasing times in seconds, one for each frame, or None."
             )
         self._check_texts()
         self._check_cameras()
@@ -176,7 +191,11 @@ class Recording:
                 )
             return frame if each is None else each(frame)
 
-        video = read_segment(self.video, start=self.start + start, count=stop - start, each=checked)
+        if self.times_s is None:
+            first = self.start + start
+            video = read_segment(self.video, start=first, count=stop - start, each=checked)
+        else:
+            video = read_moments(self.video, self.times_s[start:stop], each=checked)
         return Video(frames=video.frames, fps=self.fps)
 
     def read_depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
@@ -215,7 +234,8 @@ class Recording:
         depth = self.depth and replace(self.depth, paths=self.depth.paths[start:stop])
         return replace(
             self,
-            start=self.start + start,
+            start=self.start + start if self.times_s is None else 0,
+            times_s=None if self.times_s is None else self.times_s[start:stop],
             frames=stop - start,
             depth=depth,
             points=self.points and self.points.within(start, stop),
@@ -342,9 +362,7 @@ class Recording:
 
 
 def _array(recording: Recording, name: str) -> np.ndarray | None:
-    owner = recording if name in ("world_from_camera", "intrinsics_px", "joints_m") else (
-        recording.points
-    )  # fmt: skip
+    owner = recording if name in _OWN else recording.points
     return None if owner is None else getattr(owner, name)
 
 
@@ -366,7 +384,7 @@ def _load(folder: Path) -> Recording:
             "again."
         )
     arrays: dict[str, Any] = read_arrays(folder / ARRAYS, {}, optional=_DTYPES)
-    points = {n: arrays.pop(n) for n in list(_DTYPES)[3:] if n in arrays}
+    points = {n: arrays.pop(n) for n in _DTYPES if n in arrays and n not in _OWN}
     if points and "points_m" not in points:
         raise InputError(f"{ARRAYS} has {', '.join(points)}, but no points_m.")
     if not RATE.fullmatch(written["fps"]):

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -181,6 +181,21 @@ def check_packet(stream: VideoStream, packet: Packet, name: str) -> None:
         raise DamagedError(f"{name} is damaged: a packet does not have its checksum.")
 
 
+def skip_leading(packets: Iterable[Packet | None]) -> Iterator[Packet | None]:
+    """Omit packets before the first key frame, and frames shown before it.
+
+    They refer to frames that are not in the file, as after a cut without encoding (open GOP).
+    """
+    begun, first = False, None
+    for packet in packets:
+        if packet is not None:
+            if not begun and packet.is_keyframe:
+                begun, first = True, packet.pts
+            if not begun or (None not in (first, packet.pts) and packet.pts < first):
+                continue
+        yield packet
+
+
 def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
     """Decode a packet; None flushes the decoder. Raises `DamagedError`."""
     with refusing(f"{name} is damaged", DamagedError):
@@ -194,7 +209,7 @@ def read_frames(stream: VideoStream, name: str, max_frames: int) -> Iterator[Vid
     """Yield decoded frames. Raises `DamagedError` where the video is damaged."""
     size = None
     shown = given = 0
-    for packet in read_packets(stream, name, max_frames):
+    for packet in skip_leading(read_packets(stream, name, max_frames)):
         shown += packet is not None and not packet.is_discard
         for frame in decode_packet(stream, packet, name):
             size = size or (frame.height, frame.width)
@@ -307,14 +322,6 @@ def check_size(name: str, frames: int, area: int, max_frames: int) -> None:
         raise InputError(
             f"{name} has more than {MAX_PIXELS:,} pixels ({area:,} per frame), the maximum."
         )
-
-
-def frame_rate(stream: VideoStream, name: str) -> Fraction:
-    """Return the average frame rate of a stream."""
-    rate = stream.average_rate or stream.guessed_rate
-    if not rate:
-        raise InputError(f"{name} does not say its frame rate.")
-    return rate
 
 
 class FrameBuffer:

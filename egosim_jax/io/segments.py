@@ -1,70 +1,51 @@
 """Read segments of long videos without decoding the frames before them.
 
-First the packets are listed without decoding, which counts frames exactly at any frame rate. Then
-decoding starts at the last key frame before the segment.
+First the packets are listed without decoding (`io/listing.py`), which gives the time of each frame.
+Then decoding starts at the last key frame before the segment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import no_type_check
 
 import numpy as np
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
+from jaxtyping import Float
 
-from egosim_jax.io.bounded import quote_path, quote_text
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.boxes import MAX_SAMPLES
 from egosim_jax.io.decoding import (
     MAX_FRAMES,
     DamagedError,
     File,
     FrameBuffer,
-    check_packet,
     check_size,
     decode_packet,
-    frame_rate,
     open_file,
     open_video,
-    pixel_aspect,
-    shown_size,
+    skip_leading,
     to_rgb,
 )
-from egosim_jax.io.video import Video, VideoInfo
+from egosim_jax.io.listing import Listing, list_frames
+from egosim_jax.io.timing import convert
+from egosim_jax.io.video import Video, VideoInfo, describe
 from egosim_jax.types import InputError, check_counts
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Listing:
-    times: list[int]
-    """Presentation time of every frame, in order, in units of the stream."""
-    keys: list[tuple[int, int]]
-    """Presentation and decoding time of every key frame, in order."""
 
 
 def probe_long_video(path: Path) -> VideoInfo:
     """Count the frames of a video of any length and read its size and rate.
 
-    Decodes only the first frame; the packets show whether frames are equally spaced. Raises
-    `InputError` if the video is unreadable or damaged.
+    Decodes only the first frame. Raises `InputError` if the video is unreadable or damaged, or has
+    a variable frame rate.
     """
     name = quote_path(path)
     with open_file(path) as file:
         listing = _list(file, name)
         with open_video(file, name, None) as stream:
-            decoded = next(_frames(stream, name, listing.keys[0][1]))
-            height, width = shown_size(stream, decoded)
-            fps, unit = frame_rate(stream, name), stream.time_base
-            aspect = pixel_aspect(stream)
-    return VideoInfo(
-        frames=len(listing.times),
-        height=height,
-        width=width,
-        fps=fps,
-        pixel_aspect=aspect,
-        unevenness_s=_unevenness(listing.times) * float(unit or 0),
-    )
+            return describe(stream, name, listing)
 
 
 def read_segment(
@@ -77,64 +58,100 @@ def read_segment(
     """Decode `count` frames of a video of any length, starting at frame `start`.
 
     `each` is applied to every frame as it is decoded. Raises `InputError` if the file is unreadable
-    or damaged, or ends before the segment.
+    or damaged, has a variable frame rate, or ends before the segment.
     """
     check_counts({"The number of frames": count})
     name = quote_path(path)
-    kept = FrameBuffer(name)
     with open_file(path) as file:
         listing = _list(file, name)
-        if start < 0 or start + count > len(listing.times):
+        timeline = listing.timeline
+        if start < 0 or start + count > timeline.count:
             raise InputError(
                 f"Frames {start} to {start + count - 1} of {name} cannot be read: it has "
-                f"{len(listing.times)}, counted from 0."
+                f"{timeline.count}, counted from 0."
             )
-        first, last = listing.times[start], listing.times[start + count - 1]
-        with open_video(file, name, None) as stream:
-            key = max((k for k in listing.keys if k[0] <= first), default=listing.keys[0])
-            for decoded in _frames(stream, name, key[1]):
-                time = first - 1 if decoded.pts is None else decoded.pts
-                if time < first:
-                    continue
-                if time != listing.times[start + len(kept)]:
-                    break
-                frame = to_rgb(stream, decoded, "accurate")
-                kept.append(frame if each is None else each(frame))
-                if time >= last:
-                    break
-            fps = frame_rate(stream, name)
-    if len(kept) < count:
-        raise DamagedError(f"{name} is damaged: frame {start + len(kept)} cannot be decoded.")
-    return Video(frames=kept.frames(), fps=fps)
+        return _read(file, name, listing, timeline.moments_s(start, start + count), each)
 
 
-def _list(file: File, name: str) -> _Listing:
-    """List the frames of a video without decoding them."""
-    times, keys = list[int](), list[tuple[int, int]]()
-    with open_video(file, name, None) as stream:
+@no_type_check
+def read_moments(
+    path: Path,
+    times_s: Float[np.ndarray, " f"],
+    *,
+    each: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Video:
+    """Decode the frames nearest to increasing times, in seconds after the first frame.
+
+    Otherwise as `read_segment`.
+    """
+    name = quote_path(path)
+    with open_file(path) as file:
+        listing = _list(file, name)
+        return _read(file, name, listing, times_s, each)
+
+
+@no_type_check
+def _read(
+    file: File,
+    name: str,
+    listing: Listing,
+    times_s: Float[np.ndarray, " f"],
+    each: Callable[[np.ndarray], np.ndarray] | None,
+) -> Video:
+    """Decode the frames nearest to increasing times."""
+    listing.timeline.check(name, times_s)
+    stamps = listing.stamps[listing.timeline.nearest(times_s)].tolist()
+    first = listing.keys[0]
+    key = max((key for key in listing.keys if key[0] <= stamps[0]), default=first)
+    try:
+        frames = _decode(file, name, listing, key, stamps, each)
+    except DamagedError as error:
+        if key == first:
+            raise listing.undecodable(name) if listing.cut else error from error
+        # An open GOP may tell the decoder to forget frames that it knows only from the beginning.
+        file.seek(0)
         try:
-            for packet in stream.container.demux(stream):
-                if not packet.size:
-                    continue
-                if packet.is_corrupt or packet.pts is None or len(times) > MAX_SAMPLES:
-                    raise DamagedError(f"{name} is damaged after {len(times)} frames.")
-                check_packet(stream, packet, name)
-                if packet.is_keyframe:
-                    keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
-                if not packet.is_discard:
-                    times.append(packet.pts)
-        except OSError as error:  # from FFmpeg's parsers
-            raise DamagedError(f"{name} is damaged: {quote_text(str(error))}.") from error
+            frames = _decode(file, name, listing, first, stamps, each)
+        except InputError as error:
+            raise listing.undecodable(name) from error
+    return Video(frames=frames, fps=listing.timeline.fps)
+
+
+def _decode(
+    file: File,
+    name: str,
+    listing: Listing,
+    key: tuple[int, int],
+    stamps: list[int],
+    each: Callable[[np.ndarray], np.ndarray] | None,
+) -> np.ndarray:
+    """Decode the frames with increasing time stamps, starting at a key frame."""
+    kept, before = FrameBuffer(name), None
+    with open_video(file, name, None) as stream:
+        for decoded in _frames(stream, name, key[1]):
+            stamp = stamps[0] - 1 if decoded.pts is None else decoded.pts
+            if before is not None and stamp < before:
+                raise InputError(
+                    f"{name} has frames whose time stamps are not in order, as in AVI files. Write "
+                    f"them anew, for instance with `{convert(listing.timeline.fps)}`."
+                )
+            before, frame = stamp, None
+            while len(kept) < len(stamps) and stamps[len(kept)] == stamp:
+                if frame is None:
+                    frame = to_rgb(stream, decoded, "accurate")
+                    frame = frame if each is None else each(frame)
+                kept.append(frame)
+            if len(kept) == len(stamps):
+                return kept.frames()
+    at_s = (stamps[len(kept)] - int(listing.stamps[0])) * float(listing.unit_s)
+    raise DamagedError(f"{name} is damaged: its frame at {at_s:.3f} s cannot be decoded.")
+
+
+def _list(file: File, name: str) -> Listing:
+    with open_video(file, name, None) as stream:
+        listing = list_frames(stream, name, MAX_SAMPLES)
     file.seek(0)
-    if not times or not keys or len(set(times)) != len(times):
-        raise DamagedError(f"{name} has no frames, no key frame, or two frames at one time.")
-    return _Listing(times=sorted(times), keys=sorted(keys))
-
-
-def _unevenness(times: list[int]) -> float:
-    """Return the maximum deviation of frame times from equal spacing, in units of the stream."""
-    even = np.linspace(times[0], times[-1], len(times))
-    return float(np.abs(np.array(times) - even).max())
+    return listing
 
 
 def _frames(stream: VideoStream, name: str, dts: int) -> Iterator[VideoFrame]:
@@ -142,8 +159,9 @@ def _frames(stream: VideoStream, name: str, dts: int) -> Iterator[VideoFrame]:
     container = stream.container
     container.seek(dts, stream=stream, backward=True)
     size, count = None, 0
-    for packet in container.demux(stream):
-        for decoded in decode_packet(stream, packet if packet.size else None, name):
+    packets = (packet if packet.size else None for packet in container.demux(stream))
+    for packet in skip_leading(packets):
+        for decoded in decode_packet(stream, packet, name):
             size = size or (decoded.height, decoded.width)
             if decoded.is_corrupt or size != (decoded.height, decoded.width):
                 raise DamagedError(f"{name} is damaged at {decoded.time} s.")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -21,10 +21,12 @@ from typing import Any, no_type_check
 
 import av
 import numpy as np
+from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import quote_path
+from egosim_jax.io.boxes import MAX_SAMPLES
 from egosim_jax.io.chroma import to_yuv420
 from egosim_jax.io.decoding import (
     ACCURATE,
@@ -34,16 +36,19 @@ from egosim_jax.io.decoding import (
     Decoding,
     File,
     FrameBuffer,
+    check_size,
     decode_packet,
-    frame_rate,
     open_file,
     open_video,
     pixel_aspect,
     read_frames,
     read_packets,
     shown_size,
+    skip_leading,
     to_rgb,
 )
+from egosim_jax.io.listing import Listing, list_frames
+from egosim_jax.io.timing import Timeline
 from egosim_jax.types import InputError
 
 CRF = 10
@@ -66,13 +71,15 @@ class VideoInfo:
     """Length, size as shown and rate of a video, read without decoding it."""
 
     frames: int
+    """Number of frames at the constant rate (`io/timing.py`)."""
     height: int
     width: int
     fps: Fraction
+    """Rate in frames per second, by time stamps."""
+    timeline: Timeline = field(repr=False, compare=False)
+    """Times of the frames."""
     pixel_aspect: Fraction = Fraction(1)
     """Width over height of a stored pixel; frames are read with square ones."""
-    unevenness_s: float = 0.0
-    """Maximum deviation of frame times from equal spacing, in seconds; 0 if not measured."""
 
     def check_square(self, name: str) -> None:
         """Raise `InputError` if intrinsics of stored pixels would not fit the frames."""
@@ -148,26 +155,41 @@ def decode_video(
 
 
 def _probe(file: File, name: str, damage: Damage) -> VideoInfo:
-    frames, size = 0, None
     with open_video(file, name, MAX_FRAMES) as stream:
-        try:
-            for packet in read_packets(stream, name, MAX_FRAMES):
-                frames += packet is not None and not packet.is_discard
-                if size is None:
-                    decoded = decode_packet(stream, packet, name)
-                    size = shown_size(stream, decoded[0]) if decoded else None
-        except DamagedError:
-            if damage == "refuse" or size is None:
-                raise
-        if size is None:
-            raise InputError(f"{name} holds no frames.")
-        return VideoInfo(
-            frames=frames,
-            height=size[0],
-            width=size[1],
-            fps=frame_rate(stream, name),
-            pixel_aspect=pixel_aspect(stream),
-        )
+        listing = list_frames(stream, name, MAX_FRAMES, damage=damage)
+    file.seek(0)
+    with open_video(file, name, MAX_FRAMES) as stream:
+        return describe(stream, name, listing)
+
+
+def describe(stream: VideoStream, name: str, listing: Listing) -> VideoInfo:
+    """Return a listed video's length, size and rate, and log which frames are not used.
+
+    Decodes the first frame. Raises `InputError` for a variable frame rate.
+    """
+    timeline = listing.timeline
+    timeline.check(name)
+    frames = (
+        frame
+        for packet in skip_leading(read_packets(stream, name, MAX_SAMPLES))
+        for frame in decode_packet(stream, packet, name)
+    )
+    try:
+        first = next(frames, None)
+    except DamagedError as error:
+        raise listing.undecodable(name) if listing.cut else error from error
+    if first is None:
+        raise InputError(f"{name} holds no frames. Export or download it again.")
+    height, width = shown_size(stream, first)
+    listing.report(name)
+    return VideoInfo(
+        frames=timeline.count,
+        height=height,
+        width=width,
+        fps=timeline.fps,
+        timeline=timeline,
+        pixel_aspect=pixel_aspect(stream),
+    )
 
 
 def _decode(
@@ -180,24 +202,38 @@ def _decode(
     damage: Damage,
     each: Callable[[np.ndarray], np.ndarray] | None,
 ) -> Video:
-    start, stop, kept = frames.start, frames.stop, FrameBuffer(name)
+    kept, before, position = FrameBuffer(name), None, -1
+    with open_video(file, name, max_frames) as stream:
+        # Damage after the wanted frames does not matter, so decoding finds it.
+        listing = list_frames(stream, name, max_frames, damage="stop")
+    timeline = listing.timeline
+    stop = timeline.count if frames.stop is None else min(frames.stop, timeline.count)
+    check_size(name, stop - frames.start, 0, max_frames)
+    moments_s = timeline.moments_s(frames.start, stop)
+    timeline.check(name, moments_s)
+    wanted = timeline.nearest(moments_s)
+    file.seek(0)
     with open_video(file, name, max_frames) as stream:
         try:
-            for index, decoded in enumerate(read_frames(stream, name, max_frames)):
-                if stop is not None and index >= stop:
+            for decoded in read_frames(stream, name, max_frames):
+                if decoded.pts is not None and decoded.pts == before:
+                    continue  # a repeated time stamp
+                before, position = decoded.pts, position + 1
+                frame = None
+                while len(kept) < len(wanted) and wanted[len(kept)] == position:
+                    if frame is None:
+                        frame = to_rgb(stream, decoded, decoding)
+                        frame = frame if each is None else each(frame)
+                    kept.append(frame)
+                if len(kept) == len(wanted) and stop < timeline.count:
                     break
-                if index < start:
-                    continue
-                frame = to_rgb(stream, decoded, decoding)
-                kept.append(frame if each is None else each(frame))
-        except DamagedError:
+        except DamagedError as error:
             if damage == "refuse" or not len(kept):
-                raise
-        fps = frame_rate(stream, name)
+                raise listing.undecodable(name) if listing.cut else error from error
     if not len(kept):
-        wanted = f" from frame {start} on" if start else ""
-        raise InputError(f"{name} holds no frames{wanted}.")
-    return Video(frames=kept.frames(), fps=fps)
+        since = f" from frame {frames.start} on" if frames.start else ""
+        raise InputError(f"{name} holds no frames{since}.")
+    return Video(frames=kept.frames(), fps=timeline.fps)
 
 
 def write_video(

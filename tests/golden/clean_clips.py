@@ -154,7 +154,7 @@ def video(folder, suffix, codec, fps):
         container.mux(stream.encode())
     for probe in (probe_video, probe_long_video):
         info = probe(path)
-        facts = [info.frames, info.width, info.height, str(info.fps), info.hdr]
+        facts = [info.frames, info.width, info.height, str(info.fps)]
         yield probe.__name__, facts
     yield "even", probe_long_video(path).unevenness_s < 2e-3
     readings = {

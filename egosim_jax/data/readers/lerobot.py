@@ -4,6 +4,10 @@
     v3   meta/info.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet; a video holds
          several episodes, each from `from_timestamp` to `to_timestamp` in seconds
 
+Row k of an episode belongs to the frame of its video that is nearest to the row's `timestamp`, or
+without that column to k / fps, in seconds after the episode's start (`io/timing.py`). Rows after
+the end of the video are omitted, with a warning.
+
 Paths come from the templates in info.json; only the fields of the format are filled in. The format
 does not define cameras, hands and their units (a robot's state has no common meaning), so they stay
 unknown. Videos may have any codec that FFmpeg reads, such as AV1. tasks.parquet is a pandas file:
@@ -13,6 +17,7 @@ the text is its index or a column `task`. Followed: huggingface's `lerobot` of 2
 
 from __future__ import annotations
 
+import logging
 import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +26,9 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 import tyro
+from jaxtyping import Float
 
 from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
 from egosim_jax.data.recording import MAX_FRAMES, Recording
@@ -34,9 +41,12 @@ from egosim_jax.io.bounded import (
     read_lines,
 )
 from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.timing import row_times
 from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import InputError
+
+logger = logging.getLogger(__name__)
 
 EGOCENTRIC = ("ego", "head", "top")
 """Parts of the preferred camera's name if there are several cameras."""
@@ -50,6 +60,8 @@ class _Episode:
     index: int
     video: Path
     start_s: float
+    stop_s: float
+    data: Path | None
     length: int
     tasks: tuple[str, ...]
 
@@ -67,49 +79,98 @@ class LeRobot:
     def find(self) -> Iterator[Entry]:
         """Yield the episodes of a LeRobot dataset."""
         info = read_info(self.source)
-        camera, fps = _choose_camera(info["features"], self.camera), info["fps"]
+        camera, fps = _choose_camera(info["features"], self.camera), rate_of(info)
         episodes = _episodes_v3 if info["codebase_version"] == "v3.0" else _episodes_v2
-        probe = lru_cache(maxsize=1)(probe_long_video)  # consecutive episodes share a video
+        # Consecutive episodes share a video and a table.
+        probe, read = (lru_cache(maxsize=1)(f) for f in (probe_long_video, _read_stamps))
         for episode in episodes(self.source, info, camera):
             if isinstance(episode, str):
                 index, _, problem = episode.partition(": ")
-                read = partial(_fail, problem)
                 yield Entry(
-                    recording_id=make_id([f"episode_{index}"]), read=read, source=self.source
+                    recording_id=make_id([f"episode_{index}"]),
+                    read=partial(_fail, problem),
+                    source=self.source,
                 )
                 continue
             yield Entry(
                 recording_id=f"episode_{episode.index:06d}",
-                read=partial(self._read, episode, Fraction(fps).limit_denominator(1001), probe),
+                read=partial(_read, episode, fps, probe, read),
                 source=episode.video,
                 options={"camera": camera},
             )
 
-    def _read(
-        self,
-        episode: _Episode,
-        fps: Fraction,
-        probe: Callable[[Path], VideoInfo],
-        folder: Path,
-    ) -> Recording:
-        info = probe(episode.video)
-        start = round(episode.start_s * fps)
-        if start + episode.length > info.frames:
-            raise InputError(
-                f"Episode {episode.index} has frames {start} to {start + episode.length - 1} of "
-                f"{quote_path(episode.video)}, which has {info.frames}: the video is not the one "
-                "that the metadata describe. Download both again."
-            )
-        return Recording(
-            recording_id=f"episode_{episode.index:06d}",
-            video=episode.video,
-            start=start,
-            frames=episode.length,
-            fps=fps,
-            height=info.height,
-            width=info.width,
-            caption="; ".join(episode.tasks) or None,
+
+def _read(
+    episode: _Episode,
+    fps: Fraction,
+    probe: Callable[[Path], VideoInfo],
+    read: Callable[[Path], Mapping[int, list[Any]]],
+    folder: Path,
+) -> Recording:
+    info = probe(episode.video)
+    stamps = read(episode.data).get(episode.index) if episode.data else None
+    times_s, fps = _row_times(episode, stamps, fps)
+    times_s = episode.start_s + times_s
+    end_s = (info.frames - 0.5) / float(info.fps)  # the last frame is the nearest until then
+    fits = (times_s < end_s) & (times_s < episode.stop_s - 0.5 / float(fps))
+    if not fits.any():
+        raise InputError(
+            f"Episode {episode.index} begins at {times_s[0]:.3f} s of {quote_path(episode.video)}, "
+            f"which has {info.frames} frames in {end_s:.3f} s: the video is not the one that the "
+            "metadata describe. Download both again."
         )
+    if len(times_s) != episode.length or not fits.all():
+        logger.warning(
+            "Episode %d: %d of %d rows are within %s, %.3f to %.3f s; the others are omitted",
+            episode.index, fits.sum(), episode.length, quote_path(episode.video), episode.start_s,
+            min(end_s, episode.stop_s),
+        )  # fmt: skip
+    times_s = times_s[fits]
+    start = _consecutive(info, times_s)
+    return Recording(
+        recording_id=f"episode_{episode.index:06d}",
+        video=episode.video,
+        start=start or 0,
+        times_s=times_s if start is None else None,
+        frames=len(times_s),
+        fps=fps,
+        height=info.height,
+        width=info.width,
+        caption="; ".join(episode.tasks) or None,
+    )
+
+
+def _row_times(
+    episode: _Episode, stamps: list[Any] | None, fps: Fraction
+) -> tuple[Float[np.ndarray, " f"], Fraction]:
+    """Return the times of an episode's rows after its start in seconds, and their rate."""
+    if stamps is None:
+        return np.arange(episode.length) / float(fps), fps
+    _, first_s, timeline = row_times(stamps, [fps], f"Episode {episode.index}, column timestamp")
+    whole = timeline.count == len(timeline.times_s)
+    times_s = timeline.times_s if whole else np.arange(timeline.count) / float(timeline.fps)
+    return first_s + times_s, timeline.fps
+
+
+def _consecutive(info: VideoInfo, times_s: Float[np.ndarray, " f"]) -> int | None:
+    """Return the first of the frames nearest to times if no frame is between them, or None."""
+    start = round(float(times_s[0]) * info.fps)
+    stop = start + len(times_s)
+    nearest = info.timeline.nearest
+    same = np.array_equal(nearest(info.timeline.moments_s(start, stop)), nearest(times_s))
+    return start if same and stop <= info.frames else None
+
+
+def _read_stamps(path: Path) -> dict[int, list[Any]]:
+    """Return the time stamps of each episode in a table; empty without such a column."""
+    require("pyarrow")
+    names = ("episode_index", "frame_index", "timestamp")
+    table = read_parquet(path, [], optional=names) if path.is_file() else {}
+    stamps: dict[int, list[Any]] = {}
+    if all(name in table for name in names):
+        for number in sorted(range(len(table["timestamp"])), key=table["frame_index"].__getitem__):
+            stamps.setdefault(table["episode_index"][number], []).append(table["timestamp"][number])
+    return stamps
 
 
 def read_info(root: Path, versions: Sequence[str] = VERSIONS) -> dict[str, Any]:
@@ -128,8 +189,18 @@ def read_info(root: Path, versions: Sequence[str] = VERSIONS) -> dict[str, Any]:
     return info
 
 
+def rate_of(info: Mapping[str, Any]) -> Fraction:
+    """Return the frame rate of a dataset's tables."""
+    return Fraction(info["fps"]).limit_denominator(1001) or Fraction(info["fps"])
+
+
 def read_rows(
-    root: Path, info: Mapping[str, Any], episode: int, columns: Sequence[str]
+    root: Path,
+    info: Mapping[str, Any],
+    episode: int,
+    columns: Sequence[str],
+    *,
+    optional: Sequence[str] = (),
 ) -> dict[str, list[Any]]:
     """Return columns of an episode's frames in order, from a dataset of version 3.0.
 
@@ -153,7 +224,7 @@ def read_rows(
     row = {name: _count(values[number], name) for name, values in table.items()}
     fields = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
     path = _fill(root, info.get("data_path"), fields, what="data_path")
-    frames = read_parquet(path, ["episode_index", "frame_index", *columns])
+    frames = read_parquet(path, ["episode_index", "frame_index", *columns], optional=optional)
     chosen = [n for n, index in enumerate(frames["episode_index"]) if index == episode]
     chosen.sort(key=lambda n: frames["frame_index"][n])
     if [frames["frame_index"][n] for n in chosen] != list(range(row["length"])):
@@ -161,7 +232,8 @@ def read_rows(
             f"{quote_path(path)} has {len(chosen)} frames of episode {episode}, meta/episodes says "
             f"{row['length']}, from 0 without gaps. Download both again."
         )
-    return {name: [frames[name][n] for n in chosen] for name in columns}
+    names = [name for name in (*columns, *optional) if name in frames]
+    return {name: [frames[name][n] for n in chosen] for name in names}
 
 
 def _fail(problem: str, folder: Path) -> Recording:
@@ -213,6 +285,8 @@ def _episodes_v2(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
                 index=number,
                 video=_video_path(root, info, camera, fields),
                 start_s=0.0,
+                stop_s=float("inf"),
+                data=_data_path(root, info, fields),
                 length=_count(row.get("length"), "length", minimum=1),
                 tasks=_texts(row.get("tasks")),
             )
@@ -225,25 +299,29 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
     paths = sorted((root / "meta" / "episodes").glob("*/*.parquet"), key=natural_order)
     if not paths:
         raise InputError(f"{root} has no meta/episodes/chunk-*/file-*.parquet.")
-    place = {n: f"videos/{camera}/{n}" for n in ("chunk_index", "file_index", "from_timestamp")}
+    names = ("chunk_index", "file_index", "from_timestamp")
+    place = {n: f"videos/{camera}/{n}" for n in names}
+    stop = f"videos/{camera}/to_timestamp"
     for path in paths:
         table = read_parquet(
             path,
             ["episode_index", "length", *place.values()],
-            optional=["tasks", "data/chunk_index", "data/file_index"],
+            optional=["tasks", "data/chunk_index", "data/file_index", stop],
         )
         for number in range(len(table["episode_index"])):
             row = {name: values[number] for name, values in table.items()}
             try:
                 index = _count(row["episode_index"], "episode_index")
                 fields = {n: _count(row[place[n]], n) for n in ("chunk_index", "file_index")}
-                start = row[place["from_timestamp"]]
-                if not isinstance(start, float) or not 0 <= start < 1e6:
-                    raise InputError(f"from_timestamp is {quote(start)}, not a time in seconds.")
+                start_s = _time(row[place["from_timestamp"]], "from_timestamp")
+                end_s = row.get(stop)
+                data = {n: row.get(f"data/{n}") for n in ("chunk_index", "file_index")}
                 yield _Episode(
                     index=index,
                     video=_video_path(root, info, camera, fields),
-                    start_s=start,
+                    start_s=start_s,
+                    stop_s=float("inf") if end_s is None else _time(end_s, "to_timestamp"),
+                    data=_data_path(root, info, data),
                     length=_count(row["length"], "length", minimum=1),
                     tasks=_texts(row["tasks"]) if "tasks" in row else _tasks(root, info, row),
                 )
@@ -279,6 +357,15 @@ def _video_path(
     return _fill(root, info.get("video_path"), {**fields, "video_key": camera}, what="video_path")
 
 
+def _data_path(root: Path, info: Mapping[str, Any], fields: Mapping[str, Any]) -> Path | None:
+    """Return the table of an episode's rows; None if the dataset does not name it."""
+    try:
+        fields = {name: _count(value, name) for name, value in fields.items()}
+        return _fill(root, info.get("data_path"), fields, what="data_path")
+    except InputError:
+        return None
+
+
 def _fill(root: Path, template: object, fields: Mapping[str, int | str], *, what: str) -> Path:
     """Fill in a path template of info.json, which may hold only plain fields."""
     # str.format would also resolve attributes and items, and pad to gigabytes.
@@ -309,6 +396,13 @@ def _count(value: Any, name: str, *, minimum: int = 0) -> int:
     if type(value) is not int or not minimum <= value < max(MAX_EPISODES, MAX_FRAMES):
         raise InputError(f"{name} is {quote(value)}, not a whole number of at least {minimum}.")
     return value
+
+
+def _time(value: Any, name: str) -> float:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not 0 <= value < 1e6:
+        raise InputError(f"{name} is {quote(value)}, not a time in seconds.")
+    return float(value)
 
 
 def _texts(value: Any) -> tuple[str, ...]:

@@ -132,11 +132,3 @@ def test_hdr_is_refused_before_it_is_decoded(tmp_path):
     (source,) = find_sources([tmp_path / "hdr.mp4"])
     with pytest.raises(InputError, match=r"is HDR .*FFmpeg"):
         open_source(source)
-
-
-def test_a_variable_frame_rate_is_refused(tmp_path, monkeypatch):
-    (source,) = find_sources([write(tmp_path / "phone.mp4", textured_video(9))])
-    assert open_source(source).frames == 9
-    monkeypatch.setattr("egosim_jax.annotate.sources.MAX_UNEVENNESS_S", -1.0)
-    with pytest.raises(InputError, match=r"variable frame rate.*-fps_mode cfr -r 16"):
-        open_source(source)

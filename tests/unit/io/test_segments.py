@@ -50,11 +50,17 @@ def test_frames_are_counted_where_the_rate_varies(tmp_path):
     )
 
 
-def test_an_uneven_rate_is_measured(tmp_path):
-    assert probe_long_video(write(tmp_path / "even.mp4")).unevenness_s < 1e-3
+def test_a_pause_is_refused_with_the_command_that_converts(tmp_path):
+    assert probe_long_video(write(tmp_path / "even.mp4")).fps == 30
     times = [20 * index + (300 if index >= 20 else 0) for index in range(40)]  # a pause of 0.5 s
-    info = probe_long_video(write(tmp_path / "pause.mp4", times=times))
-    assert info.unevenness_s == pytest.approx(0.25, abs=0.02)
+    path = write(tmp_path / "pause.mp4", times=times)
+    with pytest.raises(
+        InputError, match=r"variable frame rate: .*0\.63 and 1\.17 s.*-vf fps=30 OUT"
+    ):
+        probe_long_video(path)
+    with pytest.raises(InputError, match="variable frame rate"):
+        read_segment(path, start=24, count=2)
+    assert len(read_segment(path, start=0, count=20).frames) == 20
 
 
 def test_a_video_longer_than_what_is_decoded_at_once_is_probed_and_read(tmp_path, monkeypatch):

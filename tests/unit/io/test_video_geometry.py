@@ -1,5 +1,6 @@
 """Videos are shown as their files say: track, rotation, aspect and color, by every opener."""
 
+import itertools
 import re
 import struct
 from collections.abc import Callable
@@ -305,10 +306,11 @@ def converted(path, target, *filters):
         graph = Graph()
         nodes = [graph.add_buffer(template=old), *(graph.add(*f.split("=", 1)) for f in filters)]
         graph.link_nodes(*nodes, graph.add("buffersink")).configure()
+        numbers = itertools.count()
         for frame in [*source.decode(old), None]:
             graph.vpush(frame)
             for coded in _ready(graph):
-                coded.pts = None
+                coded.pts, coded.time_base = next(numbers), 1 / old.average_rate
                 coder = new.codec_context
                 coder.color_primaries, coder.color_trc = coded.color_primaries, coded.color_trc
                 container.mux(new.encode(coded))

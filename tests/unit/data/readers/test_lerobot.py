@@ -111,7 +111,12 @@ def test_v2_has_one_video_per_episode_and_reports_a_missing_one(world, tmp_path,
 
 
 def test_an_episode_beyond_the_end_of_its_video_is_refused(world, tmp_path, imported):
-    write_v3(tmp_path / "set", world, fps=60)
+    write_v3(tmp_path / "set", world)
+    path = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path).to_pydict()
+    table[f"videos/{KEY}/from_timestamp"][1] = table[f"videos/{KEY}/to_timestamp"][0] = 14 / 30
+    table[f"videos/{KEY}/to_timestamp"][1] = 19 / 30
+    pq.write_table(pa.table(table), path)
     done, problems = imported(LeRobot(source=tmp_path / "set"))
     assert list(done) == ["episode_000000"]
     assert "which has 12" in problems["episode_000001"]
