@@ -37,9 +37,8 @@ def to_srgb(image: Image.Image, name: str) -> UInt8[np.ndarray, "h w 3"]:
         if "transparency" in info:
             _refuse_transparent(name)
         image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-    elif image.has_transparency_data:
-        if image.convert("RGBA").getchannel("A").getextrema()[0] == 0:
-            _refuse_transparent(name)
+    elif image.has_transparency_data and not np.asarray(image.convert("RGBA"))[..., 3].all():
+        _refuse_transparent(name)
     profile = info.get("icc_profile")
     if profile:
         return _convert(image, profile, name)
