@@ -18,7 +18,7 @@ from math import ceil
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from egosim_jax.data.crop import Crop, plan_crop
 from egosim_jax.data.recording import Recording
@@ -78,6 +78,29 @@ class Plan(Crop):
         times = [Fraction(k) * self.source_fps / self.fps for k in range(start, stop)]
         return np.array([int(time + Fraction(1, 2)) for time in times])
 
+    @no_type_check
+    def fit(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Return a frame of the video, resized (by area if smaller) and cropped."""
+        import cv2
+
+        return self._fit(frame, cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC)
+
+    @no_type_check
+    def fit_depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "height width"]:
+        """Return the depth of a frame of the video, resized by nearest neighbor and cropped."""
+        import cv2
+
+        return self._fit(depth, cv2.INTER_NEAREST)
+
+    def _fit(self, image: np.ndarray, how: int) -> np.ndarray:
+        import cv2
+
+        rows, columns = image.shape[:2]
+        size = round(columns * self.scale), round(rows * self.scale)
+        resized = image if size == (columns, rows) else cv2.resize(image, size, interpolation=how)
+        left, top = (round(offset) for offset in self.offset_px)
+        return resized[top : top + self.height, left : left + self.width]
+
 
 def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     """Return frame rate, size and crop of a recording's clips.
@@ -106,7 +129,13 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     own = _own_size(recording)
     fix = f"Choose a size of a similar shape, for instance {' '.join(map(str, own))}. (--size)"
     crop = plan_crop(source, sampling.size or own, name=name, fix=fix)
-    return Plan(**vars(crop), source_fps=recording.fps, fps=fps, count=count)
+    left, top = (
+        float((round(length * crop.scale) - kept) // 2)
+        for length, kept in ((recording.width, crop.width), (recording.height, crop.height))
+    )
+    return Plan(
+        **{**vars(crop), "offset_px": (left, top)}, source_fps=recording.fps, fps=fps, count=count
+    )
 
 
 def _own_size(info: Recording) -> tuple[int, int]:

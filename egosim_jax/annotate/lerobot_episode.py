@@ -58,7 +58,7 @@ def episode_from_lerobot(
     name = quote_path(root)
     crop = crop_to(video, _size(info["features"], video), name=name)
     if image is not None:
-        image = crop_to(video, image.shape, name=name).fit_smoothly(image)
+        image = crop_to(video, image.shape, name=name).resample(image)
     moments = nearest_frames(len(poses), float(info["fps"]), float(video.fps))
     step = video.frames - 1
     possible = (len(moments) - 1) // step

@@ -329,7 +329,7 @@ def _given_points(record: Record) -> SparsePoints | None:
 def _given_depth(record: Record, frame: int) -> np.ndarray | None:
     """Return the recorded depth of a clip's frame in meters, at the clip's size, if known."""
     depth = record.recording.read_depth(int(_source_frames(record)[frame]))
-    return None if depth is None else record.plan.fit_nearest(depth)
+    return None if depth is None else record.plan.fit_depth(depth)
 
 
 def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:

@@ -49,7 +49,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     picked = [moments[number * step : number * step + video.frames] for number in range(count)]
     image = read_image(folder / "first_frame.png")
     crop = crop_to(video, recorded.frames.shape[1:3], name=quote_path(folder))
-    frames = [np.stack([crop.fit_smoothly(frame) for frame in recorded.frames[k]]) for k in picked]
+    frames = [np.stack([crop.resample(frame) for frame in recorded.frames[k]]) for k in picked]
     cameras = crop.intrinsics(arrays["intrinsics_px"])
     kinds: dict[int, Kind] = {joints: kind for kind, joints in JOINTS.items()}
     return Episode(
@@ -69,7 +69,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
             for k in picked
         ),
         fps=video.fps,
-        first_frame=crop.fit_smoothly(image),
+        first_frame=crop.resample(image),
         ground_truth=tuple(GroundTruth(frames=target) for target in frames),
     )
 

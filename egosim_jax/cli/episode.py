@@ -115,7 +115,7 @@ class MakeEpisode:
             name=str(self.image),
             fix="Crop the image, or turn it, as the clips are. (--image)",
         )
-        frame = crop.fit_smoothly(image)
+        frame = crop.resample(image)
         if self.state is not None:
             return _read_state(self.state), frame
         return self._lift(image, crop.source_intrinsics(cameras.intrinsics_px), cameras), frame

@@ -11,6 +11,7 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
 
 from egosim_jax.types import InputError
 
@@ -46,37 +47,16 @@ class Crop:
         source[:2] /= self.scale
         return source
 
-    def fit(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Return an image, resized (by area if smaller) and cropped."""
-        import cv2
-
-        rows, columns = self._resized(frame)
-        how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC
-        same = (rows, columns) == frame.shape[:2]
-        return self.cut(frame if same else cv2.resize(frame, (columns, rows), interpolation=how))
-
-    def fit_smoothly(
-        self, frame: UInt8[np.ndarray, "h w 3"]
-    ) -> UInt8[np.ndarray, "height width 3"]:
-        """Return an image, resized as the input of a model (`resize_image`) and cropped."""
-        from egosim_jax.data.transforms import resize_image
-
-        return self.cut(resize_image(frame, *self._resized(frame)))
-
-    def fit_nearest(self, values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "height width"]:
-        """Return a map, such as depth, resized by nearest neighbor and cropped."""
-        import cv2
-
-        rows, columns = self._resized(values)
-        return self.cut(cv2.resize(values, (columns, rows), interpolation=cv2.INTER_NEAREST))
-
-    def cut(self, resized: np.ndarray) -> np.ndarray:
-        """Crop a resized image."""
-        left, top = (round(offset) for offset in self.offset_px)
-        return resized[top : top + self.height, left : left + self.width]
-
-    def _resized(self, image: np.ndarray) -> tuple[int, int]:
-        return round(image.shape[0] * self.scale), round(image.shape[1] * self.scale)
+    def resample(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Return the image cropped and resized by LANCZOS, as the input of a model is."""
+        rows, columns = image.shape[:2]
+        left, top = (offset / self.scale for offset in self.offset_px)
+        box = left, top, left + self.width / self.scale, top + self.height / self.scale
+        ends = np.clip(np.round(box, 6), 0, [columns, rows, columns, rows]).tolist()
+        resized = Image.fromarray(image).resize(
+            (self.width, self.height), Image.Resampling.LANCZOS, box=ends
+        )
+        return np.asarray(resized)
 
 
 def plan_crop(source: tuple[int, int], size: tuple[int, int], *, name: str, fix: str) -> Crop:
@@ -92,10 +72,9 @@ def plan_crop(source: tuple[int, int], size: tuple[int, int], *, name: str, fix:
             f"{name} is {columns}x{rows}: {width}x{height} would keep {kept:.0%} of the image, "
             f"less than {MIN_KEPT:.0%}. {fix}"
         )
-    rest = round(columns * scale) - width, round(rows * scale) - height
     return Crop(
         height=height,
         width=width,
         scale=scale,
-        offset_px=(float(rest[0] // 2), float(rest[1] // 2)),
+        offset_px=((columns * scale - width) / 2, (rows * scale - height) / 2),
     )
