@@ -148,7 +148,7 @@ class ReadRecording:
 
     def _phrases(self, step: int) -> dict[int, str]:
         path = self._path("mask", "txt", step)
-        text = read_bytes(path, limit=MAX_TEXT_BYTES).decode("utf-8", "replace")
+        text = read_bytes(path, limit=MAX_TEXT_BYTES).decode("utf-8-sig", "replace")
         found = {}
         for line in text.splitlines():
             number, colon, phrase = line.partition(":")
