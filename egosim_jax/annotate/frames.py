@@ -19,6 +19,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from egosim_jax.data.crop import Crop, plan_crop
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.types import WAN_GRID, InputError, check_counts
@@ -29,8 +30,6 @@ MAX_CLIP_FRAMES, MIN_CLIP_FRAMES = 601, 9
 """Maximum and minimum length of a clip in frames."""
 MAX_SIDE_PX = 832
 """Maximum longer side in pixels of clips without a given size."""
-MIN_KEPT = 0.6
-"""Minimum fraction of the image that a crop must keep."""
 CHUNK = 300
 """Number of frames that are decoded at a time."""
 
@@ -58,7 +57,7 @@ class Sampling:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class Plan(Crop):
     """Frames to take from one video, and their scale and crop."""
 
     source_fps: Fraction
@@ -67,14 +66,6 @@ class Plan:
     """Frame rate of the clips in frames per second."""
     count: int
     """Number of frames of the whole video at the clips' frame rate."""
-    height: int
-    """Height of a clip in pixels."""
-    width: int
-    """Width of a clip in pixels."""
-    scale: float
-    """Pixels of the clip per pixel of the video."""
-    offset_px: tuple[float, float]
-    """Column and row, in the resized image, of the clip's first pixel."""
 
     @no_type_check
     def indices(self, start: int, stop: int) -> Int[np.ndarray, " f"]:
@@ -87,22 +78,25 @@ class Plan:
         return np.array([int(time + Fraction(1, 2)) for time in times])
 
     @no_type_check
-    def intrinsics(self, source_px: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-        """Return the intrinsics of the clip, given the intrinsics of the video, both in pixels."""
-        fitted = np.array(source_px, float)
-        fitted[:2] *= self.scale
-        fitted[:2, 2] += (self.scale - 1) / 2 - np.array(self.offset_px)
-        return fitted
-
-    @no_type_check
     def fit(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Return a frame of the video, resized (by area if smaller) and cropped."""
         import cv2
 
-        rows, columns = frame.shape[:2]
+        return self._fit(frame, cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC)
+
+    @no_type_check
+    def fit_depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "height width"]:
+        """Return the depth of a frame of the video, resized by nearest neighbor and cropped."""
+        import cv2
+
+        return self._fit(depth, cv2.INTER_NEAREST)
+
+    def _fit(self, image: np.ndarray, how: int) -> np.ndarray:
+        import cv2
+
+        rows, columns = image.shape[:2]
         size = round(columns * self.scale), round(rows * self.scale)
-        how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC
-        resized = frame if size == (columns, rows) else cv2.resize(frame, size, interpolation=how)
+        resized = image if size == (columns, rows) else cv2.resize(image, size, interpolation=how)
         left, top = (round(offset) for offset in self.offset_px)
         return resized[top : top + self.height, left : left + self.width]
 
@@ -130,25 +124,16 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
             f"{MAX_CLIP_FRAMES}. Cut it into clips (--clips), or take its first frames "
             "(--num-frames)."
         )
-    info = recording
-    height, width = sampling.size or _own_size(info)
-    scale = max(height / info.height, width / info.width)
-    kept = height * width / (info.height * info.width * scale**2)
-    if kept < MIN_KEPT:
-        raise InputError(
-            f"{name} is {info.width}x{info.height}: {width}x{height} would keep {kept:.0%} of the "
-            f"image, less than {MIN_KEPT:.0%}. Choose a size of a similar shape, for instance "
-            f"{' '.join(map(str, _own_size(info)))}. (--size)"
-        )
-    rest = round(info.width * scale) - width, round(info.height * scale) - height
+    source = recording.height, recording.width
+    own = _own_size(recording)
+    fix = f"Choose a size of a similar shape, for instance {' '.join(map(str, own))}. (--size)"
+    crop = plan_crop(source, sampling.size or own, name=name, fix=fix)
+    left, top = (
+        float((round(length * crop.scale) - kept) // 2)
+        for length, kept in ((recording.width, crop.width), (recording.height, crop.height))
+    )
     return Plan(
-        source_fps=recording.fps,
-        fps=fps,
-        count=count,
-        height=height,
-        width=width,
-        scale=scale,
-        offset_px=(float(rest[0] // 2), float(rest[1] // 2)),
+        **{**vars(crop), "offset_px": (left, top)}, source_fps=recording.fps, fps=fps, count=count
     )
 
 

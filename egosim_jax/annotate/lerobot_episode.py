@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.annotate.to_episode import resized_intrinsics
+from egosim_jax.annotate.to_episode import crop_to
 from egosim_jax.data.lerobot_writer import HANDS, INTRINSICS, POSES, SCENE
 from egosim_jax.data.readers.lerobot import rate_of, read_info, read_rows, read_tasks
-from egosim_jax.data.transforms import resize_image
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.simulation.episode import Episode
@@ -59,11 +58,14 @@ def episode_from_lerobot(
             f"Episode {number} of {quote_path(root)} changes its {INTRINSICS}: an episode has one "
             "lens. Choose another episode. (--episode)"
         )
-    size = _size(info["features"], video)
+    name = quote_path(root)
+    crop = crop_to(video, _size(info["features"], video), name=name)
+    if image is not None:
+        image = crop_to(video, image.shape, name=name).resample(image)
     fps = rate_of(info)
     moments = Timeline.even(len(poses), fps).at_rate(video.fps)
     if stamps := rows.get("timestamp"):
-        order, _, timeline = row_times(stamps, [fps], f"Episode {number} of {quote_path(root)}")
+        order, _, timeline = row_times(stamps, [fps], f"Episode {number} of {name}")
         moments = order[timeline.at_rate(video.fps)]
     step = video.frames - 1
     possible = (len(moments) - 1) // step
@@ -81,7 +83,7 @@ def episode_from_lerobot(
             Action(
                 cameras=Cameras(
                     world_from_camera=poses[k],
-                    intrinsics_px=resized_intrinsics(lens[0], size, video),
+                    intrinsics_px=crop.intrinsics(lens[0]),
                     height=video.height,
                     width=video.width,
                 ),
@@ -92,7 +94,7 @@ def episode_from_lerobot(
             for k in picked
         ),
         fps=video.fps,
-        first_frame=None if image is None else resize_image(image, video.height, video.width),
+        first_frame=image,
     )
 
 

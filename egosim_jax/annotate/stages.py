@@ -328,16 +328,8 @@ def _given_points(record: Record) -> SparsePoints | None:
 
 def _given_depth(record: Record, frame: int) -> np.ndarray | None:
     """Return the recorded depth of a clip's frame in meters, at the clip's size, if known."""
-    import cv2
-
     depth = record.recording.read_depth(int(_source_frames(record)[frame]))
-    if depth is None:
-        return None
-    plan = record.plan
-    size = round(depth.shape[1] * plan.scale), round(depth.shape[0] * plan.scale)
-    resized = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
-    left, top = (round(offset) for offset in plan.offset_px)
-    return resized[top : top + plan.height, left : left + plan.width]
+    return None if depth is None else record.plan.fit_depth(depth)
 
 
 def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from egosim_jax.annotate.clip import ANNOTATION
-from egosim_jax.data.transforms import resize_image, resize_video
+from egosim_jax.data.crop import Crop, plan_crop
 from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.images import read_image
 from egosim_jax.io.timing import Timeline
@@ -22,9 +22,8 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     """Return an episode made from an annotated clip, with the length, size and rate of `video`.
 
     Consecutive actions share a frame: the last frame of one is the first of the next. The
-    ground-truth frames are the nearest in time, resized without keeping the aspect ratio, as in
-    training.
-    Raises `InputError` if the clip was refused or is too short.
+    ground-truth frames are the nearest in time, cropped to the model's size, and so are the first
+    frame and the intrinsics. Raises `InputError` if the clip was refused or is too short.
     """
     about = read_json(folder / ANNOTATION)
     row = about.get("row") if isinstance(about, dict) else None
@@ -49,8 +48,10 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
             f"{possible} clips of {video.frames} frames, not {count}. (--clips, --config)"
         )
     picked = [moments[number * step : number * step + video.frames] for number in range(count)]
-    frames = [resize_video(recorded.frames[k], video.height, video.width) for k in picked]
-    cameras = resized_intrinsics(arrays["intrinsics_px"], recorded.frames.shape[1:3], video)
+    image = read_image(folder / "first_frame.png")
+    crop = crop_to(video, recorded.frames.shape[1:3], name=quote_path(folder))
+    frames = [np.stack([crop.resample(frame) for frame in recorded.frames[k]]) for k in picked]
+    cameras = crop.intrinsics(arrays["intrinsics_px"])
     kinds: dict[int, Kind] = {joints: kind for kind, joints in JOINTS.items()}
     return Episode(
         state=snapshot.load(folder / "state"),
@@ -69,20 +70,15 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
             for k in picked
         ),
         fps=video.fps,
-        first_frame=resize_image(read_image(folder / "first_frame.png"), video.height, video.width),
+        first_frame=crop.resample(image),
         ground_truth=tuple(GroundTruth(frames=target) for target in frames),
     )
 
 
-def resized_intrinsics(
-    intrinsics_px: np.ndarray, size: tuple[int, ...], video: VideoSpec
-) -> np.ndarray:
-    """Return the intrinsics of images resized to a model's size, each axis by its own factor."""
-    scale = np.array([video.width / size[1], video.height / size[0]])
-    resized = intrinsics_px.copy()
-    resized[:2] *= scale[:, None]
-    resized[:2, 2] += (scale - 1) / 2
-    return resized
+def crop_to(video: VideoSpec, size: tuple[int, ...], *, name: str) -> Crop:
+    """Return how images of a height and width are fitted to a model's size."""
+    fix = "Choose a model whose clips have a similar shape. (--config)"
+    return plan_crop((size[0], size[1]), (video.height, video.width), name=name, fix=fix)
 
 
 def _reachable(joints_m: np.ndarray) -> np.ndarray:

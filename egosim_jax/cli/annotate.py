@@ -161,12 +161,11 @@ class Annotate:
     def _finish(self, report: dict) -> int:
         counts = report["clips"]
         empty = {name: video for name, video in report["videos"].items() if not video["done"]}
-        reasons = {
-            about["source"]: about["reason"] for about in report["annotations"] if "reason" in about
-        }
         for name, video in empty.items():
-            reason = video.get("problem") or reasons.get(name)
-            print(f"{name}: no clip: {reason}", file=sys.stderr)
+            clips = (about for about in report["annotations"] if about["source"] == name)
+            reasons = [video.get("problem"), *(about.get("reason") for about in clips)]
+            for reason in dict.fromkeys(filter(None, reasons)):
+                print(f"{name}: no clip: {reason}", file=sys.stderr)
         print(
             f"{counts['done']} clips done, {counts['refused']} refused, {counts['failed']} failed; "
             f"see {self.out / 'index.html'}",

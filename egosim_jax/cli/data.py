@@ -96,11 +96,12 @@ class Pack:
             grid=_grid(self.config),
             resampling=self.resampling,
         )
-        problems = [problem for problem in track(progress, "packing", total=len(items)) if problem]
-        for problem in problems:
-            print(f"skipped: {problem}", file=sys.stderr)
+        skipped = 0
+        for problem in filter(None, track(progress, "packing", total=len(items))):
+            print(f"skipped: {problem}", file=sys.stderr)  # at once: if all are, `pack` raises
+            skipped += 1
         print(self.out)
-        return ExitCode.PARTIAL if problems else ExitCode.DONE
+        return ExitCode.PARTIAL if skipped else ExitCode.DONE
 
     def _spec(self) -> VideoSpec | None:
         if self.resampling != "rate":

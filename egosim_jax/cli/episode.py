@@ -100,34 +100,38 @@ class MakeEpisode:
 
     def _scene(self, cameras: Cameras) -> tuple[SceneState, np.ndarray | None]:
         """Return the state, and the image, if given, at the size of the clips."""
-        from egosim_jax.data.transforms import resize_video
+        from egosim_jax.data.crop import plan_crop
         from egosim_jax.io.images import read_image
 
-        image = None if self.image is None else read_image(self.image)
-        size = cameras.height, cameras.width
-        frame = None if image is None else resize_video(image[None], *size)[0]
-        if self.state is not None and self.depth is None:
+        lifted = self.image is not None and self.depth is not None and self.state is None
+        if not lifted and (self.state is None or self.depth is not None):
+            raise InputError("The scene must be given once: by --state, or by --image and --depth.")
+        if self.image is None:
+            return _read_state(self.state), None
+        image = read_image(self.image)
+        crop = plan_crop(
+            image.shape[:2],
+            (cameras.height, cameras.width),
+            name=str(self.image),
+            fix="Crop the image, or turn it, as the clips are. (--image)",
+        )
+        frame = crop.resample(image)
+        if self.state is not None:
             return _read_state(self.state), frame
-        if image is not None and self.depth is not None and self.state is None:
-            return self._lift(image, self.depth, cameras), frame
-        raise InputError("The scene must be given once: by --state, or by --image and --depth.")
+        return self._lift(image, crop.source_intrinsics(cameras.intrinsics_px), cameras), frame
 
-    def _lift(self, image: np.ndarray, depth: Path, cameras: Cameras) -> SceneState:
+    def _lift(self, image: np.ndarray, intrinsics: np.ndarray, cameras: Cameras) -> SceneState:
         """Return the points of an RGB-D image taken by the first camera."""
-        import numpy as np
-
         from egosim_jax.io.untrusted.npz import read_arrays
         from egosim_jax.state.depth import state_from_depth
 
-        depth_m = read_arrays(depth, {}, others=("depth_m",), packed=True)["depth_m"]
+        depth_m = read_arrays(self.depth, {}, others=("depth_m",), packed=True)["depth_m"]
         if depth_m.shape != image.shape[:2]:
             raise InputError(
-                f"{depth} has shape {depth_m.shape} and {self.image} {image.shape[:2]}: depth "
-                "must have one value per pixel of the image. Resize one of them."
+                f"{self.depth} has shape {depth_m.shape} and {self.image} {image.shape[:2]}: depth "
+                "must have one value per pixel of the image as it is shown (turned as EXIF says). "
+                "Compute it from that image, or resize it to that. (--depth)"
             )
-        scale = np.array([image.shape[1] / cameras.width, image.shape[0] / cameras.height, 1])
-        intrinsics = cameras.intrinsics_px * scale[:, None]
-        intrinsics[:2, 2] += (scale[:2] - 1) / 2  # pixel centers are at integer coordinates
         return state_from_depth(image, depth_m, intrinsics, cameras.world_from_camera[0])
 
 

@@ -43,6 +43,8 @@ class Output:
         done = resumed = 0
         for outcome in track(outcomes, "importing", total=total):
             done, resumed = done + (outcome.problem is None), resumed + outcome.resumed
+            if outcome.note is not None:
+                print(f"{outcome.recording_id}: {outcome.note}", file=sys.stderr)
             if outcome.problem is not None:
                 print(f"skipped: {outcome.recording_id}: {outcome.problem}", file=sys.stderr)
         earlier = f", {resumed} of them earlier" if resumed else ""

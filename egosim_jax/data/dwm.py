@@ -113,7 +113,7 @@ def _files(root: Path, entry: str, row: str, prompts: Prompts, *, first_line: bo
     texts = [folder / name / f"{video.stem}.txt" for name in PROMPTS[prompts]]
     found = next((text for text in texts if text.is_file()), texts[0])
     text = _text(found, MAX_PROMPT_BYTES)
-    prompt = " ".join((text.partition("\n")[0] if first_line else text).split())
+    prompt = " ".join((text.splitlines()[0] if first_line and text else text).split())
     if not prompt:
         raise InputError(f"the caption {quote_path(found)} is empty")
     static = folder / STATIC / video.name

@@ -13,11 +13,14 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-from egosim_jax.data.readers import Entry, Reader
+from egosim_jax.data.readers import NOTE, Entry, Reader
 from egosim_jax.data.recorded_files import DESCRIPTION
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.types import InputError, check_counts
+
+FIXED = {"camera": "fixed"}
+"""Provenance of a recording whose dataset has a camera at rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +33,8 @@ class Outcome:
     """Reason why it was skipped; None if it was imported."""
     resumed: bool = False
     """True if an earlier import wrote it."""
+    note: str | None = None
+    """Part of its source that was imported, unless it is all."""
 
 
 def import_recordings(
@@ -57,13 +62,13 @@ def _import(dataset: str, entries: Iterable[Entry], out: Path) -> Iterator[Outco
                         "separately."
                     )
                 seen[name] = entry.source
-                yield Outcome(recording_id=name, resumed=_import_one(dataset, entry, out / name))
+                yield _import_one(dataset, entry, out / name)
             except InputError as error:
                 yield Outcome(recording_id=name, problem=str(error))
 
 
-def _import_one(dataset: str, entry: Entry, folder: Path) -> bool:
-    """Read and write a recording; return True if an earlier import wrote it."""
+def _import_one(dataset: str, entry: Entry, folder: Path) -> Outcome:
+    """Read and write a recording, unless an earlier import wrote it."""
     made_of = {"dataset": dataset, "source": str(entry.source.resolve()), **entry.options}
     if (folder / DESCRIPTION).exists():
         try:
@@ -77,8 +82,29 @@ def _import_one(dataset: str, entry: Entry, folder: Path) -> bool:
                     f"{folder} holds a recording with another {', '.join(differing)}: choose "
                     "another folder, or remove it. (--out)"
                 )
-            return True
-    recording = entry.read(folder)
+            return Outcome(recording_id=entry.recording_id, resumed=True, note=written.get(NOTE))
+    recording = _without_placeholders(entry.read(folder))
     provenance = {**recording.provenance, **made_of}
     replace(recording, recording_id=entry.recording_id, provenance=provenance).save(folder)
-    return False
+    return Outcome(recording_id=entry.recording_id, note=provenance.get(NOTE))
+
+
+def _without_placeholders(recording: Recording) -> Recording:
+    """Return a recording whose cameras are unknown if all poses are equal.
+
+    A camera that a person wears or holds never rests exactly: such poses fill a required field.
+    The camera of a robot may rest, and so may one that its dataset calls fixed.
+    """
+    poses = recording.world_from_camera
+    fixed = recording.provenance.items() >= FIXED.items() or recording.kind == "robot"
+    if poses is None or len(poses) < 2 or fixed or not (poses == poses[0]).all():
+        return recording
+    why = "unknown: all are equal, as placeholders are"
+    return replace(
+        recording,
+        world_from_camera=None,
+        joints_m=None,
+        points=None,
+        metric=False,
+        provenance={**recording.provenance, "poses": why, NOTE: f"no cameras; poses {why}"},
+    )

@@ -11,7 +11,8 @@
 Paths are relative to the folder of the metadata file. The default files have EgoSim's names and are
 in the folder of the prior. So is the mask, `pc_mask_video.mp4`, which has no column. Ids consist of
 letters, digits, `.`, `_` and `-`; a `/` in an id makes a subfolder of the outputs. No cell of the
-columns above may be empty. Further columns are copied to the results.
+columns above may be empty; blanks around their text are dropped. Further columns are copied to the
+results.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
     clips: list[ClipFiles] = []
     problems = Problems()
     first_seen: dict[str, int] = {}
-    for line, row in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
+    for line, cells in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
+        row = {name: cell.strip() if name in COLUMNS else cell for name, cell in cells.items()}
         found = list(_row_problems(row, first_seen))
         problems.add(f"line {line}{problem}" for problem in found)
         if not found:
@@ -153,7 +155,7 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     try:
         text = read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig")
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        header = next(reader, [])
+        header = [cell.strip() for cell in next(reader, [])]
         needed = (*REQUIRED, *(() if TARGET in header else ("video_id",)))
         absent = [column for column in needed if column not in header]
         if absent:
@@ -178,7 +180,9 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
                 yield line, dict(zip(header, cells, strict=True))
             line = reader.line_num + 1
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{name} cannot be read as CSV: {quote_text(str(error))}.") from error
+        raise InputError(
+            f"{name} cannot be read as CSV: {quote_text(str(error))}. Save it as CSV in UTF-8."
+        ) from error
 
 
 def _json_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:

@@ -61,6 +61,8 @@ MAX_FRAMES = 1 << 20
 """Maximum length of a recording in frames: about ten hours."""
 MAX_BYTES = 1 << 28
 """Maximum size of a description in bytes."""
+MAX_STRETCH = 0.1
+"""Maximum relative difference between the aspect ratios of depth and image."""
 MAX_FPS = 1000
 """Maximum frame rate."""
 RATE = re.compile(r"[0-9]{1,40}(?:\.[0-9]{1,40}|/[1-9][0-9]{0,39})?")
@@ -201,16 +203,25 @@ class Recording:
     def read_depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
         """Return measured depth in meters at the image's size, infinite where unknown, or None.
 
-        A smaller map is enlarged by nearest neighbor, so that edges stay sharp.
+        A smaller map is enlarged by nearest neighbor, so that edges stay sharp. Raises `InputError`
+        if its shape is not the image's.
         """
         if self.depth is None or (path := self.depth.paths[frame]) is None:
             return None
         values = read_depth_image(path) * np.float32(self.depth.unit_m)
-        rows, columns = (
+        rows, columns = values.shape
+        fitting = rows * self.width / self.height
+        if abs(columns - fitting) > max(1, MAX_STRETCH * fitting):
+            raise InputError(
+                f"{quote_path(path)} is {columns}x{rows} and the image "
+                f"{self.width}x{self.height}: depth must have the image's shape. Remove the depth "
+                "files, or align them with the images."
+            )
+        at = [
             np.minimum((np.arange(size) + 0.5) * stored / size, stored - 1).astype(int)
             for size, stored in zip((self.height, self.width), values.shape, strict=True)
-        )
-        values = values[rows[:, None], columns]
+        ]
+        values = values[at[0][:, None], at[1]]
         return np.where(np.isfinite(values) & (values > 0), values, np.float32(np.inf))
 
     def clip(self, start: int, stop: int) -> Recording:

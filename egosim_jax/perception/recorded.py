@@ -23,6 +23,7 @@ from jaxtyping import Float, Float32, Int32
 
 from egosim_jax.io.bounded import open_regular, quote, quote_text, read_bytes
 from egosim_jax.io.digest import sha256
+from egosim_jax.io.images import decode_labels
 from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
 from egosim_jax.perception.registry import register
@@ -147,7 +148,7 @@ class ReadRecording:
 
     def _phrases(self, step: int) -> dict[int, str]:
         path = self._path("mask", "txt", step)
-        text = read_bytes(path, limit=MAX_TEXT_BYTES).decode("utf-8", "replace")
+        text = read_bytes(path, limit=MAX_TEXT_BYTES).decode("utf-8-sig", "replace")
         found = {}
         for line in text.splitlines():
             number, colon, phrase = line.partition(":")
@@ -199,24 +200,10 @@ def _unpack(path: Path, count: int) -> Iterator[np.ndarray]:
                 name = quote_text(entry.filename)
                 if entry.file_size > MAX_FRAME_BYTES:
                     raise InputError(f"{path}: {name} unpacks to {entry.file_size} bytes.")
-                read = _exr if entry.filename.endswith(".exr") else _png
+                read = _exr if entry.filename.endswith(".exr") else decode_labels
                 yield read(archive.read(entry), f"{path}: {name}")
     except DAMAGE as error:
         raise InputError(f"{path} is damaged: {quote_text(str(error))}.") from error
-
-
-def _png(data: bytes, name: str) -> np.ndarray:
-    import cv2
-
-    width, height = int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
-    image = None
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and width * height <= MAX_FRAME_PIXELS:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2:
-        raise InputError(
-            f"{name} must be a PNG with one channel and at most {MAX_FRAME_PIXELS} pixels."
-        )
-    return image
 
 
 def _exr(data: bytes, name: str) -> np.ndarray:

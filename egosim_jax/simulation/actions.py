@@ -219,8 +219,8 @@ def load_placed(
 def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> Action:
     """Return the action of a user's .npz or .json file (`egosim episode make`).
 
-    `prompt` replaces the file's. The number of joints gives the kind of hands. Raises `InputError`
-    naming the file.
+    `prompt` replaces the file's; without either it is empty. The number of joints gives the kind of
+    hands. Raises `InputError` naming the file.
     """
     values: Mapping[str, Any]
     if path.suffix == ".json":
@@ -232,9 +232,11 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
     written = values.get("prompt")
     if not isinstance(written, str | None):
         raise InputError(f"{path}: prompt is {quote(written)}: it must be text.")
-    prompt = prompt or written
-    if not prompt:
-        raise InputError(f"{path} has no prompt: give one per clip. (--prompts)")
+    if written == "" and not prompt:
+        raise InputError(
+            f"{path} has no prompt: give one per clip, or omit it to use none. (--prompts)"
+        )
+    prompt = prompt or written or ""
     joints = np.asarray(values["joints_m"])
     kinds: dict[int, Kind] = {count: kind for kind, count in JOINTS.items()}
     try:

@@ -28,6 +28,11 @@ POINTS, DESCRIPTION = "points.npz", "state.json"
 _NAMES = re.compile(r"points\.npz|state\.json")
 ARRAYS = ("points_m", "colors", "object_ids", "last_seen")
 CHANNELS = ("red", "green", "blue")
+SPLATS = ("f_dc_0", "f_dc_1", "f_dc_2")
+COLORS = (CHANNELS, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"), SPLATS)
+"""Names of the color channels in files of several programs."""
+SH0 = 0.28209479
+"""Spherical harmonic of degree 0, the factor of a splat's base color."""
 _DTYPES = {"points_m": "float32", "colors": "uint8", "object_ids": "int32", "last_seen": "int32"}
 
 
@@ -165,20 +170,30 @@ def write_ply(path: Path, state: SceneState) -> None:
 def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
     """Read a state from a PLY file of colored points; other fields come from the template.
 
+    Of Gaussian splats, the centers of opaque ones (at least half) are read, in their base colors.
     Raises `InputError` if it is damaged, or has no points or no colors.
     """
     points = read_points(path)
-    missing = [
-        name for name in ("x", "y", "z", *CHANNELS) if name not in (points.dtype.names or ())
-    ]
-    if missing:
+    names = points.dtype.names or ()
+    channels = next((c for c in COLORS if set(c) <= set(names)), CHANNELS)
+    if missing := [name for name in ("x", "y", "z", *channels) if name not in names]:
         raise InputError(
-            f"{quote_path(path)} has no colored points: missing property {', '.join(missing)}."
+            f"{quote_path(path)} has no colored points: missing property {', '.join(missing)}. "
+            "Save the points with colors (red, green, blue as uchar)."
         )
+    if channels == SPLATS and "opacity" in names:
+        points = points[points["opacity"] > 0]
     try:
+        places = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float32)
+        if bad := int((~np.isfinite(places)).any(axis=1).sum()):
+            raise InputError(
+                f"{bad:,} of {len(points):,} points are not finite. Remove them, for instance by "
+                "Open3D's remove_non_finite_points."
+            )
+        colors = np.stack([points[name] for name in channels], axis=1)
         arrays = {
-            "points_m": np.stack([points[name] for name in "xyz"], axis=1).astype(np.float32),
-            "colors": np.stack([_channel(points[name]) for name in CHANNELS], axis=1),
+            "points_m": places,
+            "colors": _levels(np.clip(0.5 + SH0 * colors, 0, 1) if channels == SPLATS else colors),
             "object_ids": _ids(points, "object_ids"),
             "last_seen": _ids(points, "last_seen"),
         }
@@ -189,8 +204,8 @@ def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
         raise InputError(f"{quote_path(path)}: {error}") from error
 
 
-def _channel(values: np.ndarray) -> np.ndarray:
-    """Return 8-bit levels of a color channel given as bytes or as floats from 0 to 1."""
+def _levels(values: np.ndarray) -> np.ndarray:
+    """Return 8-bit levels of colors given as bytes or as floats from 0 to 1."""
     if values.dtype == np.uint8:
         return values
     if values.dtype.kind != "f" or not ((values >= 0) & (values <= 1)).all():

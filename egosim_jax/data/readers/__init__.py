@@ -22,6 +22,9 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import quote
 from egosim_jax.types import InputError
 
+NOTE = "used"
+"""Entry of the provenance that says which part of its source a recording is; it is printed."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:

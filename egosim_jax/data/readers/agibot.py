@@ -19,7 +19,8 @@ If both readings are equal, the recording is refused unless the user decides.
 A gripper has three joints: the flange, and the tips of thumb and index finger. The tips are
 `TOOL_M` along the flange's z axis, and half of the opening to either side along its y axis. The
 dataset documents that the value grows when the gripper opens; other users found the reverse. If the
-measured value grows with the command (0 open, 1 closed), it is inverted. Intel's cameras have pixel
+measured value grows with the command (0 open, 1 closed), it is inverted. Values from 0 to 1 may be
+shares or grippers that stay closed: the user decides. Intel's cameras have pixel
 centers at integers. A lens that is not a pinhole is remapped, which writes a video. Followed: the
 dataset's card of 2025 and the loaders of its challenges.
 """
@@ -53,11 +54,16 @@ TOOL_M = 0.23
 """Distance from the flange to the fingertips along its z axis, in meters, as EnerVerse-AC draws."""
 MAX_OPENING_MM = 120.0
 """Maximum opening of a gripper in millimeters."""
+MAX_SHARE, MAX_VALUE_MM = 1.5, 150.0
+"""Bounds of the largest value of the grippers: below, it may be a share; above, no opening."""
+MIN_AGREEMENT = 0.3
+"""Minimum correlation of the grippers' values and commands that decides their sign."""
 MAX_SURPLUS = 2
 """Maximum difference in length of video, poses and states of an episode, in frames."""
 CHUNK = 64
 """Number of frames to remap at a time."""
 Reading = Literal["camera_to_base", "base_to_camera"]
+Opening = Literal["open_mm", "closed_mm", "open_share", "closed_share"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +113,9 @@ class AgiBot:
     """Folder with observations, parameters, proprio_stats and task_info."""
     extrinsics: Reading | None = None
     """Reading of the camera's extrinsics; by default decided by projecting the grippers."""
+    opening: Opening | None = None
+    """Meaning of the grippers' values: millimeters, or a share from 0 to 1 that is open or closed.
+    By default millimeters, if there are values above 1."""
 
     def find(self) -> Iterator[Entry]:
         """List the parts of all episodes."""
@@ -121,7 +130,10 @@ class AgiBot:
                     recording_id=make_id([files.task, files.episode, f"{part.number:03d}"]),
                     read=partial(self._read, files, part),
                     source=files.states,
-                    options={"--extrinsics": self.extrinsics or "decided"},
+                    options={
+                        "--extrinsics": self.extrinsics or "decided",
+                        "--opening": self.opening or "decided",
+                    },
                 )
 
     def _read(self, files: _Files, part: _Part, folder: Path) -> Recording:
@@ -129,7 +141,7 @@ class AgiBot:
         info.check_square(quote_path(files.video))
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
-        joints, tools, notes = _read_grippers(files.states)
+        joints, tools, notes = _read_grippers(files.states, self.opening)
         span = _span(part, {"frames": info.frames, "poses": len(matrices), "states": len(joints)})
         joints, matrices = joints[span], matrices[span]
         poses, decision = self._decide(matrices, tools[span], lens)
@@ -290,7 +302,7 @@ def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"]:
 
 
 def _read_grippers(
-    path: Path,
+    path: Path, given: Opening | None
 ) -> tuple[Float[np.ndarray, "f 2 3 3"], Float[np.ndarray, "f 2 3"], dict[str, str]]:
     """Return joints and points between the fingers in the base, and the reading of the opening."""
     end, effector = "state/end", "effector/position"
@@ -307,12 +319,13 @@ def _read_grippers(
     tools = positions + TOOL_M * rotations[..., 2]
     if opening.shape[1] != 2:
         return np.full((len(positions), 2, 3, 3), np.nan), tools, {"hands": "not grippers"}
-    notes = {"opening": "grows when it opens"}
-    if _closes(arrays.get(f"action/{effector}"), opening):
-        opening, notes = (
-            MAX_OPENING_MM - opening,
-            {"opening": "grows when it closes, as the command"},
-        )
+    meaning = given or _meaning(arrays.get(f"action/{effector}"), opening, path)
+    if meaning.endswith("share"):
+        opening = MAX_OPENING_MM * opening
+    if meaning.startswith("closed"):
+        opening = MAX_OPENING_MM - opening
+    grows = "closes, as the command" if meaning.startswith("closed") else "opens"
+    notes = {"opening": f"grows when it {grows}", "opening_in": meaning}
     half = np.clip(opening, 0, MAX_OPENING_MM) / 2000
     zero = np.zeros_like(half)
     local = np.stack(
@@ -323,12 +336,32 @@ def _read_grippers(
     return joints, tools, notes
 
 
-def _closes(command: np.ndarray | None, opening: Float[np.ndarray, "f 2"]) -> bool:
-    """Return True if the measured value grows with the command, which is 1 when closed."""
-    if command is None or command.shape != opening.shape:
-        return False
-    changes = (command - command.mean(axis=0)) * (opening - opening.mean(axis=0))
-    return bool(np.nansum(changes) > 0)
+def _meaning(command: np.ndarray | None, opening: Float[np.ndarray, "f 2"], path: Path) -> Opening:
+    """Return what the grippers' values mean. Raises `InputError` if they do not decide it.
+
+    Values that grow with the command, which is 1 when closed, grow when the gripper closes.
+    """
+    low, high = float(np.nanmin(opening)), float(np.nanmax(opening))
+    if not (MAX_SHARE < high <= MAX_VALUE_MM and low > -MAX_SHARE):
+        raise InputError(
+            f"{quote_path(path)}: the grippers' values are from {low:g} to {high:g}: openings in "
+            f"millimeters must reach more than {MAX_SHARE:g} and at most {MAX_VALUE_MM:g}. If they "
+            "are shares of the opening, choose open_share (1 is open) or closed_share. (--opening)"
+        )
+    agreement = 0.0
+    if command is not None and command.shape == opening.shape:
+        moves = [
+            np.nan_to_num(values - np.nanmean(values, axis=0)) for values in (command, opening)
+        ]
+        size = float(np.sqrt((moves[0] ** 2).sum() * (moves[1] ** 2).sum()))
+        agreement = float((moves[0] * moves[1]).sum()) / size if size > 0 else 0.0
+    if abs(agreement) < MIN_AGREEMENT:
+        raise InputError(
+            f"{quote_path(path)}: the grippers' values and their commands do not move together "
+            f"(correlation {agreement:.2f}): whether values grow when a gripper opens is unknown. "
+            "Choose open_mm, as the dataset documents, or closed_mm. (--opening)"
+        )
+    return "closed_mm" if agreement > 0 else "open_mm"
 
 
 def _find_depth(folder: Path, span: slice) -> DepthFiles | None:

@@ -2,9 +2,9 @@
 
 A folder with a sparse model (itself, or in sparse/0 or sparse/) and the images in images/. The
 images in order of their names are the frames of a video, at a rate that the user gives. The
-longest run of registered images is the recording. One camera must have taken all images;
-distorted images are remapped, and so are the pixels that observe points. The unit is arbitrary,
-so that `metric` is False. Conventions: `io/untrusted/colmap.py`.
+longest run of registered images without gaps is the recording. One camera must have taken all
+images; distorted images are remapped, and so are the pixels that observe points. The unit is
+arbitrary, so that `metric` is False. Conventions: `io/untrusted/colmap.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from egosim_jax.data.readers import Entry, inside, make_id, natural_order, requi
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
     ImageVideo,
+    describe_run,
     longest_run,
+    read_posed,
     write_images,
 )
 from egosim_jax.data.readers.lenses import Lens
@@ -31,7 +33,6 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote_path, quote_text
-from egosim_jax.io.images import read_image
 from egosim_jax.io.untrusted.colmap import Camera, Image, Model, read_model
 from egosim_jax.types import InputError
 
@@ -100,7 +101,7 @@ class Colmap:
             )
         paths = [inside(root, image.name, what="an image of the model") for image in images]
         lens = make_lens(model.cameras[cameras.pop()])
-        video = write_images(folder, map(read_image, paths), lens, fps)
+        video = write_images(folder, (read_posed(path, lens) for path in paths), lens, fps)
         return Recording(
             recording_id=make_id([self.source.resolve().name]),
             video=video.path,
@@ -114,6 +115,7 @@ class Colmap:
             provenance={
                 "images": f"{len(images)} of {len(names)}, {len(by_name)} registered",
                 "lens": "pinhole" if video.remap is None else "remapped",
+                **describe_run(names, run),
             },
         )
 

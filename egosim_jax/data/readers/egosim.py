@@ -100,7 +100,7 @@ def _read(clip: Path, folder: Path) -> Recording:
     caption = clip / "caption.txt"
     text = ""
     if caption.exists():
-        text = read_bytes(caption, limit=MAX_CAPTION_BYTES).decode("utf-8", "replace").strip()
+        text = read_bytes(caption, limit=MAX_CAPTION_BYTES).decode("utf-8-sig", "replace").strip()
     return Recording(
         recording_id=make_id([clip.resolve().name]),
         video=video,

@@ -165,10 +165,11 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
             text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
             lines = iter(lambda: text.readline(MAX_LINE), "")
             reader = csv.DictReader(lines, strict=True)
-            if "video_id" not in (reader.fieldnames or ()):
+            reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+            if "video_id" not in reader.fieldnames:
                 raise InputError(f"{name} has no column video_id.")
             for row in reader:
-                cells = {k: v for k, v in row.items() if isinstance(k, str) and isinstance(v, str)}
+                cells = {k: v.strip() for k, v in row.items() if k and isinstance(v, str)}
                 if cells.get("video_id"):
                     yield cells
     except (UnicodeDecodeError, csv.Error) as error:

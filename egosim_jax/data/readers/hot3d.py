@@ -148,7 +148,7 @@ class _Clip:
 
     def image(self, name: str) -> np.ndarray:
         """Decode an image."""
-        return decode_image(self.read(name), name=f"{self.name}: {name}")
+        return decode_image(self.read(name), name=f"{self.name}: {name}", pixels="stored")
 
     def camera(self, key: str, stream: str) -> tuple[dict[str, Any], np.ndarray]:
         """Return calibration and pose of a camera at a frame."""

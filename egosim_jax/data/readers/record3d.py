@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -33,7 +33,12 @@ import tyro
 from PIL import Image
 
 from egosim_jax.data.readers import Entry, make_id, natural_order
-from egosim_jax.data.readers.images import MAX_IMAGES, write_images
+from egosim_jax.data.readers.images import (
+    MAX_IMAGES,
+    describe_run,
+    longest_run,
+    write_images,
+)
 from egosim_jax.data.readers.lenses import Lens
 from egosim_jax.data.readers.lzfse import unpack
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
@@ -50,7 +55,7 @@ from egosim_jax.io.bounded import (
 )
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.untrusted.npz import DAMAGE
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, is_rigid
 
 MAX_FILE_BYTES = 1 << 28
 """Maximum size of a file in a capture or archive, in bytes."""
@@ -94,20 +99,28 @@ def _metadata_name(folder: Path) -> str | None:
 def _read(path: Path, folder: Path) -> Recording:
     with _open_capture(path) as (names, read):
         metadata = _read_metadata(names, read, path)
-        numbered = sorted(
-            (int(match[1]), name) for name in names if (match := _IMAGE.fullmatch(name))
-        )[:MAX_IMAGES]  # fmt: skip
+        matches = filter(None, map(_IMAGE.fullmatch, sorted(names)))
+        numbered = {int(match[1]): match[0] for match in matches}  # rgbd/ rather than rgb/
         poses = _poses(metadata, path)
-        if [number for number, _ in numbered] != list(range(len(poses))):
+        if not numbered or max(numbered) >= len(poses):
             raise InputError(
                 f"{quote_path(path)} has {len(numbered)} images and {len(poses)} poses: the "
                 "images must be numbered from 0, one per pose. Export the capture again."
             )
         lens, spread = _lens(metadata, len(poses), path)
+        rigid, numbers = is_rigid(poses), sorted(numbered)[:MAX_IMAGES]
+        used = dict(zip((numbered[number] for number in numbers), rigid[numbers], strict=True))
+        run = longest_run(list(used), used.__getitem__)
+        notes = describe_run(list(used), run)
+        numbers = numbers[run] or numbers  # without a pose, the recording names the first
+        poses = poses[numbers]
         fps = Fraction(_number(metadata, "fps", path)).limit_denominator(1001)
-        images = (decode_image(read(name), name=quote_text(name)) for _, name in numbered)
+        images = (
+            decode_image(read(name), name=quote_text(name), pixels="stored")
+            for name in map(numbered.__getitem__, numbers)
+        )
         video = write_images(folder, images, lens, fps)
-        depth, why = _write_depth(names, read, metadata, len(poses), path, folder)
+        depth, why = _write_depth(names, read, metadata, numbers, path, folder)
     return Recording(
         recording_id=make_id([path.resolve().stem]),
         video=video.path,
@@ -119,7 +132,7 @@ def _read(path: Path, folder: Path) -> Recording:
         intrinsics_px=video.intrinsics_px,
         metric=True,
         depth=depth,
-        provenance={"focal_spread": f"{spread:.4f}", "depth": why},
+        provenance={"focal_spread": f"{spread:.4f}", "depth": why, **notes},
     )
 
 
@@ -224,12 +237,13 @@ def _write_depth(
     names: list[str],
     read: ReadFile,
     metadata: dict[str, Any],
-    frames: int,
+    numbers: Sequence[int],
     path: Path,
     folder: Path,
 ) -> tuple[DepthFiles | None, str]:
     """Write depth maps as PNG in millimeters; return them, or None, and their source or why not."""
-    found = [f"rgbd/{number}.depth" in names for number in range(frames)]
+    known = set(names)
+    found = [f"rgbd/{number}.depth" in known for number in numbers]
     if not any(found):
         return None, "none"
     if find_spec("liblzfse") is None:
@@ -237,9 +251,9 @@ def _write_depth(
     columns, rows = (int(_number(metadata, name, path)) for name in ("dw", "dh"))
     if max(columns, rows) > MAX_DEPTH_SIDE:
         raise InputError(f"{quote_path(path)}: depth of {columns}x{rows} pixels is too large.")
-    paths: list[Path | None] = [None] * frames
-    for number in range(frames):
-        if found[number]:
+    paths: list[Path | None] = [None] * len(numbers)
+    for frame, number in enumerate(numbers):
+        if found[frame]:
             name = f"rgbd/{number}.depth"
             try:
                 data = unpack(read(name), 4 * rows * columns)
@@ -247,7 +261,7 @@ def _write_depth(
                 raise InputError(f"{quote_path(path)}: {name} is damaged: {error}.") from error
             meters = np.frombuffer(data, "<f4").reshape(rows, columns)
             meters = np.where(np.isfinite(meters) & (meters > 0) & (meters < 65), meters, 0)
-            paths[number] = target = folder / "depth" / f"{number:06d}.png"
+            paths[frame] = target = folder / "depth" / f"{number:06d}.png"
             with atomic_write(target) as temporary:
                 Image.fromarray(np.rint(1000 * meters).astype(np.uint16)).save(temporary)
     return DepthFiles(paths=tuple(paths), unit_m=0.001), "LiDAR"

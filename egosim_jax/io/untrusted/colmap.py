@@ -9,6 +9,7 @@ pixel at (0.5, 0.5). In the arrays here it is at (0, 0).
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -74,10 +75,19 @@ def read_model(folder: Path) -> Model:
     with TemporaryDirectory(prefix="egosim_colmap_") as name:
         for part in PARTS:
             data = read_bytes(folder / f"{part}{suffix}", limit=MAX_BYTES)
-            # pycolmap drops the last image of a text if no line of keypoints follows it.
-            ending = b"\n\n" if suffix == ".txt" else b""
-            (Path(name) / f"{part}{suffix}").write_bytes(data + ending)
+            (Path(name) / f"{part}{suffix}").write_bytes(data if suffix == ".bin" else _plain(data))
         return read_file(_read, folder, Path(name), suffix)
+
+
+def _plain(data: bytes) -> bytes:
+    """Return a text with line feeds and single spaces, as pycolmap reads it.
+
+    pycolmap keeps the carriage return of an image's name, and drops the last image if no line of
+    keypoints follows it.
+    """
+    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    data = re.sub(rb" +", b" ", data.replace(b"\t", b" "))
+    return re.sub(rb" ?\n ?", b"\n", data).strip(b" ") + b"\n\n"
 
 
 def _read(folder: Path, copy: Path, suffix: str) -> Model:
