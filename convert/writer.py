@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egosim_jax.convert.finite import all_finite, is_floating, out_of_range
 from egosim_jax.convert.source import INDEX
 from egosim_jax.io.atomic import LOG, PART, sync
 from egosim_jax.io.bounded import quote_path
@@ -44,6 +45,10 @@ class Weight:
     dtype: np.dtype
     pieces: tuple[Callable[[], np.ndarray], ...]
     """Functions of equal parts along the first axis, or of the full array; cast to `dtype`."""
+    names: tuple[str, ...] = ()
+    """Name of each piece in error messages; empty for the weight's own name."""
+    fix: str = "Store the weights as bfloat16 or float32, or omit the option. (--dtype)"
+    """What to do about values beyond the range of `dtype`, for an error message."""
 
     @property
     def bytes(self) -> int:
@@ -72,12 +77,12 @@ def write(
     The pieces are read from the files `origin`; an incomplete file is resumed only if they have not
     changed. With `keep_log`, the log of a complete file stays, so the same call recognizes the file
     and does not write it again. `metadata` goes into the header, which is sealed if the format is
-    ours. If a piece is damaged, no file remains.
+    ours. If a piece is damaged or not finite, also after its cast, no file remains.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # Wide dtypes first, so that every weight is aligned to its item size.
     ordered = sorted(weights, key=lambda weight: (-weight.dtype.itemsize, weight.name))
-    pieces = [(weight, piece) for weight in ordered for piece in weight.pieces]
+    pieces = [(weight, number) for weight in ordered for number in range(len(weight.pieces))]
     sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
     blank = _header(ordered, metadata, len(pieces) * [BLANK])
     plan = _fingerprint(blank, origin)
@@ -179,8 +184,13 @@ def _put(pieces: Iterable, file: int) -> Iterator[str]:
             yield future.result()
 
 
-def _put_one(file: int, offset: int, weight: Weight, piece: Callable[[], np.ndarray]) -> str:
-    array = in_rows(piece().astype(weight.dtype, copy=False))
+def _put_one(file: int, offset: int, weight: Weight, number: int) -> str:
+    name = weight.names[number] if weight.names else weight.name
+    given = weight.pieces[number]()
+    with np.errstate(over="ignore", invalid="ignore"):
+        array = in_rows(given.astype(weight.dtype, copy=False))
+    if not all_finite(array):
+        raise out_of_range(given, weight.dtype, name=name, fix=weight.fix)
     data = array.reshape(-1).view(np.uint8).data
     written = 0
     while written < len(data):  # a call writes at most 2 GiB
@@ -202,8 +212,7 @@ def in_rows(x: np.ndarray) -> np.ndarray:
 
 def stored_as(kind: np.dtype, dtype: str | None) -> np.dtype:
     """Return the stored dtype of a weight of dtype `kind`; only floating dtypes are cast."""
-    floating = np.issubdtype(kind, np.floating) or kind.name.startswith(("bfloat", "float8"))
-    target = kind if dtype is None or not floating else np.dtype(dtype)
+    target = kind if dtype is None or not is_floating(kind) else np.dtype(dtype)
     if target not in CODES.values():
         raise InputError(f"safetensors cannot store {target}. Choose another dtype. (--dtype)")
     return target

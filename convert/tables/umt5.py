@@ -113,7 +113,8 @@ TABLE = Table(
         ),
         "transformers": Naming(
             rules=transformers,
-            signature="encoder.block.0.layer.0.SelfAttention.q.weight",
+            # T5 has a position bias in its first block alone.
+            signature="encoder.block.1.layer.0.SelfAttention.relative_attention_bias.weight",
             layout="diffusers",
             folder="text_encoder",
             stem="model",
