@@ -132,8 +132,6 @@ class Weights:
             raise InputError(f"{quote_path(self.source)} holds {has}. (egosim convert inspect)")
         if needless and not self.only:
             print(f"skipped, as {self.config} lacks it: {needless}", file=sys.stderr)
-        if not self.only:
-            folder.check_complete(config, names, out=self.out)
         apart(self.out, self.source)
         planned = []
         for found in map(folder.network, names):
@@ -148,6 +146,8 @@ class Weights:
                 )
             for file in found.source.files:
                 apart(self.out / f"{found.network}.safetensors", file)
+        if not self.only:
+            folder.check_complete(config, names, out=self.out)
         kept = {}
         if folder.tokenizer is not None and "text" in names and config.tokenizer.kind != "byt5":
             kept = tokenizer_files(folder.tokenizer, within=self.source)

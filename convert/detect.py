@@ -7,8 +7,10 @@ diffusers' have a folder per network, and the tokenizer has a separate folder.
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -99,8 +101,8 @@ class Folder:
             raise InputError(
                 f"{has} in one file, with {prefixes} before the names: choose one. (--prefix)"
             )
-        files = ", ".join(quote_path(found.source.path) for found in here)
-        raise InputError(f"{has}: {files}. Give the path of one of them.")
+        files = ", ".join(quote_path(os.path.relpath(f.source.path, self.path)) for f in here)
+        raise InputError(f"{has} ({files}): give the path of one of them.")
 
     def check_complete(self, config: ModelConfig, names: Iterable[str], *, out: Path) -> None:
         """Raise `InputError` if a folder lacks a network of the config; warn if a file does.
@@ -172,7 +174,7 @@ def known_tables(config: ModelConfig | None = None) -> list[tuple[str, Table]]:
 
 def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[DetectedNetwork]:
     """Return the networks of a checkpoint; a ComfyUI file can hold several, each with a prefix."""
-    found: dict[tuple[str, str], DetectedNetwork] = {}
+    found: dict[tuple[str, str], dict[Table, DetectedNetwork]] = {}
     for network, table in tables:
         for naming, names in table.namings.items():
             for key in source.tensors:
@@ -181,7 +183,7 @@ def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[Det
                     detected = DetectedNetwork(
                         network=network, table=table, naming=naming, prefix=prefix, source=source
                     )
-                    found.setdefault((network, prefix), detected)
+                    found.setdefault((network, prefix), {}).setdefault(table, detected)
     if len(found) > MAX_NETWORKS:
         raise InputError(
             f"{source.name} holds {len(found)} networks; the limit is {MAX_NETWORKS} per file. "
@@ -189,9 +191,21 @@ def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[Det
         )
     prefixes = {prefix for _, prefix in found}
     return [
-        replace(one, others=tuple(p for p in prefixes if p.startswith(prefix) and p != prefix))
-        for (_, prefix), one in found.items()
+        replace(
+            _fitting(list(alike.values())),
+            others=tuple(p for p in prefixes if p.startswith(prefix) and p != prefix),
+        )
+        for (_, prefix), alike in found.items()
     ]
+
+
+def _fitting(alike: Sequence[DetectedNetwork]) -> DetectedNetwork:
+    """Return the first network whose table takes the tensors; the first one if none does."""
+    for one in alike if len(alike) > 1 else ():
+        with suppress(InputError):
+            one.table.check(one.tensors)
+            return one
+    return alike[0]
 
 
 def _folders(path: Path) -> list[Path]:
