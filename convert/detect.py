@@ -175,9 +175,10 @@ def known_tables(config: ModelConfig | None = None) -> list[tuple[str, Table]]:
 def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[DetectedNetwork]:
     """Return the networks of a checkpoint; a ComfyUI file can hold several, each with a prefix."""
     found: dict[tuple[str, str], dict[Table, DetectedNetwork]] = {}
+    keys = [key.replace(BASE_LAYER, ".") for key in source.tensors]
     for network, table in tables:
         for naming, names in table.namings.items():
-            for key in source.tensors:
+            for key in keys:
                 prefix = key.removesuffix(names.signature)
                 if prefix != key and (not prefix or prefix.endswith(".")):
                     detected = DetectedNetwork(

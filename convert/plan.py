@@ -111,6 +111,7 @@ def merged(
     lora.check_scale(scale)
     lora.check(want, changes)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def piece(path: str, layer: int | None) -> np.ndarray:
         at, name = (..., path) if layer is None else (layer, f"{path}, block {layer}")
         weight = tensors[path].array()[at]
@@ -127,8 +128,7 @@ def merged(
             added.append(full.array[at].astype(np.float32) - weight.astype(np.float32))
         if not added:
             return weight
-        with np.errstate(over="ignore", invalid="ignore"):
-            result = weight.astype(np.float32) + scale * sum(added)
+        result = weight.astype(np.float32) + scale * sum(added)
         if all_finite(weight) and not all_finite(result):
             raise InputError(
                 f"The LoRA makes values of {name} that float32 cannot hold: its alpha, its values "
