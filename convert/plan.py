@@ -128,13 +128,14 @@ def merged(
             added.append(full.array[at].astype(np.float32) - weight.astype(np.float32))
         if not added:
             return weight
-        result = weight.astype(np.float32) + scale * sum(added)
-        if all_finite(weight) and not all_finite(result):
-            raise InputError(
-                f"The LoRA makes values of {name} that float32 cannot hold: its alpha, its values "
-                f"or the scale {scale:g} are too high. Lower the scale. (--scale)"
-            )
-        return result
+        change = np.asarray(sum(added))
+        result = weight.astype(np.float32) + scale * change
+        if all_finite(result) or not all_finite(weight):
+            return result
+        why = "its alpha or its values are too high. Take another version of the LoRA."
+        if all_finite(change):
+            why = f"the scale {scale:g} is too high for it. Lower it. (--scale)"
+        raise InputError(f"The LoRA makes values of {name} that float32 cannot hold: {why}")
 
     table = table_of(config)
     rules = table.rules(next(iter(table.namings)), config)
