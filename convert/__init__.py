@@ -9,7 +9,8 @@ Networks belong in `models`, bounded readers of foreign files in `io.untrusted` 
     rules         rules of a table, and their match with a checkpoint
     plan          weights to write, each with functions that compute its pieces
     widen         base models with fewer input channels
-    stream        resumable writing in bounded memory
+    writer        resumable writing in bounded memory
+    finite        values that no weight may have
     lora          `read_lora`: LoRA files in every common naming
     lora_export   LoRA files for ComfyUI and diffusers, and DWM's checkpoints
     reference     one forward compared with PyTorch's

@@ -94,8 +94,10 @@ class Inspect:
 class Weights:
     """Convert every network of a checkpoint folder to a weights folder of a config.
 
-    Networks that the config lacks are skipped with a message. All names and shapes are checked
-    before anything is written. Running the same command again resumes an interrupted conversion.
+    Networks that the config lacks are skipped with a message. A folder without one that the config
+    needs is refused, unless --only names the others or it is in --out. All names and shapes are
+    checked before anything is written, and all values are checked to be finite. Running the same
+    command again resumes an interrupted conversion.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -106,6 +108,8 @@ class Weights:
     """Weights folder; its other networks are kept."""
     only: tuple[str, ...] = ()
     """Convert only these networks: dit, vae, text, image."""
+    prefix: str | None = None
+    """Text before the names, such as `ema`, if a file has several checkpoints of a network."""
     dtype: Dtype | None = None
     """Dtype to store floating weights in; by default each keeps its own."""
     widen: WidenMode | None = None
@@ -119,7 +123,7 @@ class Weights:
         from egosim_jax import configs
 
         config = configs.get(self.config)
-        folder = detect(self.source, config)
+        folder = detect(self.source, config).only(self.prefix)
         detected = dict.fromkeys(found.network for found in folder.found)
         names = self.only or tuple(name for name in detected if name in config.networks)
         needless = ", ".join(name for name in detected if name not in config.networks)
@@ -142,6 +146,8 @@ class Weights:
                 )
             for file in found.source.files:
                 apart(self.out / f"{found.network}.safetensors", file)
+        if not self.only:
+            folder.check_complete(config, names, out=self.out)
         kept = {}
         if folder.tokenizer is not None and "text" in names and config.tokenizer.kind != "byt5":
             kept = tokenizer_files(folder.tokenizer, within=self.source)
@@ -211,7 +217,8 @@ class ToTorch:
 class Lora:
     """Convert a LoRA for ComfyUI and diffusers, or merge it into weights.
 
-    Reads the namings of PEFT, diffusers, kohya (VideoX-Fun, musubi) and ComfyUI, with alpha.
+    Reads the namings of PEFT, diffusers, kohya (VideoX-Fun, musubi) and ComfyUI, with alpha, after
+    any prefix. A setting that changes the meaning is applied or refused.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -226,6 +233,10 @@ class Lora:
     """Strength of the LoRA in a merge."""
     base: Path | None = None
     """Weights folder that the LoRA was trained on; the file's header gets its hash."""
+    prefix: str | None = None
+    """Text before the names, such as `ema`, if the file has several LoRAs."""
+    adapter: str | None = None
+    """Name of PEFT's adapter, if the file has several."""
     layout: Literal["dwm"] | None = None
     """Layout instead of one file; `dwm` writes a folder like DWM's checkpoints.
 
@@ -248,7 +259,7 @@ class Lora:
         base = {_hash(folder) for folder in (self.merge, self.base) if folder is not None}
         if base:
             check_base(self.source, base)
-        changes = read_lora(self.source, config)
+        changes = read_lora(self.source, config, prefix=self.prefix, adapter=self.adapter)
         origin = [self.source]
         if self.source.is_dir():
             origin = sorted(file for file in self.source.iterdir() if file.is_file())
@@ -311,6 +322,8 @@ class Verify:
     """Weights folder converted from it."""
     config: str
     """Name of the model."""
+    prefix: str | None = None
+    """Value of --prefix in the conversion."""
     widen: WidenMode | None = None
     """Value of --widen in the conversion."""
 
@@ -322,20 +335,21 @@ class Verify:
 
         config = configs.get(self.config)
         wrong = []
-        folder = detect(self.source, config)
+        folder = detect(self.source, config).only(self.prefix)
         files = {f.network: self.weights / f"{f.network}.safetensors" for f in folder.found}
         if not any(file.exists() for file in files.values()):
             raise InputError(
                 f"{quote_path(self.weights)} has none of the networks of "
                 f"{quote_path(self.source)}, {', '.join(files) or 'which has none'}."
             )
-        for found in folder.found:
+        for found in map(folder.network, files):
             file = files[found.network]
             if not file.exists():
                 print(f"{found.network}: not converted")
                 continue
             widening = _widening(found, config, self.widen)
-            weights = to_jax(found, config, widening=widening)
+            # `_same` casts each piece to the dtype in the file: any dtype does here.
+            weights = to_jax(found, config, dtype="float32", widening=widening)
             tensors = read_safetensors(file)
             if problems := mismatches(tensors, {w.name: w.shape for w in weights}):
                 raise WeightsError(problems, source=str(file))

@@ -7,14 +7,17 @@ diffusers' have a folder per network, and the tokenizer has a separate folder.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import Table, tables_of
-from egosim_jax.io.bounded import quote_path
+from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.types import InputError
 
@@ -47,6 +50,8 @@ class DetectedNetwork:
     """Prefix of all its keys, such as `diffusion_model.` in ComfyUI's files."""
     source: Source
     """Checkpoint that has it."""
+    others: tuple[str, ...] = ()
+    """Longer prefixes of other networks in the checkpoint."""
 
     @property
     def tensors(self) -> Mapping[str, Tensor]:
@@ -56,7 +61,9 @@ class DetectedNetwork:
         return {
             name[cut:].replace(BASE_LAYER, "."): tensor
             for name, tensor in self.source.tensors.items()
-            if name.startswith(self.prefix) and name not in skipped
+            if name.startswith(self.prefix)
+            and name not in skipped
+            and not (self.others and name.startswith(self.others))
         }
 
     @property
@@ -83,13 +90,56 @@ class Folder:
     def network(self, name: str) -> DetectedNetwork:
         """Return the only checkpoint of a network. Raises `InputError` for 0 or several."""
         here = [found for found in self.found if found.network == name]
-        if len(here) != 1:
-            names = ", ".join(found.source.name for found in here) or "none"
+        if len(here) == 1:
+            return here[0]
+        has = f"{quote_path(self.path)} holds {len(here)} checkpoints of the network {name}"
+        if not here:
+            names = ", ".join(dict.fromkeys(found.network for found in self.found)) or "none"
+            raise InputError(f"{has}. Choose from its networks, {names}. (--only)")
+        if len({found.source.files for found in here}) == 1:
+            prefixes = ", ".join(quote(found.prefix) for found in here)
             raise InputError(
-                f"{quote_path(self.path)} holds {len(here)} checkpoints of the network {name} "
-                f"({names}); expected one. Give the path of the file itself."
+                f"{has} in one file, with {prefixes} before the names: choose one. (--prefix)"
             )
-        return here[0]
+        files = ", ".join(quote_path(os.path.relpath(f.source.path, self.path)) for f in here)
+        raise InputError(f"{has} ({files}): give the path of one of them.")
+
+    def check_complete(self, config: ModelConfig, names: Iterable[str], *, out: Path) -> None:
+        """Raise `InputError` if a folder lacks a network of the config; warn if a file does.
+
+        Networks in `names` are converted, and those in the weights folder `out` are there.
+        """
+        there = {*names, *(path.stem for path in out.glob("[!.]*.safetensors"))}
+        missing = ", ".join(name for name in config.networks if name not in there)
+        if missing and self.path.is_dir():
+            raise InputError(
+                f"{quote_path(self.path)} has no {missing}, which {config.name} needs; it has "
+                f"{', '.join(names)}. Add the missing files, or convert what it has. (--only "
+                f"{' '.join(names)})"
+            )
+        if missing:
+            print(f"still missing in {quote_path(out)}: {missing}", file=sys.stderr)
+
+    def only(self, prefix: str | None) -> Folder:
+        """Return the folder with one checkpoint of each network that has several in a file.
+
+        `prefix` is the text before the names, or its first parts. Raises `InputError` if no
+        network has it.
+        """
+        if prefix is None:
+            return self
+        wanted = prefix.rstrip(".")
+        here = [f for f in self.found if f.prefix.rstrip(".") == wanted]
+        here = here or [f for f in self.found if f.prefix.startswith(f"{wanted}.")]
+        if not here:
+            known = ", ".join(dict.fromkeys(quote(found.prefix) for found in self.found)) or "none"
+            raise InputError(
+                f"{quote_path(self.path)} has no network after {quote(prefix)}. Its prefixes: "
+                f"{known}. (--prefix)"
+            )
+        chosen = {(found.network, found.source.files) for found in here}
+        kept = [f for f in self.found if f in here or (f.network, f.source.files) not in chosen]
+        return replace(self, found=tuple(kept))
 
 
 def detect(path: Path, config: ModelConfig | None = None) -> Folder:
@@ -124,22 +174,39 @@ def known_tables(config: ModelConfig | None = None) -> list[tuple[str, Table]]:
 
 def networks_of(source: Source, tables: Iterable[tuple[str, Table]]) -> list[DetectedNetwork]:
     """Return the networks of a checkpoint; a ComfyUI file can hold several, each with a prefix."""
-    found: dict[tuple[str, str], DetectedNetwork] = {}
+    found: dict[tuple[str, str], dict[Table, DetectedNetwork]] = {}
+    keys = [key.replace(BASE_LAYER, ".") for key in source.tensors]
     for network, table in tables:
         for naming, names in table.namings.items():
-            for key in source.tensors:
+            for key in keys:
                 prefix = key.removesuffix(names.signature)
                 if prefix != key and (not prefix or prefix.endswith(".")):
                     detected = DetectedNetwork(
                         network=network, table=table, naming=naming, prefix=prefix, source=source
                     )
-                    found.setdefault((network, prefix), detected)
+                    found.setdefault((network, prefix), {}).setdefault(table, detected)
     if len(found) > MAX_NETWORKS:
         raise InputError(
             f"{source.name} holds {len(found)} networks; the limit is {MAX_NETWORKS} per file. "
             "Split it."
         )
-    return list(found.values())
+    prefixes = {prefix for _, prefix in found}
+    return [
+        replace(
+            _fitting(list(alike.values())),
+            others=tuple(p for p in prefixes if p.startswith(prefix) and p != prefix),
+        )
+        for (_, prefix), alike in found.items()
+    ]
+
+
+def _fitting(alike: Sequence[DetectedNetwork]) -> DetectedNetwork:
+    """Return the first network whose table takes the tensors; the first one if none does."""
+    for one in alike if len(alike) > 1 else ():
+        with suppress(InputError):
+            one.table.check(one.tensors)
+            return one
+    return alike[0]
 
 
 def _folders(path: Path) -> list[Path]:

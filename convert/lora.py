@@ -2,11 +2,9 @@
 
 Our own code, because each library reads its own naming alone, and only into PyTorch modules.
 
-A tensor's name has a prefix (`diffusion_model.`, `transformer.`, `base_model.model.`,
-`lora_unet_`), a layer of the denoiser in one of its table's namings, with dots or, in kohya's
-files, underscores, and the role of the tensor: `lora_A` or `lora_down`, `lora_B` or `lora_up`,
-`alpha`, or a full difference of a weight, bias or modulation: `diff`, `diff_b`, `diff_m`. The
-default alpha is in PEFT's `adapter_config.json` or in the file's header, else it is the rank.
+`lora_names` takes the names of tensors apart: `lora_A` or `lora_down`, `lora_B` or `lora_up`,
+`alpha`, or a full difference of a weight, bias or modulation. A low-rank change of a convolution is
+multiplied out. `lora_settings` reads the default alpha, which is the rank if nothing says it.
 
 A folder can also have full weights in a file `non_lora_weights`, like DWM's, whose patch projection
 replaces the base's. `lora_export` writes LoRA files.
@@ -15,22 +13,31 @@ replaces the base's. `lora_export` writes LoRA files.
 from __future__ import annotations
 
 import math
-import os
-import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import ml_dtypes
 import numpy as np
 from einops import EinopsError
 
-from egosim_jax.convert.rules import Rule, shape_only
+from egosim_jax.convert.detect import BASE_LAYER
+from egosim_jax.convert.finite import all_finite
+from egosim_jax.convert.lora_names import (
+    SUFFIX,
+    TEXT,
+    Location,
+    Name,
+    chosen,
+    locations,
+    parse,
+    refuse_others,
+)
+from egosim_jax.convert.lora_settings import ADAPTER, MERGE, Settings, finite, settings_of
 from egosim_jax.convert.source import PTH, Source, sources
-from egosim_jax.convert.tables import table_of, weight_shapes
-from egosim_jax.io.bounded import listing, parse_json, quote, quote_path, quote_text, read_json
+from egosim_jax.convert.tables import weight_shapes
+from egosim_jax.io.bounded import listing, quote, quote_path, quote_text
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
 from egosim_jax.models.lora import (
     BASE,
@@ -49,58 +56,25 @@ from egosim_jax.types import InputError
 if TYPE_CHECKING:
     from egosim_jax.models import NetworkConfig
 
-PREFIXES = (
-    "base_model.model.", "diffusion_model.", "model.", "transformer.", "pipe.dit.", "dit.",
-    "lora_unet_", "lora_transformer_", "_",
-)  # fmt: skip
-"""Prefixes of layer names in LoRA files of other projects, in any naming."""
-TEXT_PREFIXES = ("lora_te", "text_encoder.", "text_encoders.")
-"""Prefixes of a text encoder's layers, which are skipped."""
-LOW_RANK = {
-    "lora_A": "down", "lora_down": "down", "lora_B": "up", "lora_up": "up", "alpha": "alpha",
-}  # fmt: skip
-"""Role of a low-rank tensor by the suffix of its name."""
-FULL = {"diff": "weight", "diff_b": "bias", "diff_m": "modulation"}
-"""Kind of weight of a full difference by the suffix of its name."""
 IN_FULL = "non_lora_weights"
 """Stem of the file next to a LoRA whose weights replace the base's."""
 ENDS = (".safetensors", *PTH)
 """Extensions of weight files."""
-ADAPTER, ADAPTER_ENTRY = "adapter_config.json", "lora_adapter_metadata"
-"""PEFT's settings: the file next to the weights, and diffusers' entry in a header."""
 HALF = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
 """Dtypes that a LoRA keeps; all others are read as float32."""
-SUFFIX = re.compile(rf"\.({'|'.join((*LOW_RANK, *FULL))})(\.default)?(\.weight)?$")
 
 
-@dataclass(frozen=True)
-class Location:
-    """A weight, or one layer of a stacked weight."""
-
-    target: str
-    """Path of the weight."""
-    layer: int | None
-    """Index of the block; None for a weight that is not stacked."""
-    rule: Rule = field(compare=False)
-    """Conversion rule of the naming that matched."""
-
-    @property
-    def path(self) -> str:
-        """Path of the layer if the weight is a kernel, else of the weight."""
-        return self.target.removesuffix(".kernel")
-
-    def __str__(self) -> str:
-        return self.path if self.layer is None else f"{self.path}, block {self.layer}"
-
-
-def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
+def read_lora(
+    path: Path, config: NetworkConfig, *, prefix: str | None = None, adapter: str | None = None
+) -> dict[str, Change]:
     """Return the changes of a LoRA by path; files in our format have the same paths.
 
-    `path` is a file, or its folder with PEFT's config or full weights. Missing blocks are 0; lower
-    ranks in a stack are padded with 0 to the highest. Half-precision tensors keep their dtype if
-    nothing is computed; all others are float32. Layers of a text encoder are skipped with a
-    message. Raises `InputError` listing every tensor that is not of the network or does not fit,
-    and every value that is not finite.
+    `path` is a file, or its folder with PEFT's config or full weights. Of several LoRAs in a file,
+    `prefix` or `adapter` chooses one. Missing blocks are 0; lower ranks in a stack are padded with
+    0 to the highest. Half-precision tensors keep their dtype if nothing is computed; all others are
+    float32. Layers of a text encoder are skipped with a message. Raises `InputError` listing every
+    tensor that is not of the network or does not fit, every value that is not finite, and a setting
+    that cannot be applied.
     """
     source, in_full = _found(path)
     want = weight_shapes(config)
@@ -112,10 +86,18 @@ def read_lora(path: Path, config: NetworkConfig) -> dict[str, Change]:
         arrays = {name: tensor.array() for name, tensor in source.tensors.items()}
         changes: dict[str, Change] = {**from_tensors(arrays)}
     else:
+        settings, known = settings_of(path, source.files[0], metadata), locations(config)
+        names, problems = _names(source, known, settings, prefix=prefix, adapter=adapter)
+        if settings.saved and in_full is None and all(name.role != "value" for name in names):
+            raise InputError(
+                f"{settings.source} has modules_to_save {listing(settings.saved)}, but "
+                f"{source.name} has no weights of them. {MERGE}"
+            )
         with np.errstate(over="ignore", invalid="ignore"):  # `check` refuses values not finite
-            changes = _translated(source, config, want, settings_of(path, metadata))
+            changes = _translated(source, names, problems, want, settings)
     if in_full is not None:
-        changes |= _values(in_full, config, want)
+        known = locations(config)
+        changes |= _values(in_full, {key: parse(key, known) for key in in_full.tensors}, want)
     if not changes:
         raise InputError(f"{quote_path(path)} has no layers of this network.")
     check(want, changes)
@@ -168,17 +150,16 @@ def _found(path: Path) -> tuple[Source, Source | None]:
 
 
 def _values(
-    source: Source, config: NetworkConfig, want: Mapping[str, tuple[int, ...]]
+    source: Source, names: Mapping[str, Name | None], want: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Change]:
     """Return the full weights of a file by path."""
-    known = _locations(config, PREFIXES)
     changes: dict[str, Change] = {}
     problems = []
-    for key, tensor in source.tensors.items():
-        location = known.get(_plain(key, PREFIXES))
-        if location is None or location.layer is not None:
+    for key, name in names.items():
+        if name is None or name.role != "value" or name.location.layer is not None:
             problems.append(f"{key}: not a weight of this network outside its blocks")
             continue
+        location, tensor = name.location, source.tensors[key]
         try:
             array = location.rule.to_jax(tensor.array()).astype(_dtype([tensor]))
         except (EinopsError, ValueError):
@@ -190,105 +171,183 @@ def _values(
     return changes
 
 
+def _names(
+    source: Source,
+    known: Mapping[str, Location],
+    settings: Settings,
+    *,
+    prefix: str | None,
+    adapter: str | None,
+) -> tuple[list[Name], list[str]]:
+    """Return the names of the tensors of one LoRA, and why others cannot be of it.
+
+    As in `egosim convert weights`, what is outside the prefix of the network is skipped, with a
+    message. So is the base of a checkpoint that was saved with its LoRA.
+    """
+    keys = [key for key in source.tensors if not TEXT.search(key)]
+    if text := len(source.tensors) - len(keys):
+        print(f"{source.name}: skipped {text} tensors of a text encoder", file=sys.stderr)
+    refuse_others(keys, source=source.name, fix=MERGE)
+    parsed = {key: parse(key, known) for key in keys}
+    found = [name for name in parsed.values() if name is not None]
+    own = [n for n in found if n.role != "value" or settings.saves(n.owner)]
+    names = chosen(own, source=source.name, prefix=prefix, adapter=adapter)
+    prefixes = tuple({name.prefix for name in names} or {""})
+    with_base = any(BASE_LAYER in key for key in keys)
+    skipped, problems = {name.key for name in own} - {name.key for name in names}, []
+    for key in parsed.keys() - {name.key for name in own}:
+        low_rank, inside = SUFFIX.search(key), key.startswith(prefixes)
+        if (inside and not with_base) or (low_rank and (inside or prefix is None)):
+            problems.append(f"{key}: not of a layer of this network")
+        else:
+            skipped.add(key)
+    if skipped:
+        print(
+            f"{source.name}: skipped {len(skipped)} tensors that are not of the LoRA, such as "
+            f"{quote(min(skipped))}",
+            file=sys.stderr,
+        )
+    if names and settings.alpha is None and all("base_model." in n.prefix for n in names):
+        print(
+            f"{source.name}: alpha is taken as the rank, as there is no {ADAPTER} of PEFT next to "
+            "the file",
+            file=sys.stderr,
+        )
+    return names, sorted(problems)
+
+
 def _translated(
     source: Source,
-    config: NetworkConfig,
+    names: Sequence[Name],
+    problems: Sequence[str],
     want: Mapping[str, tuple[int, ...]],
     settings: Settings,
 ) -> dict[str, Change]:
     """Convert a file in a foreign naming; check all shapes before reading values."""
-    namings = table_of(config).namings.values()
-    prefixes = (*PREFIXES, *(naming.lora_prefix for naming in namings if naming.lora_prefix))
-    known = _locations(config, prefixes)
-    low_rank: dict[Location, dict[str, Tensor]] = {}
-    full: dict[Location, Tensor] = {}
-    problems, text = [], 0
-    for key, tensor in source.tensors.items():
-        if key.startswith(TEXT_PREFIXES):
-            text += 1
-            continue
-        suffix = SUFFIX.search(key)
-        kind = suffix[1] if suffix else ""
-        layer = _plain(key[: suffix.start()], prefixes) if suffix else ""
-        location = known.get(f"{layer}_{FULL.get(kind, 'weight')}")
-        if location is None or (kind in LOW_RANK and location.rule.transform != "linear"):
-            problems.append(f"{key}: not of a layer of this network")
-        elif (kind in FULL and location in full) or LOW_RANK.get(kind) in low_rank.get(
-            location, {}
-        ):
-            problems.append(f"{key}: duplicate of another name")
-        elif kind in LOW_RANK:
-            low_rank.setdefault(location, {})[LOW_RANK[kind]] = tensor
-        else:
-            full[location] = tensor
-    if text:
-        print(f"{source.name}: skipped {text} tensors of a text encoder", file=sys.stderr)
-    pairs = {}
-    for location, found in low_rank.items():
+    problems = list(problems)
+    low_rank: dict[Location, dict[str, Name]] = {}
+    full: dict[Location, Name] = {}
+    for name in names:
+        at, low = name.location, name.role in ("down", "up", "alpha")
+        taken = low_rank.setdefault(at, {}) if low else full
+        if low and not at.target.endswith(".kernel"):
+            problems.append(f"{name.key}: not of a layer of this network")
+        elif (name.role if low else at) in taken:
+            problems.append(f"{name.key}: duplicate of another name")
+        elif low:
+            low_rank[at][name.role] = name
+        elif name.role != "value":
+            full[at] = name
+    pairs: dict[Location, Pair] = {}
+    for location, roles in low_rank.items():
         try:
-            kernel = want[f"{location.path}.kernel"][-2:]
-            pairs[location] = _pair(location, found, kernel, settings)
+            if roles:
+                pairs[location] = _pair(location, roles, source, want, settings)
         except RefusedError as error:
             problems.append(f"{location}: {error}")
-    for location, tensor in full.items():
+    for location, name in full.items():
         shape = want[location.target][location.layer is not None :]
-        try:
-            have = location.rule.to_jax(shape_only(tensor)).shape
-        except (EinopsError, ValueError):
-            have = tensor.shape
+        have = _shape(location, source.tensors[name.key].shape)
         if have != shape:
             problems.append(f"{location}: has shape {have}; expected {shape}")
+        elif location in pairs and location.rule.transform != "linear":
+            problems.append(f"{location}: has a full difference and low-rank tensors")
     if problems:
         raise InputError(
             f"{len(problems)} tensors of {source.name} are not of a LoRA of this network: "
             f"{listing(problems)}."
         )
+    tensors = {name.key: source.tensors[name.key] for name in names}
+    refuse([f"{k}: has values that are not finite" for k, t in tensors.items() if not _sound(t)])
+    linear = {at: pair for at, pair in pairs.items() if at.rule.transform == "linear"}
     changes: dict[str, Change] = {}
-    for path in dict.fromkeys(location.path for location in pairs):
+    for path in dict.fromkeys(location.path for location in linear):
         shape = want[f"{path}.kernel"]
-        changes[path] = _stacked({p.layer: v for p, v in pairs.items() if p.path == path}, shape)
-    for target in dict.fromkeys(location.target for location in full):
-        here = [location for location in full if location.target == target]
-        values = np.zeros(want[target], _dtype([full[location] for location in here]))
-        for location in here:
-            layer = ... if location.layer is None else location.layer
-            values[layer] = location.rule.to_jax(full[location].array())
+        changes[path] = _stacked({p.layer: v for p, v in linear.items() if p.path == path}, shape)
+    parts = [(at, pair.product()) for at, pair in pairs.items() if at not in linear]
+    parts += [(at, tensors[name.key].array()) for at, name in full.items()]
+    for target in dict.fromkeys(location.target for location, _ in parts):
+        here = [(at, array) for at, array in parts if at.target == target]
+        values = np.zeros(want[target], _dtype([array for _, array in here]))
+        for at, array in here:
+            values[... if at.layer is None else at.layer] = at.rule.to_jax(array)
         changes[target] = values
-    return changes
+    return changes | _values(
+        source, {name.key: name for name in names if name.role == "value"}, want
+    )
 
 
 class Pair(NamedTuple):
     """Low-rank tensors of a layer, not yet read, and the factor of their product."""
 
     down: Tensor
-    """Down projection `[r, in]`."""
+    """Down projection `[r, in]`, or `[r, in, ...]` of a convolution."""
     up: Tensor
-    """Up projection `[out, r]`."""
+    """Up projection `[out, r]`, or with axes of length 1 after it."""
     scale: float
+
+    def product(self) -> np.ndarray:
+        """Return the change of a convolution's kernel `[out, in, ...]`."""
+        down, up = (t.array().astype(np.float32) for t in (self.down, self.up))
+        product = up.reshape(len(up), -1) @ down.reshape(len(down), -1)
+        return self.scale * product.reshape(len(up), *down.shape[1:])
 
 
 def _pair(
-    location: Location, found: Mapping[str, Tensor], kernel: tuple[int, ...], settings: Settings
+    location: Location,
+    roles: Mapping[str, Name],
+    source: Source,
+    want: Mapping[str, tuple[int, ...]],
+    settings: Settings,
 ) -> Pair:
     """Return the low-rank tensors of a layer. Raises `RefusedError` unless they fit its kernel."""
     for role, name in (("down", "lora_A"), ("up", "lora_B")):
-        if role not in found:
+        if role not in roles:
             raise RefusedError(f"has no {name}")
-    down, up = found["down"], found["up"]
+    down, up = (source.tensors[roles[role].key] for role in ("down", "up"))
     rank = down.shape[0] if down.shape else 0
     if not 1 <= rank <= MAX_RANK:
         raise RefusedError(f"has rank {rank}; expected 1 to {MAX_RANK}")
-    wide, out = kernel
-    if (down.shape, up.shape) != ((rank, wide), (out, rank)):
+    kernel = want[location.target][location.layer is not None :]
+    if location.rule.transform == "linear":
+        wide, out = kernel
+        if (down.shape, up.shape) != ((rank, wide), (out, rank)):
+            raise RefusedError(
+                f"has shapes {down.shape} and {up.shape}; expected {(rank, wide)} and {(out, rank)}"
+            )
+    elif (
+        up.shape[1:2] != (rank,)
+        or math.prod(up.shape[2:]) != 1
+        or _shape(location, (up.shape[0], *down.shape[1:])) != kernel
+    ):
         raise RefusedError(
-            f"has shapes {down.shape} and {up.shape}; expected {(rank, wide)} and {(out, rank)}"
+            f"has shapes {down.shape} and {up.shape}, whose product is not of the kernel {kernel}"
         )
     alpha = None
-    if (scalar := found.get("alpha")) is not None:
-        if math.prod(scalar.shape) != 1:
-            raise RefusedError(f"has {math.prod(scalar.shape)} numbers as alpha; expected one")
-        alpha = finite(float(scalar.array().item()), f"The alpha of {location}")
+    if (scalar := roles.get("alpha")) is not None:
+        tensor = source.tensors[scalar.key]
+        if (count := math.prod(tensor.shape)) != 1:
+            raise RefusedError(f"has {count} numbers as alpha; expected one")
+        alpha = finite(float(tensor.array().item()), f"The alpha of {location}")
+    if why := settings.misfit(roles["down"].layer, rank, alpha):
+        raise InputError(
+            f"{settings.source} is not of {source.name}: {why}. Give it the file of its own "
+            f"adapter, or move {source.name} to a folder without one."
+        )
     return Pair(down, up, settings.scale(alpha, rank))
+
+
+def _shape(location: Location, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape of a foreign tensor in our layout, or its own if it does not fit."""
+    try:
+        return location.rule.to_jax(np.broadcast_to(np.uint8(0), shape)).shape
+    except (EinopsError, ValueError):
+        return shape
+
+
+def _sound(tensor: Tensor) -> bool:
+    """Return True if all values of a tensor are finite."""
+    return all_finite(tensor.array())
 
 
 def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delta:
@@ -307,98 +366,8 @@ def _stacked(layers: Mapping[int | None, Pair], kernel: tuple[int, ...]) -> Delt
     return Delta(down=down, up=up)
 
 
-def _dtype(tensors: Sequence[Tensor]) -> np.dtype:
+def _dtype(tensors: Sequence[Tensor | np.ndarray]) -> np.dtype:
     """Return the half-precision dtype of all tensors if they share one, else float32."""
     dtypes = {tensor.dtype for tensor in tensors}
     shared = next(iter(dtypes))
     return shared if len(dtypes) == 1 and shared in HALF else np.dtype(np.float32)
-
-
-def _locations(config: NetworkConfig, prefixes: Sequence[str]) -> dict[str, Location]:
-    """Return the weights by their plain names in all namings; earlier namings take precedence."""
-    known: dict[str, Location] = {}
-    for naming in table_of(config).namings.values():
-        named = locations_by_name(config, naming.rules(config))
-        known = {_plain(name, prefixes): location for name, location in named.items()} | known
-    return known
-
-
-def locations_by_name(config: NetworkConfig, rules: Sequence[Rule]) -> dict[str, Location]:
-    """Return the weights of a network by their names in a naming."""
-    want = weight_shapes(config)
-    return {
-        rule.source.replace("*", str(layer)): Location(rule.target, layer, rule)
-        for rule in rules
-        for layer in (range(want[rule.target][0]) if rule.stacked else (None,))
-    }
-
-
-def _plain(name: str, prefixes: Sequence[str]) -> str:
-    """Return a layer's name without prefixes and with underscores for dots."""
-    while prefix := next((p for p in prefixes if name.startswith(p)), None):
-        name = name.removeprefix(prefix)
-    return name.replace(".", "_")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Settings of all layers of a LoRA."""
-
-    alpha: float | None = None
-    """Alpha of layers without one; None: the rank."""
-    rank_stabilized: bool = False
-    """True for a scale of alpha / sqrt(r), as in rsLoRA, instead of alpha / r."""
-
-    def scale(self, alpha: float | None, rank: int) -> float:
-        """Return the factor of a low-rank product."""
-        alpha = self.alpha if alpha is None else alpha
-        if alpha is None:
-            return 1.0
-        return alpha / (math.sqrt(rank) if self.rank_stabilized else rank)
-
-
-def settings_of(path: Path, metadata: Mapping[str, str]) -> Settings:
-    """Read the settings from the adapter's config or from the header."""
-    adapter = (path if path.is_dir() else path.parent) / ADAPTER
-    if os.path.lexists(adapter):
-        return _peft(read_json(adapter), source=quote_path(adapter))
-    if ADAPTER_ENTRY in metadata:
-        source = f"{ADAPTER_ENTRY} of {quote_path(path)}"
-        adapted = parse_json(metadata[ADAPTER_ENTRY].encode(), source=source)
-        return _peft(
-            {name.removeprefix("transformer."): value for name, value in adapted.items()}
-            if isinstance(adapted, dict)
-            else adapted,
-            source=source,
-        )
-    alpha = metadata.get("alpha", metadata.get("ss_network_alpha", "None"))
-    if alpha in ("None", ""):
-        return Settings()
-    return Settings(alpha=finite(alpha, f"The alpha of {quote_path(path)}"))
-
-
-def _peft(adapter: Any, *, source: str) -> Settings:
-    match adapter:
-        case {"lora_alpha": alpha}:
-            pass
-        case _:
-            raise InputError(f"{source} has no lora_alpha, which PEFT writes. Add it.")
-    if adapter.get("alpha_pattern"):
-        raise InputError(
-            f"{source} has an alpha_pattern, which is not supported: set one lora_alpha."
-        )
-    return Settings(
-        alpha=finite(alpha, f"lora_alpha of {source}"),
-        rank_stabilized=adapter.get("use_rslora") is True,
-    )
-
-
-def finite(value: Any, name: str) -> float:
-    """Return a value as a finite number. Raises `InputError` if it is not one."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{name} is {quote(value)}, which is not a finite number.")
-    return number

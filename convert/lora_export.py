@@ -11,7 +11,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from egosim_jax.convert.lora import FULL, IN_FULL, locations_by_name
+from egosim_jax.convert.lora import IN_FULL
+from egosim_jax.convert.lora_names import FULL, locations_by_name
 from egosim_jax.convert.tables import CheckpointNaming, Table, table_of
 from egosim_jax.io.bounded import listing
 from egosim_jax.io.mapped import Tensor

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egosim_jax.convert.detect import DetectedNetwork
+from egosim_jax.convert.finite import all_finite
 from egosim_jax.convert.rules import Leaf, Rule, assign, shape_only
 from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.convert.widen import Widening, WidenMode
@@ -33,19 +34,20 @@ def to_jax(
 ) -> list[Weight]:
     """Return the weights of a config's network, converted from a foreign checkpoint.
 
-    With a `widening`, the checkpoint is a base model's. Raises `WeightsError` listing all
-    mismatches.
+    With a `widening`, the checkpoint is a base model's. With a `dtype`, the layers of a stack may
+    have several floating dtypes. Raises `WeightsError` listing all mismatches.
     """
     network = network_config(config, found.network)
     if widening is not None:
         network = replace(network, in_channels=widening.base.channels)
-    leaves, tensors = _leaves(found, network), found.tensors
+    leaves, tensors = _leaves(found, network, mixed=dtype is not None), found.tensors
     weights = {
         path: Weight(
             name=path,
             shape=leaf.shape,
             dtype=stored_as(leaf.dtype, dtype),
             pieces=tuple(partial(_to_jax, leaf.rule, tensors[name]) for name in leaf.names),
+            names=tuple(f"{name} of {found.source.name}" for name in leaf.names),
         )
         for path, leaf in leaves.items()
     }
@@ -109,8 +111,9 @@ def merged(
     lora.check_scale(scale)
     lora.check(want, changes)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def piece(path: str, layer: int | None) -> np.ndarray:
-        at = ... if layer is None else layer
+        at, name = (..., path) if layer is None else (layer, f"{path}, block {layer}")
         weight = tensors[path].array()[at]
         low_rank, full = changes.get(path.removesuffix(".kernel")), changes.get(path)
         added = []
@@ -123,7 +126,16 @@ def merged(
             if scale == 1:  # exactly the value: adding a difference would round
                 return full.array[at]
             added.append(full.array[at].astype(np.float32) - weight.astype(np.float32))
-        return weight.astype(np.float32) + scale * sum(added) if added else weight
+        if not added:
+            return weight
+        change = np.asarray(sum(added))
+        result = weight.astype(np.float32) + scale * change
+        if all_finite(result) or not all_finite(weight):
+            return result
+        why = "its alpha or its values are too high. Take another version of the LoRA."
+        if all_finite(change):
+            why = f"the scale {scale:g} is too high for it. Lower it. (--scale)"
+        raise InputError(f"The LoRA makes values of {name} that float32 cannot hold: {why}")
 
     table = table_of(config)
     rules = table.rules(next(iter(table.namings)), config)
@@ -132,7 +144,15 @@ def merged(
     for path, tensor in tensors.items():
         layers = range(tensor.shape[0]) if path in stacked else (None,)
         pieces = tuple(partial(piece, path, layer) for layer in layers)
-        weights.append(Weight(name=path, shape=tensor.shape, dtype=tensor.dtype, pieces=pieces))
+        weights.append(
+            Weight(
+                name=path,
+                shape=tensor.shape,
+                dtype=tensor.dtype,
+                pieces=pieces,
+                fix="Lower the scale, or merge into weights of bfloat16. (--scale, --merge)",
+            )
+        )
     return weights
 
 
@@ -156,7 +176,7 @@ def widening_of(config: ModelConfig, mode: WidenMode) -> Widening:
 def fits(found: DetectedNetwork, config: ModelConfig) -> bool:
     """Return True if the checkpoint has exactly the weights of the config's network."""
     try:
-        _leaves(found, network_config(config, found.network))
+        _leaves(found, network_config(config, found.network), mixed=True)
     except InputError:
         return False
     return True
@@ -204,7 +224,7 @@ def _fused(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(arrays) if len(arrays) > 1 else arrays[0]
 
 
-def _leaves(found: DetectedNetwork, network: NetworkConfig) -> dict[str, Leaf]:
+def _leaves(found: DetectedNetwork, network: NetworkConfig, *, mixed: bool) -> dict[str, Leaf]:
     table = table_of(network)
     if table is not found.table:
         raise InputError(
@@ -217,5 +237,6 @@ def _leaves(found: DetectedNetwork, network: NetworkConfig) -> dict[str, Leaf]:
         table.rules(found.naming, network),
         ignore=table.ignored(network),
         want=weight_shapes(network),
+        mixed=mixed,
         source=found.source.name,
     )

@@ -42,6 +42,7 @@ def relative_error(
 ) -> float:
     """Return the relative L2 error of a converted file's output from its checkpoint's, in float32.
 
+    It is absolute if the checkpoint's output is 0, as before the first update of a zero head.
     Both networks get the same random input. The checkpoint is first cast to the file's dtype.
     """
     import jax
@@ -62,7 +63,8 @@ def relative_error(
     comparison = Comparison(network=network, config=short, load=checkpoint.load, widening=widening)
     with jax.default_matmul_precision("highest"):
         have, want = reference.outputs(comparison)
-    return float(np.linalg.norm(have - want) / np.linalg.norm(want))
+    size, error = np.linalg.norm(want), np.linalg.norm(have - want)
+    return float(error / size) if size else float(error)
 
 
 class Checkpoint:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from einops import EinopsError, rearrange
 
+from egosim_jax.convert.finite import is_floating
 from egosim_jax.io.weights import WeightsError, mismatches
 
 
@@ -101,7 +102,7 @@ class Leaf:
     shape: tuple[int, ...]
     """Shape of the weight."""
     dtype: np.dtype
-    """Dtype of the foreign tensors."""
+    """Dtype of the foreign tensors; the widest if they have several."""
 
 
 def assign(
@@ -110,6 +111,7 @@ def assign(
     *,
     ignore: Sequence[str] = (),
     want: Mapping[str, tuple[int, ...]] | None = None,
+    mixed: bool = False,
     source: str = "the checkpoint",
 ) -> dict[str, Leaf]:
     """Match foreign tensors to weights by name, shape and dtype, without reading values.
@@ -117,10 +119,12 @@ def assign(
     Skips tensors that match a pattern of `ignore` (`*` matches anything). Raises `WeightsError`
     listing every other tensor without a rule or with a wrong shape, every rule without a tensor,
     every missing layer, layers that differ in shape or dtype and, if `want` has the shapes of the
-    weights by path, every weight of another shape.
+    weights by path, every weight of another shape. With `mixed`, layers may differ in their
+    floating dtypes.
     """
     found: dict[Rule, dict[int, str]] = {}
-    shapes: dict[Rule, set[tuple[tuple[int, ...], np.dtype]]] = {}
+    shapes: dict[Rule, set[tuple[int, ...]]] = {}
+    dtypes: dict[Rule, set[np.dtype]] = {}
     patterns = [(rule, _regex(rule.source)) for rule in rules]
     problems = []
     for name, tensor in tensors.items():
@@ -138,22 +142,28 @@ def assign(
                 aim = f"a shape that {rule.transform!r} maps to {rule.target}"
                 problems.append(f"{name}: has shape {tuple(tensor.shape)}; expected {aim}")
             else:
-                shapes.setdefault(rule, set()).add((shape, np.dtype(tensor.dtype)))
+                shapes.setdefault(rule, set()).add(shape)
+                dtypes.setdefault(rule, set()).add(np.dtype(tensor.dtype))
     leaves = {}
     for rule in rules:
-        layers, kinds = found.get(rule, {}), shapes.get(rule, set())
+        layers, fits = found.get(rule, {}), shapes.get(rule, set())
+        kinds = dtypes.get(rule, set())
         if not layers:
             problems.append(f"{rule.source}: missing (fills {rule.target})")
         elif sorted(layers) != list(range(len(layers))):
             gaps = sorted(set(range(max(layers))) - set(layers))
             more = f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
             problems.append(f"{rule.source}: layers {gaps[:8]}{more} are missing")
-        elif len(kinds) > 1:
-            problems.append(f"{rule.source}: the layers differ in shape or dtype")
-        elif kinds:
-            ((shape, dtype),) = kinds
+        elif len(fits) > 1:
+            problems.append(f"{rule.source}: the layers differ in shape")
+        elif len(kinds) > 1 and not (mixed and all(map(is_floating, kinds))):
+            listed = " and ".join(sorted(kind.name for kind in kinds))
+            problems.append(f"{rule.source}: the layers are {listed}: store one dtype (--dtype)")
+        elif fits:
+            (shape,) = fits
             stacked = (len(layers), *shape) if rule.stacked else shape
             names = tuple(layers[i] for i in range(len(layers)))
+            dtype = max(kinds, key=lambda kind: (kind.itemsize, kind.name))
             leaves[rule.target] = Leaf(rule=rule, names=names, shape=stacked, dtype=dtype)
     if want is not None:
         # A target without a leaf is in `problems` already: do not also report it as missing.

@@ -21,6 +21,8 @@ from egosim_jax.types import InputError
 INDEX = ".safetensors.index.json"
 SHARD = re.compile(r"(.+)-[0-9]{5}-of-([0-9]{5})")
 PTH = (".pth", ".pt", ".bin")
+WRAPPER = re.compile(r"(^|(?<=\.))(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
+"""Parts that torch's wrappers of modules add to names."""
 TOKENIZER_FILES = (
     "tokenizer.json", "spiece.model", "tokenizer_config.json", "special_tokens_map.json",
 )  # fmt: skip
@@ -40,32 +42,36 @@ class Source:
     """Tensors of the checkpoint by name."""
 
     @property
+    def path(self) -> Path:
+        """Path of this checkpoint alone: its file, its index, or the folder of its files."""
+        if len(self.files) == 1:
+            return self.files[0]
+        index = self.files[0].with_name(f"{self.name}{INDEX}")
+        return index if index.exists() else self.files[0].parent
+
+    @property
     def bytes(self) -> int:
         """Size of all tensors in bytes."""
         return sum(math.prod(t.shape) * t.dtype.itemsize for t in self.tensors.values())
 
 
 def sources(path: Path) -> Iterator[Source]:
-    """Yield the checkpoints of a file or folder; subfolders are not searched.
+    """Yield the checkpoints of a file, an index or a folder; subfolders are not searched.
 
     Files of one index, or numbered `NAME-00001-of-00003`, are one checkpoint. Raises `InputError`
     if a file is damaged or missing, or if two files of a checkpoint have the same tensor.
     """
+    if path.name.endswith(INDEX):
+        yield _of_index(path)
+        return
     if not path.is_dir():
         yield _joined(quote_path(path.name), [path])
         return
     left = {f for f in path.iterdir() if f.suffix in (".safetensors", *PTH) and f.is_file()}
     left = {file for file in left if not file.name.startswith(".")}  # incomplete files
     for index in sorted(path.glob(f"*{INDEX}")):
-        weight_map = _indexed(index)
-        files = sorted({index.parent / name for name in weight_map.values()})
-        left -= set(files)
-        source = _joined(quote_path(index.name.removesuffix(INDEX)), files)
-        if lost := weight_map.keys() - source.tensors.keys():
-            raise InputError(
-                f"{quote_path(index)} lists {len(lost)} tensors that its files lack, such as "
-                f"{quote(min(lost))}: the files are not of the same download."
-            )
+        source = _of_index(index)
+        left -= set(source.files)
         yield source
     groups: dict[str, list[Path]] = {}
     for file in sorted(left):
@@ -78,6 +84,19 @@ def sources(path: Path) -> Iterator[Source]:
                 f"{quote_path(path)} has {len(files)} of the {int(part[2])} files of {name}."
             )
         yield _joined(name, files)
+
+
+def _of_index(index: Path) -> Source:
+    """Return the checkpoint of an index. Raises `InputError` if its files lack a tensor."""
+    weight_map = _indexed(index)
+    files = sorted({index.parent / name for name in weight_map.values()})
+    source = _joined(quote_path(index.name.removesuffix(INDEX)), files)
+    if lost := {WRAPPER.sub("", name) for name in weight_map} - source.tensors.keys():
+        raise InputError(
+            f"{quote_path(index)} lists {len(lost)} tensors that its files lack, such as "
+            f"{quote(min(lost))}: the files are not of the same download."
+        )
+    return source
 
 
 def _indexed(index: Path) -> dict[str, str]:
@@ -103,7 +122,13 @@ def _indexed(index: Path) -> dict[str, str]:
 def _joined(name: str, files: Sequence[Path]) -> Source:
     tensors: dict[str, Tensor] = {}
     for file in files:
-        found = read_pth(file) if file.suffix in PTH else read_safetensors(file)
+        read = read_pth(file) if file.suffix in PTH else read_safetensors(file)
+        found = {WRAPPER.sub("", name): tensor for name, tensor in read.items()}
+        if len(found) < len(read):
+            raise InputError(
+                f"{quote_path(file)} has the same tensors twice, with and without a wrapper such "
+                "as _orig_mod: save only one state dict."
+            )
         if duplicates := tensors.keys() & found.keys():
             raise InputError(
                 f"{quote_path(file)} has {quote(min(duplicates))}, which another file of {name} "

@@ -12,19 +12,31 @@ import hashlib
 import math
 import mmap
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from io import FileIO
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from egosim_jax.convert.finite import all_finite, is_floating, out_of_range
 from egosim_jax.convert.source import INDEX
 from egosim_jax.io.atomic import LOG, PART, sync
 from egosim_jax.io.bounded import quote_path
-from egosim_jax.io.mapped import BLANK, CODES, TensorInfo, digest, header
+from egosim_jax.io.mapped import (
+    BLANK,
+    CODES,
+    HASH,
+    TensorInfo,
+    digest,
+    header,
+    read_metadata,
+    weights_hash,
+)
 from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track_bytes
 from egosim_jax.types import InputError
@@ -44,6 +56,10 @@ class Weight:
     dtype: np.dtype
     pieces: tuple[Callable[[], np.ndarray], ...]
     """Functions of equal parts along the first axis, or of the full array; cast to `dtype`."""
+    names: tuple[str, ...] = ()
+    """Name of each piece in error messages; empty for the weight's own name."""
+    fix: str = "Store the weights as bfloat16 or float32, or omit the option. (--dtype)"
+    """What to do about values beyond the range of `dtype`, for an error message."""
 
     @property
     def bytes(self) -> int:
@@ -72,24 +88,25 @@ def write(
     The pieces are read from the files `origin`; an incomplete file is resumed only if they have not
     changed. With `keep_log`, the log of a complete file stays, so the same call recognizes the file
     and does not write it again. `metadata` goes into the header, which is sealed if the format is
-    ours. If a piece is damaged, no file remains.
+    ours. If a piece is damaged or not finite, also after its cast, no file remains.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # Wide dtypes first, so that every weight is aligned to its item size.
     ordered = sorted(weights, key=lambda weight: (-weight.dtype.itemsize, weight.name))
-    pieces = [(weight, piece) for weight in ordered for piece in weight.pieces]
+    pieces = [(weight, number) for weight in ordered for number in range(len(weight.pieces))]
     sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
-    blank = _header(ordered, metadata, len(pieces) * [BLANK])
+    blank = _header(ordered, metadata, len(pieces) * [BLANK], BLANK)
     plan = _fingerprint(blank, origin)
     part, log = (target.with_name(target.name + end) for end in (PART, LOG))
     if keep_log and _complete(
-        target, log, plan, lambda done: _header(ordered, metadata, done), len(pieces)
+        target, log, plan, lambda *hashes: _header(ordered, metadata, *hashes), len(pieces)
     ):
         yield sum(sizes)
         return
     try:
         with _open(part) as file, _open(log) as journal:
-            done = _resume(file, journal, plan, start=len(blank), sizes=sizes)
+            whole = _Digests([weight.name for weight, _ in pieces])
+            done = _resume(file, journal, plan, start=len(blank), sizes=sizes, whole=whole)
             journal.truncate(0)  # first, so that an old log never describes a new file
             if not done:
                 file.truncate(0)
@@ -98,11 +115,14 @@ def write(
             yield sum(sizes[: len(done)])
             offsets = accumulate(sizes, initial=len(blank))
             left = list(zip(offsets, pieces, strict=False))[len(done) :]
-            for size, checksum in zip(sizes[len(done) :], _put(left, file.fileno()), strict=True):
+            put = _put(left, file.fileno())
+            for size, (checksum, data) in zip(sizes[len(done) :], put, strict=True):
                 journal.write(f"{checksum}\n".encode())
                 done.append(checksum)
+                whole.add(checksum, data)
+                del data  # or one more piece stays in memory
                 yield size
-            file.write(_header(ordered, metadata, done))
+            file.write(_header(ordered, metadata, done, whole.hash_of(ordered)))
             os.fsync(file.fileno())
     except InputError:
         part.unlink()
@@ -114,8 +134,36 @@ def write(
     sync(target.parent)
 
 
+class _Digests:
+    """SHA-256 of each complete weight, from its pieces in order."""
+
+    def __init__(self, names: Sequence[str]):
+        """Take the name of the weight of each piece."""
+        self._left = list(reversed(names))
+        self._pieces = Counter(names)
+        self._hashes: dict[str, Any] = {}
+        self._digests: dict[str, str] = {}
+
+    def add(self, checksum: str, data: bytes | memoryview) -> None:
+        """Add the next piece and its own hash."""
+        name = self._left.pop()
+        if self._pieces[name] == 1:
+            self._digests[name] = checksum
+            return
+        self._hashes.setdefault(name, hashlib.sha256()).update(data)
+
+    def hash_of(self, weights: Sequence[Weight]) -> str:
+        """Return the `weights_hash` of the weights."""
+        digests = {name: total.hexdigest() for name, total in self._hashes.items()}
+        return weights_hash(_infos(weights), self._digests | digests)
+
+
 def _complete(
-    target: Path, log: Path, plan: str, header_of: Callable[[Sequence[str]], bytes], pieces: int
+    target: Path,
+    log: Path,
+    plan: str,
+    header_of: Callable[[Sequence[str], str], bytes],
+    pieces: int,
 ) -> bool:
     """Return True if a file has the header of the logged pieces, and the log is of the plan."""
     if not (target.is_file() and log.is_file()):
@@ -123,7 +171,11 @@ def _complete(
     logged, *checksums = log.read_text().split("\n")[:-1]
     if logged != plan or len(checksums) != pieces:
         return False
-    expected = header_of(checksums)
+    try:
+        hashed = read_metadata(target).get(HASH, BLANK)
+    except InputError:
+        return False
+    expected = header_of(checksums, hashed)
     with target.open("rb") as file:
         return file.read(len(expected)) == expected
 
@@ -134,11 +186,16 @@ def _open(path: Path) -> FileIO:
     return FileIO(os.open(path, flags, 0o666), "r+")
 
 
-def _header(weights: Sequence[Weight], metadata: Mapping[str, str], pieces: Sequence[str]) -> bytes:
+def _infos(weights: Sequence[Weight]) -> list[TensorInfo]:
+    return [TensorInfo(weight.name, weight.shape, weight.dtype) for weight in weights]
+
+
+def _header(
+    weights: Sequence[Weight], metadata: Mapping[str, str], pieces: Sequence[str], hashed: str
+) -> bytes:
     left = iter(pieces)
     checksums = {weight.name: [next(left) for _ in weight.pieces] for weight in weights}
-    infos = [TensorInfo(weight.name, weight.shape, weight.dtype) for weight in weights]
-    return header(infos, metadata, checksums)
+    return header(_infos(weights), metadata, checksums, hashed)
 
 
 def _fingerprint(header: bytes, origin: Sequence[Path]) -> str:
@@ -148,10 +205,11 @@ def _fingerprint(header: bytes, origin: Sequence[Path]) -> str:
 
 
 def _resume(
-    file: FileIO, journal: FileIO, plan: str, *, start: int, sizes: Sequence[int]
+    file: FileIO, journal: FileIO, plan: str, *, start: int, sizes: Sequence[int], whole: _Digests
 ) -> list[str]:
-    """Return the hashes of the valid leading pieces of an incomplete file of the same plan.
+    """Return the hashes of the valid leading pieces of an incomplete file; add them to `whole`.
 
+    The file must be of the same plan.
     After a crash of the machine, the log may list pieces that never reached the disk.
     """
     lines = journal.read((1 + len(sizes)) * (len(BLANK) + 1)).split(b"\n")
@@ -160,17 +218,19 @@ def _resume(
         offsets = accumulate(sizes, initial=start)
         # The last line may be incomplete.
         for offset, size, logged in zip(offsets, sizes, lines[1:-1], strict=False):
-            if digest(os.pread(file.fileno(), size, offset)).encode() != logged:
+            data = os.pread(file.fileno(), size, offset)
+            if digest(data).encode() != logged:
                 break
             valid.append(logged.decode())
+            whole.add(valid[-1], data)
     journal.seek(0)
     return valid
 
 
-def _put(pieces: Iterable, file: int) -> Iterator[str]:
-    """Write the pieces at their offsets, a few in parallel; yield their hashes in order."""
+def _put(pieces: Iterable, file: int) -> Iterator[tuple[str, memoryview]]:
+    """Write the pieces at their offsets, a few in parallel; yield hashes and bytes in order."""
     with ThreadPoolExecutor(WORKERS) as pool:
-        waiting: list[Future[str]] = []
+        waiting: list[Future[tuple[str, memoryview]]] = []
         for offset, piece in pieces:
             waiting.append(pool.submit(_put_one, file, offset, *piece))
             if len(waiting) == AHEAD:
@@ -179,13 +239,18 @@ def _put(pieces: Iterable, file: int) -> Iterator[str]:
             yield future.result()
 
 
-def _put_one(file: int, offset: int, weight: Weight, piece: Callable[[], np.ndarray]) -> str:
-    array = in_rows(piece().astype(weight.dtype, copy=False))
+def _put_one(file: int, offset: int, weight: Weight, number: int) -> tuple[str, memoryview]:
+    name = weight.names[number] if weight.names else weight.name
+    given = weight.pieces[number]()
+    with np.errstate(over="ignore", invalid="ignore"):
+        array = in_rows(given.astype(weight.dtype, copy=False))
+    if not all_finite(array):
+        raise out_of_range(given, weight.dtype, name=name, fix=weight.fix)
     data = array.reshape(-1).view(np.uint8).data
     written = 0
     while written < len(data):  # a call writes at most 2 GiB
         written += os.pwrite(file, data[written:], offset + written)
-    return digest(data)
+    return digest(data), data
 
 
 def in_rows(x: np.ndarray) -> np.ndarray:
@@ -202,8 +267,7 @@ def in_rows(x: np.ndarray) -> np.ndarray:
 
 def stored_as(kind: np.dtype, dtype: str | None) -> np.dtype:
     """Return the stored dtype of a weight of dtype `kind`; only floating dtypes are cast."""
-    floating = np.issubdtype(kind, np.floating) or kind.name.startswith(("bfloat", "float8"))
-    target = kind if dtype is None or not floating else np.dtype(dtype)
+    target = kind if dtype is None or not is_floating(kind) else np.dtype(dtype)
     if target not in CODES.values():
         raise InputError(f"safetensors cannot store {target}. Choose another dtype. (--dtype)")
     return target

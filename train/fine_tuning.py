@@ -87,11 +87,13 @@ class FineTuning(Recipe):
     def train(self) -> int:
         """Check the latents, train, and write the weights."""
         out, latents, weights = self.require("out", "latents", "weights")
+        from egosim_jax.io.weights import check_folder
         from egosim_jax.train.encode import check_encoders
         from egosim_jax.train.loop import train
         from egosim_jax.train.monitor import Samples
 
         model = self.model()
+        check_folder(weights, model.name)
         for shards in (latents, self.validation):
             if shards is not None:
                 check_encoders(shards, model, weights)

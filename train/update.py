@@ -125,15 +125,16 @@ class TrainState:
         self,
         gradients: nnx.State,
         norm: jax.Array,
-        config: OptimizerConfig,
+        training: TrainConfig,
         optimizer: optax.GradientTransformation,
     ) -> TrainState:
         """Return the state after an update with gradients of global norm `norm`."""
         updates, opt_state = optimizer.update(gradients, self.opt_state, self.params)
         params: Any = optax.apply_updates(self.params, updates)
         ema_params: Any = self.ema_params
-        if ema_params is not None and config.ema_decay is not None:
-            ema_params = optax.incremental_update(params, ema_params, 1 - config.ema_decay)
+        if ema_params is not None:
+            decay = training.optimizer.ema_decay_at(self.step, training.steps)
+            ema_params = optax.incremental_update(params, ema_params, 1 - decay)
         # A geometric mean: a spike hardly moves the mean that the guard compares it with.
         norm = jnp.maximum(norm, jnp.finfo(norm.dtype).tiny)
         mixed = self.grad_norm_ema**GRAD_NORM_DECAY * norm ** (1 - GRAD_NORM_DECAY)
@@ -183,7 +184,7 @@ def make_update(
         if config.skip_grad_norm_factor is not None:
             limit = config.skip_grad_norm_factor * state.grad_norm_ema
             valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
-        changed = state.apply_gradients(gradients, norm, config, optimizer)
+        changed = state.apply_gradients(gradients, norm, training, optimizer)
         # `where` drops the NaNs of a bad update: the optimizer state stays finite, too.
         state = jax.tree.map(
             lambda new, old: jnp.where(valid, new, old), changed, state.skip_update()

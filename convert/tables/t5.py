@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import Comparison, Naming, Reference, Table, umt5
 from egosim_jax.models.cogvideox.t5 import T5Config
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.io.mapped import Tensor
 
 
 def transformers(config: T5Config) -> list[Rule]:
@@ -15,6 +22,12 @@ def transformers(config: T5Config) -> list[Rule]:
     rules = [rule for rule in umt5.transformers(config) if not rule.source.endswith(bias)]
     first = f"encoder.block.0.layer.0.SelfAttention.{bias}"
     return [*rules, Rule(first, "position_bias")]
+
+
+def check(tensors: Mapping[str, Tensor]) -> None:
+    """Raise `InputError` for umT5, which has a position bias in every block."""
+    if "encoder.block.1.layer.0.SelfAttention.relative_attention_bias.weight" in tensors:
+        raise InputError("The text encoder is umT5, not T5. (--config)")
 
 
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
@@ -43,6 +56,7 @@ TABLE = Table(
         ),
     },
     ignored=umt5.ignored,
+    check=check,
     reference=Reference(
         naming="transformers",
         library="transformers",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from egosim_jax.convert.tables import (
 )
 from egosim_jax.models.t5 import T5Sizes
 from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    from egosim_jax.io.mapped import Tensor
 
 Sizes = TypeVar("Sizes", bound=T5Sizes)
 TOKENS = 128
@@ -50,6 +55,19 @@ def transformers(config: T5Sizes) -> list[Rule]:
         *_linears(ffn, "blocks.ffn", {"wi_0": "gate", "wi_1": "up", "wo": "down"}),
         Rule("encoder.final_layer_norm.weight", "norm.scale"),
     ]
+
+
+def is_t5(tensors: Mapping[str, Tensor]) -> bool:
+    """Return True for T5, which has a position bias in its first block alone."""
+    second = "encoder.block.1.layer.0.SelfAttention"
+    bias = f"{second}.relative_attention_bias.weight"
+    return f"{second}.q.weight" in tensors and bias not in tensors
+
+
+def check(tensors: Mapping[str, Tensor]) -> None:
+    """Raise `InputError` for T5."""
+    if is_t5(tensors):
+        raise InputError("The text encoder is T5, not umT5. (--config)")
 
 
 def ignored(config: T5Sizes) -> list[str]:
@@ -120,6 +138,7 @@ TABLE = Table(
         ),
     },
     ignored=ignored,
+    check=check,
     reference=Reference(
         naming="transformers",
         library="transformers",

@@ -22,6 +22,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from egosim_jax.io import hub
+from egosim_jax.io.weights import check_folder
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -106,17 +107,31 @@ def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
     return known[name]
 
 
+def _origin(name: str) -> str:
+    """Return how to get the weights of a config."""
+    if name in releases():
+        return f"Fetch them: egosim models fetch {name}"
+    if training := getattr(_module(name), "TRAINING", None):
+        return f"Train them: {training}"
+    return (
+        f"Convert a download: egosim convert weights DOWNLOAD --config {name} --out weights/{name}"
+    )
+
+
 def weights_of(name: str, given: Path | None) -> Path:
     """Return the folder of a config's weights: the given, else the shipped, else the fetched one.
 
-    Raises `InputError`, with the command that fetches them, if no weights are found.
+    Raises `InputError`, with the command that fetches, trains or converts them, if no weights are
+    found.
     """
+    if given is not None:
+        check_folder(given, name)
     folder = given or shipped_weights(name)
     if folder is None and hub.is_fetched(fetched := hub.fetched_folder(name)):
         folder = fetched
     if folder is None:
-        fetch = f"Fetch them: egosim models fetch {name}. Or name" if name in releases() else "Name"
         raise InputError(
-            f"There are no weights of {name} here. {fetch} a folder of weights. (--weights FOLDER)"
+            f"There are no weights of {name} here. {_origin(name)}. Or name a folder of weights. "
+            "(--weights FOLDER)"
         )
     return folder

@@ -18,3 +18,5 @@ CONFIG = dataclasses.replace(
 )
 RANDOM_WEIGHTS = True
 """Generate with random weights if none are given."""
+TRAINING = "egosim train debug --out runs/debug"
+"""Command that trains the weights."""

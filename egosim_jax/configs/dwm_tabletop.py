@@ -47,3 +47,5 @@ SAMPLINGS = {
     "paper": {"solver": DPMSolver(stochastic=True), "guidance": Guidance(scale=6.0), "steps": 50},
 }
 """Samplings by name: solvers, guidance and steps of the large model's."""
+TRAINING = "egosim train dwm_tabletop --out runs/dwm_tabletop"
+"""Command that trains the weights."""

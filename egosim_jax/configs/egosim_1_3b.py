@@ -9,3 +9,7 @@ CONFIG = dataclasses.replace(
     name="egosim_1_3b",
     dit=dataclasses.replace(EGOSIM_14B.dit, dim=1536, ffn_dim=8960, heads=12, layers=30),
 )
+TRAINING = (
+    "egosim train egosim_1_3b --weights weights/base --latents latents --out runs/egosim_1_3b"
+)
+"""Command that trains the weights."""

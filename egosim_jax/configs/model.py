@@ -166,7 +166,7 @@ class ModelConfig:
                 f"{self.name} cannot start from its prior with strength {self.strength}: it "
                 "must be above 0 and at most 1, and the model must have a prior. (--strength)"
             )
-        levels = self.process.timesteps(self.process.times(self.steps)[:-1])
+        levels = self.process.exact_timesteps(self.process.times(self.steps)[:-1])
         skipped = len(levels) - max(1, int(self.strength * len(levels)))
         kind = int if isinstance(self.process, VariancePreserving) else float
         return tuple(kind(level) for level in levels[skipped:])

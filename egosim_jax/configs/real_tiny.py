@@ -33,3 +33,5 @@ CONFIG = ModelConfig(
     process=RectifiedFlow(shift=3.0),
     steps=10,
 )
+TRAINING = "egosim train real_tiny --metadata clips.csv --out runs/real_tiny"
+"""Command that trains the weights."""

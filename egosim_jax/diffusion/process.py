@@ -45,11 +45,12 @@ and then moves sqrt(a) so that the last timestep has no signal (Lin et al. 2024)
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, TypeVar
+from typing import Literal, SupportsIndex, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -100,12 +101,16 @@ class Process(ABC):
     def timesteps(self, time: Numbers) -> Numbers:
         """Return the network's timesteps at these times."""
 
+    def exact_timesteps(self, time: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the timesteps at these times before any rounding; `times` takes them back."""
+        return self.timesteps(time)
+
     @abstractmethod
     def warp(self, u: Numbers) -> Numbers:
         """Return the times at uniform positions `u` in [0, 1], to draw training times."""
 
     @abstractmethod
-    def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
+    def times(self, steps: SupportsIndex | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the times that a sampler visits, in float64, falling to 0.
 
         `steps` is the number of steps, or the network's timesteps to visit.
@@ -210,6 +215,10 @@ class RectifiedFlow(Process):
         with np.errstate(divide="ignore"):
             return np.log1p(-time) - np.log(time)
 
+    def exact_timesteps(self, time: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return 1000 time."""
+        return TIMESTEPS * time
+
     def timesteps(self, time: Numbers) -> Numbers:
         """Return 1000 time, rounded as configured."""
         t = TIMESTEPS * time
@@ -227,15 +236,15 @@ class RectifiedFlow(Process):
         w = self.sigma_min + (self.sigma_max - self.sigma_min) * u
         return self.shift * w / (1 + (self.shift - 1) * w)
 
-    def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
+    def times(self, steps: SupportsIndex | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the shifted times of a sampler; given timesteps are not shifted."""
-        if isinstance(steps, int):
-            visited = self.warp(np.linspace(1.0, 0.0, _count(steps) + 1)[:-1])
+        if isinstance(given := _count(steps), int):
+            visited = self.warp(np.linspace(1.0, 0.0, given + 1)[:-1])
         else:
-            visited = _falling(steps, low=0, high=TIMESTEPS) / TIMESTEPS
+            visited = _falling(given, low=0, high=TIMESTEPS) / TIMESTEPS
             if self.prediction == "epsilon" and visited[0] == 1:
                 raise InputError(
-                    f"timesteps {list(steps)} cannot be sampled: prediction epsilon needs signal "
+                    f"timesteps {list(given)} cannot be sampled: prediction epsilon needs signal "
                     f"at every timestep, and {TIMESTEPS} has none. Start lower. (--steps)"
                 )
         return np.append(visited, 0.0)
@@ -304,19 +313,19 @@ class VariancePreserving(Process):
             return (np.minimum(np.floor(n * u), n - 1) + 1) / n
         return (jnp.minimum(jnp.floor(n * u), n - 1) + 1) / n
 
-    def times(self, steps: int | Sequence[int | float]) -> Float[np.ndarray, " times"]:
+    def times(self, steps: SupportsIndex | Sequence[int | float]) -> Float[np.ndarray, " times"]:
         """Return the times of a sampler; given timesteps are integers."""
         n = self.train_timesteps
-        if not isinstance(steps, int):
-            visited = _falling(steps, low=-1, high=n - 1)
+        if not isinstance(given := _count(steps), int):
+            visited = _falling(given, low=-1, high=n - 1)
             if (visited != np.rint(visited)).any():
-                raise InputError(f"timesteps {list(steps)} must be integers. (--steps)")
-        elif _count(steps) > n:
-            raise InputError(f"{steps} steps are more than the {n} timesteps. (--steps)")
+                raise InputError(f"timesteps {list(given)} must be integers. (--steps)")
+        elif given > n:
+            raise InputError(f"{given} steps are more than the {n} timesteps. (--steps)")
         elif self.spacing == "trailing":
-            visited = np.rint(np.arange(steps, 0, -1) * (n / steps)) - 1
+            visited = np.rint(np.arange(given, 0, -1) * (n / given)) - 1
         else:
-            visited = np.arange(steps)[::-1] * float(n // steps)
+            visited = np.arange(given)[::-1] * float(n // given)
         return np.append((visited + 1) / n, 0.0)
 
     def _lookup(self, table: Float[np.ndarray, " levels"], time: Numbers) -> Numbers:
@@ -351,10 +360,14 @@ def _check_prediction(process: Process, known: tuple[Prediction, ...]) -> None:
         )
 
 
-def _count(steps: int) -> int:
-    if steps < 1:
+def _count(steps: SupportsIndex | Sequence[int | float]) -> int | Sequence[int | float]:
+    """Return a number of steps of any integer type as an int, and timesteps as they are."""
+    if np.ndim(steps) > 0:
+        return cast("Sequence[int | float]", steps)
+    count = operator.index(cast("SupportsIndex", steps))
+    if count < 1:
         raise InputError(f"{steps} steps cannot be sampled: at least 1 is needed. (--steps)")
-    return steps
+    return count
 
 
 def _falling(timesteps: Sequence[int | float], *, low: int, high: int) -> Float[np.ndarray, " n"]:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, SupportsIndex, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +83,7 @@ def integrate(
     *,
     process: Process,
     solver: Solver,
-    steps: int | Sequence[int | float],
+    steps: SupportsIndex | Sequence[int | float],
     keys: Key[Array, " b"] | None = None,
 ) -> Float[Array, "b f h w c"]:
     """Turn noise into latents, one network evaluation a step: one scan, no host round trips.

@@ -14,7 +14,7 @@ import json
 import math
 import mmap
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ POINTER = b"version https://git-lfs.github.com/spec/"
 METADATA, OURS = "__metadata__", "egosim_jax"
 """Header entry for text metadata, and the `format` in it that marks files of egosim_jax."""
 HASH, CHECKSUMS, SEAL = "sha256", "checksums", "seal"
-"""Metadata of a sealed header: hash over all pieces, hashes per tensor, hash of the header."""
+"""Metadata of a sealed header: hash of the weights, hashes per tensor, hash of the header."""
 BLANK = "0" * hashlib.sha256().digest_size * 2
 """Placeholder with the length of a hash."""
 
@@ -151,21 +151,49 @@ def read_metadata(path: Path) -> dict[str, str]:
         return _parts(path)[0].get(METADATA, {})
 
 
+def weights_hash(tensors: Iterable[TensorInfo], digests: Mapping[str, str]) -> str:
+    """Return a hash of the names, dtypes, shapes and values of weights, in the order of the names.
+
+    `digests` has the SHA-256 of each tensor's bytes by name. Bit-equal weights have the same hash,
+    whatever the order, pieces and metadata of their file.
+    """
+    codes = {dtype: code for code, dtype in CODES.items()}
+    lines = [
+        json.dumps([name, codes[dtype], *shape, digests[name]]) for name, shape, dtype in tensors
+    ]
+    return digest("\n".join(sorted(lines)).encode())
+
+
+def read_weights_hash(path: Path) -> str:
+    """Return the `weights_hash` of a file: out of a sealed header if it can be, else computed."""
+    tensors, metadata = read_safetensors(path), read_metadata(path)
+    if all(len(tensor.checksums) == 1 for tensor in tensors.values()):
+        digests = {name: tensor.checksums[0] for name, tensor in tensors.items()}
+    elif SEAL in metadata and HASH in metadata:
+        return metadata[HASH]
+    else:
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+            found = pool.map(digest, (tensor.data for tensor in tensors.values()))
+            digests = dict(zip(tensors, found, strict=True))
+    infos = (TensorInfo(name, t.shape, t.dtype) for name, t in tensors.items())
+    return weights_hash(infos, digests)
+
+
 def header(
     tensors: Sequence[TensorInfo],
     metadata: Mapping[str, str],
     checksums: Mapping[str, Sequence[str]],
+    hashed: str,
 ) -> bytes:
     """Return the safetensors header of these tensors in this order; sealed if its format is ours.
 
-    The length does not depend on the values of the checksums.
+    `hashed` is their `weights_hash`. The length does not depend on the values of the hashes.
     """
     codes = {dtype: code for code, dtype in CODES.items()}
     written = dict(metadata)
     if metadata.get("format") == OURS:
         text = {tensor.name: "".join(checksums[tensor.name]) for tensor in tensors}
-        joint = hashlib.sha256("".join(text.values()).encode()).hexdigest()
-        written |= {HASH: joint, CHECKSUMS: json.dumps(text), SEAL: BLANK}
+        written |= {HASH: hashed, CHECKSUMS: json.dumps(text), SEAL: BLANK}
     listed: dict[str, Any] = {METADATA: written}
     end = 0
     for tensor in tensors:

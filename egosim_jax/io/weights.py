@@ -16,9 +16,7 @@ import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import listing, quote_path
-from egosim_jax.io.digest import sha256
 from egosim_jax.io.mapped import (
-    HASH,
     OURS,
     Tensor,
     TensorInfo,
@@ -26,6 +24,8 @@ from egosim_jax.io.mapped import (
     header,
     read_metadata,
     read_safetensors,
+    read_weights_hash,
+    weights_hash,
 )
 from egosim_jax.types import InputError
 
@@ -112,7 +112,7 @@ def fill(
 def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, str]:
     """Return a hash per network in a weights folder, or per network in `only`.
 
-    It is the hash in the file's header, or the SHA-256 of a file without one.
+    Bit-equal weights have the same hash (`weights_hash`).
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a weights folder. (--weights)")
@@ -121,7 +121,7 @@ def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, st
         for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden files are incomplete
         if only is None or path.stem in only
     ]
-    return {path.stem: read_metadata(path).get(HASH) or sha256(path) for path in files}
+    return {path.stem: read_weights_hash(path) for path in files}
 
 
 def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
@@ -151,7 +151,9 @@ def write(
     infos = [TensorInfo(name, arrays[name].shape, arrays[name].dtype) for name in names]
     metadata = {"format": OURS, **(metadata or {})}
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(header(infos, metadata, {name: [digest(bytes_of[name])] for name in names}))
+        digests = {name: digest(bytes_of[name]) for name in names}
+        checksums = {name: [digests[name]] for name in names}
+        file.write(header(infos, metadata, checksums, weights_hash(infos, digests)))
         for name in names:
             file.write(bytes_of[name])
 
@@ -213,7 +215,42 @@ def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
 
 def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
-        raise InputError(
+        raise _absent(path)
+    return read_safetensors(path)
+
+
+def check_folder(folder: Path, config: str) -> None:
+    """Raise `InputError` if a folder has no denoiser of ours, with the command that converts it."""
+    if not (file := folder / "dit.safetensors").is_file():
+        raise _absent(file, config)
+
+
+def _absent(path: Path, config: str = "CONFIG") -> InputError:
+    """Return the error of a weights file that is missing, with what its folder has instead."""
+    folder = path.parent
+    if (folder / "weights" / path.name).is_file():
+        return InputError(
+            f"{quote_path(folder)} is a run: its weights are in {quote_path(folder / 'weights')}. "
+            "(--weights)"
+        )
+    files = [folder, *sorted(folder.glob("[!.]*")), *sorted(folder.glob("[!.]*/*"))]
+    theirs = next((f for f in files if f.is_file() and _is_foreign(f)), None)
+    if theirs is None:
+        return InputError(
             f"No weights file at {path}. (--weights must name the folder that contains it.)"
         )
-    return read_safetensors(path)
+    return InputError(
+        f"{quote_path(folder)} is a checkpoint of another project, by {quote_path(theirs.name)}. "
+        f"Convert it, and give the new folder: egosim convert weights {quote_path(folder)} "
+        f"--config {config} --out weights/{config} (--weights)"
+    )
+
+
+def _is_foreign(path: Path) -> bool:
+    """Return True for a file of weights in the format of another project."""
+    if path.suffix != ".safetensors":
+        return path.suffix in (".pth", ".pt", ".bin")
+    try:
+        return read_metadata(path).get("format") != OURS
+    except InputError:
+        return False

@@ -10,7 +10,6 @@ denoiser's config (`lora_targets`, `also_train`) in patterns of dotted paths.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -55,6 +54,8 @@ class Value:
 
 Change = Delta | Value | np.ndarray
 """Low-rank change of the linear layer at a path, or value or difference of the weight at a path."""
+MAX_SCALE = float(np.finfo(np.float32).max)
+"""Maximum absolute scale."""
 MAX_RANK = 2048
 """Maximum rank; with the network's own widths it bounds the memory."""
 
@@ -89,7 +90,13 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
     for path, change in changes.items():
         if isinstance(change, Delta):
             down, up = (jnp.asarray(array, jnp.float32) for array in (change.down, change.up))
-            layers[path].low_rank = LowRank(down, scale * up)
+            scaled = scale * up
+            if not jnp.isfinite(scaled).all():
+                raise InputError(
+                    f"The scale {scale:g} makes values of {path} that float32 cannot hold. Lower "
+                    "it. (--lora-scale)"
+                )
+            layers[path].low_rank = LowRank(down, scaled)
 
 
 def deltas_of(network: Any) -> dict[str, Delta]:
@@ -208,9 +215,12 @@ def matches(path: str, patterns: Sequence[str]) -> bool:
 
 
 def check_scale(scale: float) -> None:
-    """Raise `InputError` unless a LoRA's scale is finite."""
-    if not math.isfinite(scale):
-        raise InputError(f"A LoRA's scale must be a finite number, not {scale}.")
+    """Raise `InputError` unless a LoRA's scale is finite, also in float32."""
+    if not abs(scale) <= MAX_SCALE:  # also for NaN
+        raise InputError(
+            f"A LoRA's scale must be a finite number of at most {MAX_SCALE:.2g}, not {scale}. "
+            "(--scale, --lora-scale)"
+        )
 
 
 def check(shapes: Mapping[str, tuple[int, ...]], changes: Mapping[str, Change]) -> None:

@@ -45,7 +45,7 @@ def tokenized(tmp_path, monkeypatch):
 
 
 def convert(source, out):
-    return ["weights", source, "--config", "debug", "--out", out]
+    return ["weights", source, "--config", "debug", "--only", "text", "--out", out]
 
 
 def test_a_tokenizer_is_copied_without_what_is_not_of_it(tokenized, tmp_path):
@@ -124,7 +124,7 @@ def commands(tmp_path):
     source, base = theirs(tmp_path), ours(tmp_path / "base", "text", "dit")
     file = save(tmp_path / "x.safetensors", pair())
     return {
-        "weights": ["weights", source, "--config", "debug"],
+        "weights": ["weights", source, "--config", "debug", "--only", "text"],
         "lora": ["lora", file, "--config", "debug"],
         "merge": ["lora", file, "--config", "debug", "--merge", base],
         "to-torch": ["to-torch", base, "--config", "debug", "--only", "text"],

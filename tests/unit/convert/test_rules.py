@@ -79,7 +79,10 @@ def test_every_problem_is_listed_at_once():
 def test_layers_that_differ_are_named():
     theirs = foreign()
     theirs["blocks.1.norm.weight"] = theirs["blocks.1.norm.weight"].astype(np.float16)
-    assert problems(theirs) == "blocks.*.norm.weight: the layers differ in shape or dtype"
+    expected = "blocks.*.norm.weight: the layers are float16 and float32: store one dtype (--dtype)"
+    assert problems(theirs) == expected
+    theirs["blocks.1.norm.weight"] = np.zeros(5, np.float32)
+    assert "blocks.*.norm.weight: the layers differ in shape" in problems(theirs)
 
 
 def test_a_layer_has_one_name():

@@ -167,3 +167,11 @@ def test_an_impossible_variance_preserving_process_is_refused(fields, rule):
 def test_a_prediction_that_a_flow_cannot_invert_is_refused(prediction, rule):
     with pytest.raises(InputError, match=rule):
         RectifiedFlow(prediction=prediction)
+
+
+@pytest.mark.parametrize("process", EVERY)
+@pytest.mark.parametrize("kind", [np.int64, np.int8, np.uint16, np.array], ids=lambda k: k.__name__)
+def test_a_number_of_steps_may_have_any_integer_type(process, kind):
+    np.testing.assert_array_equal(process.times(kind(10)), process.times(10))
+    with pytest.raises(InputError, match="at least 1"):
+        process.times(kind(0))

@@ -10,7 +10,7 @@ import pytest
 from egosim_jax import configs
 from egosim_jax.cli.generate import Generate
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.diffusion import Guidance
+from egosim_jax.diffusion import Euler, Guidance, RectifiedFlow
 from egosim_jax.generation.batch import STRENGTH, BatchJob
 from egosim_jax.generation.generator import Generator, denoise
 from egosim_jax.testing import write_weights
@@ -108,6 +108,21 @@ def test_sdedit_takes_the_last_steps_from_the_noised_prior():
         part = dit.condition[..., at[name].start - shift : at[name].stop - shift]
         assert not part.any(), name
     assert dit.condition[..., at["hands"].start - shift :].any()
+
+
+@pytest.mark.parametrize("rounding", ["none", "bfloat16", "down"])
+@pytest.mark.parametrize("steps", [4, 100, 200, 1000])
+@pytest.mark.parametrize("strength", [0.75, 0.31, 1.0])
+def test_sdedit_visits_the_last_times_of_the_sampler(rounding, steps, strength):
+    """Also if their rounded timesteps repeat."""
+    process = RectifiedFlow(shift=5.0, timestep_rounding=rounding)
+    config = replace(
+        configs.get("debug"), process=process, steps=steps, strength=strength, solver=Euler()
+    )
+    times = process.times(steps)
+    visited = process.times(config.visited)
+    assert len(visited) == int(strength * steps) + 1
+    np.testing.assert_allclose(visited, times[-len(visited) :], rtol=1e-14)
 
 
 @pytest.mark.parametrize("strength", [0.0, 1.5])

@@ -1,0 +1,98 @@
+"""What a model without weights says, and a checkpoint or run that is given as weights."""
+
+import dataclasses
+import shlex
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from egosim_jax import configs
+from egosim_jax.cli.__main__ import main
+from egosim_jax.generation.generator import Generator
+from egosim_jax.io import weights
+from egosim_jax.testing import write_weights
+from egosim_jax.train import recipes
+from egosim_jax.types import InputError
+
+TRAINED = ("debug", "real_tiny", "dwm_tabletop", "egosim_1_3b")
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_a_model_without_weights_names_its_training(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(InputError, match=f"Train them: egosim train {name}") as caught:
+        configs.weights_of(name, None)
+    command = str(caught.value).split("Train them: ")[1].split(". Or name")[0]
+    _, _, recipe, *options = shlex.split(command)
+    fields = {field.name for field in dataclasses.fields(recipes.get(recipe))}
+    given = {word[2:].replace("-", "_") for word in options if word.startswith("--")}
+    assert "out" in given
+    assert given <= fields
+
+
+@pytest.mark.parametrize("name", sorted(set(configs.names()) - {*TRAINED, "tabletop"}))
+def test_a_released_model_without_weights_names_fetch_or_convert(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    commands = rf"egosim models fetch {name}|egosim convert weights DOWNLOAD --config {name} --out"
+    with pytest.raises(InputError, match=commands):
+        configs.weights_of(name, None)
+
+
+def checkpoint(folder, form):
+    """A download in one of the layouts of releases; the path that a user gives."""
+    files = {
+        "EgoSim": ["diffusion_pytorch_model.safetensors"],
+        "Wan": ["Wan2.1_VAE.pth", "diffusion_pytorch_model-00001-of-00002.safetensors"],
+        "diffusers": ["model_index.json", "transformer/diffusion_pytorch_model.safetensors"],
+        "ComfyUI": ["wan.safetensors", "vae.safetensors"],
+        "a file": ["wan.safetensors"],
+    }[form]
+    for name in files:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".safetensors":
+            save_file({"a": np.zeros(3, np.float32)}, path, {"format": "pt"})
+        else:
+            path.write_bytes(b"{}")
+    return folder / files[0] if form == "a file" else folder
+
+
+FORMS = ("EgoSim", "Wan", "diffusers", "ComfyUI", "a file")
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("command", ["generate", "simulate", "play"])
+def test_a_checkpoint_given_as_weights_is_to_be_converted(form, command, tmp_path, capsys):
+    given = checkpoint(tmp_path / "EgoSim", form)
+    args = [command, "--config", "debug", "--weights", str(given)]
+    args += [] if command == "play" else ["--out", str(tmp_path / "out")]
+    assert main(args) == 2
+    said = capsys.readouterr().err
+    assert f"egosim convert weights {given} --config debug --out weights/debug" in said
+
+
+def test_a_checkpoint_is_refused_by_the_library_and_by_training(tmp_path):
+    given = checkpoint(tmp_path / "EgoSim", "EgoSim")
+    with pytest.raises(InputError, match="egosim convert weights"):
+        Generator.load("debug", given)
+    recipe = dataclasses.replace(
+        recipes.get("egosim_14b"), out=tmp_path / "out", latents=given, weights=given
+    )
+    with pytest.raises(InputError, match=r"egosim convert weights .*--config egosim_14b"):
+        recipe.train()
+
+
+def test_a_run_given_as_weights_is_named_with_its_folder(tmp_path):
+    write_weights(tmp_path / "run" / "weights", configs.get("debug"))
+    with pytest.raises(InputError, match=r"run is a run: its weights are in .*run/weights\. \("):
+        configs.weights_of("debug", tmp_path / "run")
+    assert configs.weights_of("debug", tmp_path / "run" / "weights")
+
+
+@pytest.mark.parametrize("has", [[], ["vae"], ["lora"]])
+def test_a_folder_of_ours_without_a_denoiser_is_no_checkpoint(has, tmp_path):
+    for name in has:
+        weights.write(tmp_path / f"{name}.safetensors", {"a": np.zeros(3, np.float32)})
+    with pytest.raises(InputError, match=r"No weights file at .*dit\.safetensors"):
+        configs.weights_of("debug", tmp_path)
