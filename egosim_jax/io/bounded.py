@@ -9,8 +9,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -18,7 +19,13 @@ from typing import Any, Literal, NoReturn
 from egosim_jax.types import InputError
 
 MAX_JSON_BYTES = 16 << 20
-"""Maximum size of a JSON document in bytes; its Python objects take up to 30 times as much."""
+"""Maximum size of a JSON document in bytes, unless a reader allows more."""
+MAX_MEMORY = 768 << 20
+"""Maximum memory of a document, its text and its values in bytes, estimated from above."""
+JSON_COSTS = {b",": 88, b"[": 104, b"{": 304, b":": 304}
+"""Bytes of memory that the value behind each mark takes at most, with its place in a container."""
+CSV_COSTS = {b",": 72, b"\n": 160, b"\r": 160}
+"""The same of the cells and rows of a CSV file."""
 MAX_QUOTED = 80
 """Maximum length of an untrusted value in a message, in characters."""
 
@@ -57,10 +64,12 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     """Parse one JSON document in UTF-8, with or without a byte order mark.
 
     Raises `InputError`, naming `source`, if it is too large, nested too deeply or not JSON, repeats
-    a name or holds half a surrogate pair.
+    a name or holds half a surrogate pair. A document that would expand to more than
+    `MAX_MEMORY` is refused before it is parsed.
     """
     if len(data) > limit:
         raise InputError(f"{source}: {len(data):,} bytes of JSON, more than {limit:,}.")
+    check_memory(data, JSON_COSTS, source=source)
     try:
         value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
         if b"\\u" in data:
@@ -70,6 +79,17 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     except ValueError as error:
         raise InputError(f"{source} is not valid JSON: {quote_text(str(error))}.") from error
     return value
+
+
+def check_memory(data: bytes, costs: Mapping[bytes, int], *, source: str) -> None:
+    """Raise `InputError` if a document, once parsed, would take more than `MAX_MEMORY`."""
+    memory = len(data) * (2 if data.isascii() else 5)
+    memory += sum(cost * data.count(mark) for mark, cost in costs.items())
+    if memory > MAX_MEMORY:
+        raise InputError(
+            f"{source}: its {len(data):,} bytes would take {memory:,} bytes of memory, more than "
+            f"{MAX_MEMORY:,}, the maximum. Split it."
+        )
 
 
 def read_lines(
@@ -161,12 +181,15 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
 def _check_surrogates(value: Any) -> None:
     rest = [value]  # a stack: recursion would fail on deep documents
     while rest:
         item = rest.pop()
         if isinstance(item, str):
-            if any("\ud800" <= character <= "\udfff" for character in item):
+            if _SURROGATE.search(item):
                 _refuse(f"{quote(item)} holds half a surrogate pair")
         elif isinstance(item, dict):
             rest += item.keys()
