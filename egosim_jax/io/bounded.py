@@ -71,7 +71,7 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
         raise InputError(f"{source}: {len(data):,} bytes of JSON, more than {limit:,}.")
     check_memory(data, JSON_COSTS, source=source)
     try:
-        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
+        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=unique)
         if b"\\u" in data:
             _check_surrogates(value)
     except RecursionError:
@@ -170,10 +170,11 @@ def quote_path(path: Path | str) -> str:
     return text if text.isprintable() else ascii(text)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique(pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Return the map of pairs. Raises `ValueError` if a name is repeated."""
     found = dict(pairs)
     if len(found) != len(pairs):
-        seen: set[str] = set()
+        seen: set[Any] = set()
         for name, _ in pairs:
             if name in seen:
                 _refuse(f"the name {quote(name)} is repeated")

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.bounded import parse_json, quote, quote_text
+from egosim_jax.io.bounded import parse_json, quote, quote_text, unique
 from egosim_jax.types import InputError
 
 MAX_BYTES = 16 << 20
@@ -63,7 +63,7 @@ def unpack(data: bytes, *, limit: int | None = None) -> Any:
     try:
         value = msgpack.unpackb(
             data,
-            object_hook=lambda value: _unpacked(counted(value)),
+            object_pairs_hook=lambda pairs: _unpacked(unique(counted(pairs))),
             list_hook=counted,
             strict_map_key=True,
             max_array_len=max_length,

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from egosim_jax.io.bounded import quote_path, read_bytes, refusing
-from egosim_jax.io.untrusted.isolated import read_file
+from egosim_jax.io.untrusted.isolated import MAX_ADDRESSES, TIMEOUT_S, read_file
 
 MAX_BYTES = 1 << 30
 """Maximum size of each file of a model in bytes."""
@@ -77,7 +77,9 @@ def read_model(folder: Path) -> Model:
             # pycolmap drops the last image of a text if no line of keypoints follows it.
             ending = b"\n\n" if suffix == ".txt" else b""
             (Path(name) / f"{part}{suffix}").write_bytes(data + ending)
-        return read_file(_read, folder, Path(name), suffix)
+        return read_file(
+            _read, folder, Path(name), suffix, max_memory=MAX_ADDRESSES, max_cpu_s=TIMEOUT_S
+        )
 
 
 def _read(folder: Path, copy: Path, suffix: str) -> Model:
