@@ -44,6 +44,7 @@ from egosim_jax.models.lora import (
     pairs,
     refuse,
 )
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -222,7 +223,9 @@ def _translated(
         else:
             full[location] = tensor
     if text:
-        print(f"{source.name}: skipped {text} tensors of a text encoder", file=sys.stderr)
+        print(
+            printable(f"{source.name}: skipped {text} tensors of a text encoder"), file=sys.stderr
+        )
     pairs = {}
     for location, found in low_rank.items():
         try:

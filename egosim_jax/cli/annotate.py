@@ -14,6 +14,7 @@ from egosim_jax.perception.estimates import ChosenRung
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ class Annotate:
         }
         for name, video in empty.items():
             reason = video.get("problem") or reasons.get(name)
-            print(f"{name}: no clip: {reason}", file=sys.stderr)
+            print(printable(f"{name}: no clip: {reason}"), file=sys.stderr)
         print(
             f"{counts['done']} clips done, {counts['refused']} refused, {counts['failed']} failed; "
             f"see {self.out / 'index.html'}",

@@ -23,6 +23,7 @@ from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.data.readers.trumans import Trumans
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import printable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,8 @@ class Output:
         for outcome in track(outcomes, "importing", total=total):
             done, resumed = done + (outcome.problem is None), resumed + outcome.resumed
             if outcome.problem is not None:
-                print(f"skipped: {outcome.recording_id}: {outcome.problem}", file=sys.stderr)
+                problem = f"skipped: {outcome.recording_id}: {outcome.problem}"
+                print(printable(problem), file=sys.stderr)
         earlier = f", {resumed} of them earlier" if resumed else ""
         print(f"{done} of {total} recordings imported{earlier}", file=sys.stderr)
         print(self.out)

@@ -11,11 +11,14 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 MAX_JSON_BYTES = 16 << 20
@@ -33,23 +36,65 @@ MAX_QUOTED = 80
 def open_regular(path: Path) -> io.BufferedReader:
     """Open a regular file for reading.
 
-    Raises `InputError` if it is missing, unreadable, a folder, a pipe, a socket or a device.
+    Raises `InputError` if it is missing, unreadable, a folder, a pipe, a socket, a device, a file
+    of the kernel, or outside the folders of `only_inside`.
     """
+    check_inside(path)
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the name
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{quote_path(path)} cannot be read: {reason}.") from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+    about = os.fstat(descriptor)
+    if not stat.S_ISREG(about.st_mode) or about.st_dev in _kernel_devices():
         os.close(descriptor)
-        raise InputError(f"{quote_path(path)} is not a regular file.")
+        raise InputError(f"{quote_path(path)} is not a regular file: give a file on a disk.")
     return os.fdopen(descriptor, "rb")
+
+
+@cache
+def _kernel_devices() -> frozenset[int]:
+    """Return the devices of /proc and /sys: their files are made while they are read."""
+    return frozenset(os.stat(path).st_dev for path in ("/proc", "/sys") if os.path.isdir(path))
+
+
+_ROOTS: ContextVar[tuple[Path, ...]] = ContextVar("roots", default=())
+
+
+@contextmanager
+def only_inside(sources: Iterable[Path]) -> Iterator[None]:
+    """Refuse files outside the given folders, or the folders of the given files, in this context.
+
+    A link would otherwise bring any file of the user into what is made of others' data. In a
+    cache of the Hugging Face Hub, files are links to the repository's own blobs.
+    """
+    folders = {p if p.is_dir() else p.parent for s in sources for p in (s, s.resolve())}
+    folders = {folder.resolve() for folder in folders}
+    caches = {p.parent for folder in folders for p in folder.parents if p.name == "snapshots"}
+    token = _ROOTS.set((*folders, *caches))
+    try:
+        yield
+    finally:
+        _ROOTS.reset(token)
+
+
+def check_inside(path: Path) -> None:
+    """Raise `InputError` if a path is outside the folders of `only_inside`."""
+    roots = _ROOTS.get()
+    if roots and not any(path.resolve().is_relative_to(root) for root in roots):
+        raise InputError(
+            f"{quote_path(path)} is a link to a file outside of the source, which is not followed: "
+            "put a copy of the file in its place."
+        )
 
 
 def read_bytes(path: Path, *, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes. Raises `InputError` if it is larger."""
     with open_regular(path) as file:
-        data = file.read(limit + 1)
+        try:
+            data = file.read(limit + 1)
+        except OSError as error:
+            raise InputError(f"{quote_path(path)} cannot be read: {error.strerror}.") from error
     if len(data) > limit:
         raise InputError(f"{quote_path(path)} has more than {limit:,} bytes, the maximum.")
     return data
@@ -156,6 +201,20 @@ def quote(value: Any) -> str:
 def quote_text(text: str) -> str:
     """Cut and escape text for a message, without quotation marks."""
     return ascii(text[:MAX_QUOTED])[1:-1] + ("…" if len(text) > MAX_QUOTED else "")
+
+
+def plot_text(text: str) -> str:
+    """Return a title for matplotlib, which would read text between dollar signs as formulas."""
+    cut = text[:MAX_QUOTED] + ("…" if len(text) > MAX_QUOTED else "")
+    return printable(cut.replace("\n", " ")).replace("$", r"\$")
+
+
+def own_file(folder: Path, name: str) -> Path | None:
+    """Return the path of a regular file in a folder; None if absent, or behind a link out of it."""
+    path = folder / name
+    if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
+        return path
+    return None
 
 
 def listing(items: Sequence[str], *, limit: int = 5) -> str:

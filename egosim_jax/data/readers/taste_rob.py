@@ -20,7 +20,14 @@ import tyro
 
 from egosim_jax.data.readers import Entry, find_files, inside, make_id
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.bounded import CSV_COSTS, check_memory, listing, quote_path, quote_text, read_bytes
+from egosim_jax.io.bounded import (
+    CSV_COSTS,
+    check_memory,
+    listing,
+    quote_path,
+    quote_text,
+    read_bytes,
+)
 from egosim_jax.io.segments import probe_long_video
 from egosim_jax.types import InputError
 

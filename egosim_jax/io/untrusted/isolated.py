@@ -27,7 +27,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, NoReturn, TypeVar
 
-from egosim_jax.io.bounded import quote_path, quote_text
+from egosim_jax.io.bounded import check_inside, quote_path, quote_text
 from egosim_jax.runtime.processes import THREADS
 from egosim_jax.types import InputError
 
@@ -151,6 +151,7 @@ def read_file(
     Raises `InputError` if it crashes, hangs, or takes more memory or processor time than allowed:
     by default `MAX_MEMORY` and `MAX_CPU_S`.
     """
+    check_inside(path)
     name = quote_path(path)
     max_memory, max_cpu_s = max_memory or MAX_MEMORY, max_cpu_s or MAX_CPU_S
     try:

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedIOBase
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,7 +65,7 @@ class Archive:
             entries[entry.name] = entry
             spans.append((header, entry.begin + entry.packed, entry.name))
         spans.sort()
-        for (_, end, _), (begin, _, name) in zip(spans, spans[1:], strict=False):
+        for (_, end, _), (begin, _, name) in pairwise(spans):
             if begin < end:
                 raise ValueError(f"entry {quote(name)} overlaps another one")
         self.entries: Mapping[str, Entry] = entries
