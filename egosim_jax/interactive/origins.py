@@ -1,4 +1,4 @@
-"""Which requests come from this machine and from a server's own page."""
+"""Checks that a request comes from this machine, and from the page of the server itself."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ _ROOTS: ContextVar[tuple[Path, ...]] = ContextVar("roots", default=())
 def only_inside(sources: Iterable[Path]) -> Iterator[None]:
     """Refuse files outside the given folders, or the folders of the given files, in this context.
 
-    A link would otherwise bring any file of the user into what is made of others' data. In a
+    A link could bring any file of the user into output that is made of data of others. In a
     cache of the Hugging Face Hub, files are links to the repository's own blobs.
     """
     folders = {p if p.is_dir() else p.parent for s in sources for p in (s, s.resolve())}

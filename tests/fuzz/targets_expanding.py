@@ -96,7 +96,7 @@ def other_entries(data: bytes, rng: random.Random) -> bytes:
             value = rng.choice(values)
             entries[at] = name, b"[" + value * (rng.choice((1, 10**7)) // len(value) + 1) + b"0]"
         case 2:
-            entries[at] = rng.choice((f"../{name}", f"/{name}", name + "x", "\0", "")), content
+            entries[at] = rng.choice((f"../{name}", f"/{name}", name + "x", "a/", "\xe9")), content
         case 3:
             entries += [(f"{name}{number}", content) for number in range(rng.choice((1, 3000)))]
         case _:

@@ -181,7 +181,9 @@ def _limited(max_memory: int, max_cpu_s: float, read: Callable[..., T], *argumen
 
     The kernel refuses what would exceed the memory, and ends the child when its time is over.
     """
-    resource.setrlimit(resource.RLIMIT_DATA, (max_memory, resource.RLIM_INFINITY))
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    soft = max_memory if hard == resource.RLIM_INFINITY else min(max_memory, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
     signal.setitimer(signal.ITIMER_PROF, max_cpu_s)
     try:
         return read(*arguments)
